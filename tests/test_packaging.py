@@ -134,7 +134,7 @@ def test_deploy_writes_what_is_committed_and_keeps_what_is_there(
     for place in (mine, mine / "compose.yaml"):
         assert main(["deploy", "--out", str(place)]) == 2
     assert [p.name for p in mine.iterdir()] == ["compose.yaml"]
-    assert capsys.readouterr().err.count("is not an empty folder") == 2
+    assert capsys.readouterr().err.count("is not empty") == 2
     attack_now(f"`gfmhil deploy --out DIR` writes {len(written)} files and replaces none")
 
 

@@ -17,6 +17,7 @@ from gfm_hil.scenario.events.base import Event
 from gfm_hil.scenario.events.breaker import SynchroCheck
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
+from gfm_plant.components import COMPONENTS, FiniteGrid
 from gfm_runtime import inner_file, lawfile
 
 
@@ -34,7 +35,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[plant.dc_source]", options.DcSource),
     ("[plant.lcl]", options.SecondInductor),
     ("[plant.grid]", options.Grid),
-    ("[plant.grid.finite]", options.FiniteGrid),
+    ("[plant.grid.finite]", FiniteGrid),
     ("[plant.sensors]", options.Sensors),
     ("[plant.adc]", options.AnalogToDigital),
     ("[plant.dac]", options.DigitalToAnalog),
@@ -44,12 +45,7 @@ TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
 NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network]", scenario.NetworkSettings),
     ("[network.converters.NAME]", scenario.NetworkConverter),
-    ("[network.lines.NAME]", options.Line),
-    ("[network.transformers.NAME]", options.Transformer),
-    ("[network.loads.NAME]", options.Load),
-    ("[network.constant_power.NAME]", options.ConstantPowerLoad),
-    ("[network.capacitors.NAME]", options.CapacitorBank),
-    ("[network.machines.NAME]", options.Machine),
+    *((f"[network.{table}.NAME]", kind) for table, kind in COMPONENTS.items()),
 )
 CHECK = ("check", SynchroCheck)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)

@@ -19,9 +19,8 @@
 #include <time.h>
 #include <unistd.h>
 
-#define FOLDER "/dev/shm"
 #define SCHEME "shm://"
-#define PREFIX FOLDER "/gfmhil-link-"
+#define FOLDER "/dev/shm/gfmhil-%u" /* of a user, by number */
 
 static const char MAGIC[8] = "GFMHILSM"; /* eight letters, no zero at the end */
 
@@ -105,11 +104,20 @@ static bool is_left_over(const char *path) {
     return memcmp(head + AT_MAGIC, MAGIC, sizeof MAGIC) == 0 && !lives(owner);
 }
 
-/* Lock the folder of all links: it is held while one is made or removed, never during a run. */
+/* Lock the folder of the user's links, which no other user may have any access to; -1 if it is none
+   such. The lock is held while a link is made or removed, never during a run. */
 static int lock(void) {
-    const int folder = open(FOLDER, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-    if (folder >= 0)
-        flock(folder, LOCK_EX);
+    char place[64];
+    struct stat found;
+    snprintf(place, sizeof place, FOLDER, (unsigned)geteuid());
+    mkdir(place, 0700);
+    const int folder = open(place, O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC);
+    if (folder < 0 || fstat(folder, &found) != 0 || found.st_uid != geteuid() ||
+        (found.st_mode & 077) != 0) {
+        fprintf(stderr, "%s: is not a folder of this user alone\n", place);
+        return -1;
+    }
+    flock(folder, LOCK_EX);
     return folder;
 }
 
@@ -148,8 +156,11 @@ link_t *link_open(const char *endpoint) {
         fprintf(stderr, "%s: must be shm://name\n", endpoint);
         return NULL;
     }
-    snprintf(link.path, sizeof link.path, PREFIX "%s", endpoint + strlen(SCHEME));
+    snprintf(link.path, sizeof link.path, FOLDER "/link-%s", (unsigned)geteuid(),
+             endpoint + strlen(SCHEME));
     const int folder = lock();
+    if (folder < 0)
+        return NULL;
     link.memory = make(link.path); /* the plant takes the lock too: it never sees half a header */
     if (link.memory == NULL)
         fprintf(stderr, "%s: cannot be created: %s\n", endpoint, strerror(errno));

@@ -1,5 +1,6 @@
 """Tests of a controller in C against the emulated rig, over both links that it speaks."""
 
+import os
 import subprocess
 import sys
 import time
@@ -60,7 +61,7 @@ def test_real_time(bench):
 
 def test_shared_memory_has_one_owner_and_is_not_left_behind():
     name = f"own-controller-{uuid.uuid4().hex}"
-    memory = Path("/dev/shm/gfmhil-link-" + name)
+    memory = Path(f"/dev/shm/gfmhil-{os.geteuid()}/link-{name}")
     command = [HERE / "controller-shm", f"shm://{name}", "0=0.5"]
 
     def occupied():

@@ -1,6 +1,6 @@
 """The design of a law: its gamma, gains for the least gamma, its margins, and its network."""
 
-from gfm_design.margins.all_margins import Margins, UnstableLoop
+from gfm_design.margins.all_margins import Margins, UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop
 from gfm_design.norms.hinf import Unstable
@@ -19,6 +19,7 @@ __all__ = [
     "UnstableLoop",
     "Weight",
     "gamma",
+    "loop_margins",
     "margins",
     "network_loop",
     "tune",

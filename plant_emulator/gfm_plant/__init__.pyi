@@ -1,5 +1,6 @@
 from .bases import Bases
 from .build import make_network, make_plant
+from .components import NetworkParts
 from .emulator import (
     plant_advance,
     plant_command,
@@ -8,7 +9,7 @@ from .emulator import (
     plant_truth,
 )
 from .grid import (
-    Checked,
+    SynchroCheckResult,
     breaker,
     check_synchronism,
     clear_fault,
@@ -26,7 +27,7 @@ from .grid import (
 )
 from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
-from .options import NetworkParts, Plant
+from .options import Plant
 from .parameters import ConverterParameters, load_converter
 from .protection import trip_reason, wait_reason
 from .records import PlantRecords
@@ -39,13 +40,13 @@ __all__ = [
     "TRIP_REASONS",
     "TRUTH",
     "Bases",
-    "Checked",
     "ConverterParameters",
     "Network",
     "NetworkParts",
     "NoEquilibrium",
     "Plant",
     "PlantRecords",
+    "SynchroCheckResult",
     "breaker",
     "check_synchronism",
     "clear_fault",

@@ -37,54 +37,9 @@ class Bases:
                 raise ValueError(f"{field.name} = {value!r}: a base must be finite and > 0")
 
     @property
-    def S_b(self) -> float:
-        """Power base in VA (also of active and reactive power, and of the DC side)."""
-        return self.S_n
-
-    @property
-    def V_b(self) -> float:
-        """AC voltage base, line-to-line RMS, in V."""
-        return self.V_n
-
-    @property
     def omega_b(self) -> float:
         """Angular frequency base in rad/s: the omega_b of Eq. (1)-(8)."""
         return self.omega_n
-
-    @property
-    def I_b(self) -> float:
-        """AC current base, line RMS, in A."""
-        return self.S_b / (math.sqrt(3) * self.V_b)
-
-    @property
-    def Z_b(self) -> float:
-        """AC impedance base in ohm."""
-        return self.V_b**2 / self.S_b
-
-    @property
-    def L_b(self) -> float:
-        """AC inductance base in H."""
-        return self.Z_b / self.omega_b
-
-    @property
-    def C_b(self) -> float:
-        """AC capacitance base in F."""
-        return 1 / (self.Z_b * self.omega_b)
-
-    @property
-    def I_dcb(self) -> float:
-        """DC current base in A."""
-        return self.S_b / self.V_dcref
-
-    @property
-    def Z_dc(self) -> float:
-        """DC impedance base in ohm."""
-        return self.V_dcref**2 / self.S_b
-
-    @property
-    def C_dcb(self) -> float:
-        """DC capacitance base in F."""
-        return 1 / (self.Z_dc * self.omega_b)
 
     def base_of(self, quantity: str) -> float:
         """Return the SI value that is 1 p.u. of `quantity`.
@@ -92,12 +47,15 @@ class Bases:
         Raises:
             ValueError: If `quantity` is none of `QUANTITIES`.
         """
-        if quantity == "f":
-            return self.omega_b / (2 * math.pi)
-        if quantity not in _BASE_PROPERTY:
+        S, V, w = self.S_n, self.V_n, self.omega_n
+        Z, Z_dc = V**2 / S, self.V_dcref**2 / S
+        values = (
+            S, S, V, S / (math.sqrt(3) * V), w, Z, Z / w, 1 / (Z * w),
+            self.V_dcref, S / self.V_dcref, 1 / (Z_dc * w), w / (2 * math.pi),
+        )  # fmt: skip
+        if quantity not in QUANTITIES:
             raise ValueError(f"quantity = {quantity!r}: must be one of {', '.join(QUANTITIES)}")
-        base: float = getattr(self, _BASE_PROPERTY[quantity])
-        return base
+        return values[QUANTITIES.index(quantity)]
 
     def to_pu(self, value: float, quantity: str) -> float:
         """Convert `value` from SI units to p.u.; `quantity` is one of `QUANTITIES`."""
@@ -108,19 +66,6 @@ class Bases:
         return value * self.base_of(quantity)
 
 
-_BASE_PROPERTY = {
-    "P": "S_b",
-    "Q": "S_b",
-    "V": "V_b",
-    "I": "I_b",
-    "omega": "omega_b",
-    "R": "Z_b",
-    "L": "L_b",
-    "C": "C_b",
-    "v_dc": "V_dcref",
-    "i_dc": "I_dcb",
-    "C_dc": "C_dcb",
-}
-
-QUANTITIES = (*_BASE_PROPERTY, "f")
-"""The quantities that have a base; in SI: W, var, V, A, rad/s, ohm, H, F, V, A, F and Hz."""
+QUANTITIES = ("P", "Q", "V", "I", "omega", "R", "L", "C", "v_dc", "i_dc", "C_dc", "f")
+"""The quantities that have a base; in SI: W, var, V (line-to-line RMS), A (line RMS), rad/s, ohm,
+H, F, V, A, F and Hz."""

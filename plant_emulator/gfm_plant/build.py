@@ -5,49 +5,29 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt, Sink
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
+from gfm_plant.components import DYNAMIC, NetworkParts
+from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.part import Component, Dynamic, Fed, emf
+from gfm_plant.components.swing import pack_swing
+from gfm_plant.layout import Record, make_net_and_now
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
-from gfm_plant.options import (
-    COMMANDS,
-    MEASURED,
-    ConstantPowerLoad,
-    FiniteGrid,
-    Grid,
-    Machine,
-    NetworkParts,
-    Overload,
-    Plant,
-    Protection,
-)
+from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
-from gfm_plant.records import (
-    N_OWN,
-    N_RING,
-    PlantRecords,
-    Record,
-    converter_par_dtype,
-    converter_state_dtype,
-    network_dtypes,
-    size_for,
-)
-from gfm_plant.wiring import MAGNETISING, Unit, Wiring
-from gfm_plant.wiring import Machine as MachineParts
+from gfm_plant.records import N_RING, converter_par_dtype, converter_state_dtype
+from gfm_plant.wiring import ConverterCircuit, Wiring
 from gfm_runtime.signals import SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
 CONNECTION, LINE = "connection", "line"
 """With a second inductor: the point of connection behind it, and the line from there."""
-
-_LAG = 5.0  # shortest lag of a load of constant power, in sampling periods
-_SWING_STEP = 0.1  # largest rate of a finite grid times T_s
 
 
 def make_plant(options: Plant, T_s: float) -> Network:
@@ -63,15 +43,15 @@ def make_plant(options: Plant, T_s: float) -> Network:
     Raises:
         ValueError: If the converter is unknown, or the DC source's control is too fast for T_s.
     """
-    converter, parts, node = load_converter(options.converter), [], FAR
+    converter, branches, node = load_converter(options.converter), list[Branch](), FAR
     if options.lcl is not None:
         line, node = converter.pu(options.real_factors()), CONNECTION
-        parts.append(Branch(LINE, CONNECTION, FAR, line["L_g"], line["R_g"]))
+        branches.append(Branch(LINE, CONNECTION, FAR, line["L_g"], line["R_g"]))
     if options.grid.load_R is not None and options.grid.load_L is not None:
         bases = converter.bases
         L, R = bases.to_pu(options.grid.load_L, "L"), bases.to_pu(options.grid.load_R, "R")
-        parts.append(Branch(LOAD, FAR, GROUND, L, R))
-    plant = _make({CONVERTER: (options, node)}, T_s, options.grid, FAR, parts)
+        branches.append(Branch(LOAD, FAR, GROUND, L, R))
+    plant = _make({CONVERTER: (options, node)}, T_s, options.grid, FAR, branches=branches)
     if options.lcl is not None:  # all that lies between capacitor and grid
         plant.par["L_g"] += line["L_g"]
         plant.par["R_g"] += line["R_g"]
@@ -93,34 +73,13 @@ def make_network(
         ValueError: If there are too many parts, two of one name, converters of different voltages
             or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
-    names = [*converters, *parts.lines, *parts.loads, *parts.capacitors, *parts.machines]
-    names += [*parts.constant_power, *parts.transformers]
-    names += [f"{name}{MAGNETISING}" for name, x in parts.transformers.items() if x.X_m]
+    each = [*parts.components()]
+    elements = [element for _, name, one in each for element in one.elements(name)]
+    names = [*converters, *(element.name for element in elements)]
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
-    branches = [Branch(name, x.start, x.end, x.L, x.R) for name, x in parts.lines.items()]
-    for name, one in parts.transformers.items():
-        branches.append(Branch(name, one.start, one.end, one.X / one.S, one.R / one.S))
-        if one.X_m is not None:
-            inductor = Branch(f"{name}{MAGNETISING}", one.start, GROUND, one.X_m / one.S, 0.0)
-            branches.append(inductor)
-    shunts = []
-    for name, load in parts.loads.items():
-        size = load.P**2 + load.Q**2
-        if load.Q > 0:
-            branches.append(Branch(name, load.node, GROUND, load.Q / size, load.P / size))
-        else:
-            shunts.append(Shunt(name, load.node, 1 / load.P))
-    banks = tuple(Capacitor(name, x.node, x.Q) for name, x in parts.capacitors.items())
-    opened = {name for name, line in parts.lines.items() if not line.closed}
-    opened |= {name for name, one in parts.transformers.items() if not one.closed}
-    opened |= {name for name, load in parts.loads.items() if not load.closed}
-    opened |= {name for name, load in parts.constant_power.items() if not load.closed}
-    network = _make(
-        converters, T_s, grid, parts.grid, branches, tuple(shunts), banks,
-        frozenset(opened), parts.machines, parts.constant_power,
-        tuple((name, one.earthed) for name, one in parts.transformers.items()),
-    )  # fmt: skip
+    opened = frozenset(name for _, name, one in each if not getattr(one, "closed", True))
+    network = _make(converters, T_s, grid, parts.grid, each, opened)
     network.net["joins"] = 1
     return network
 
@@ -130,28 +89,21 @@ def _make(
     T_s: float,
     grid: Grid,
     grid_node: str | None,
-    branches: Sequence[Branch],
-    shunts: Sequence[Shunt] = (),
-    capacitors: Sequence[Capacitor] = (),
+    each: Sequence[tuple[str, str, Component]] = (),
     opened: frozenset[str] = frozenset(),
-    machines: Mapping[str, Machine] = MappingProxyType({}),
-    constant_power: Mapping[str, ConstantPowerLoad] = MappingProxyType({}),
-    transformers: tuple[tuple[str, str], ...] = (),
+    branches: Sequence[Branch] = (),
 ) -> Network:
-    """Return a plant; elements in p.u. of the first converter."""
+    """Return a plant.
+
+    Args:
+        each: table, name and options of each component.
+        opened: names of those whose breaker is open.
+        branches: more of them, p.u. of the converter.
+    """
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
-    N = len(converters)
-    # two more for a fault within a branch
-    states = N_OWN * N + len(branches) + len(capacitors) + len(machines) + 2
-    net_dtype, now_dtype = network_dtypes(size_for(N, states, len(machines), len(constant_power)))
-    records = PlantRecords(
-        np.zeros(N, converter_par_dtype),
-        np.zeros(N, converter_state_dtype),
-        np.zeros(1, net_dtype),
-        np.zeros(1, now_dtype),
-    )
-    par, st, net, now = records
+    par = np.zeros(len(converters), converter_par_dtype)
+    st = np.zeros(len(converters), converter_state_dtype)
     units = []
     first = load_converter(next(iter(converters.values()))[0].converter)
     for k, (name, (options, node)) in enumerate(converters.items()):
@@ -161,46 +113,72 @@ def _make(
         one["T_s"], one["delay"] = T_s, options.delay.samples
         one["fraction"] = options.delay.fraction
         _pack_protection(one, options.protection, T_s)
-    net["omega_b"], net["T_s"], net["n_converters"] = first.bases.omega_b, T_s, N
-    _pack_timing(records)
-    net["n_machines"], net["n_sinks"] = len(machines), len(constant_power)
-    for j, (name, load) in enumerate(constant_power.items()):
-        if load.tau_s < _LAG * T_s:
-            raise ValueError(
-                f"network.constant_power.{name}: tau_s = {load.tau_s:g}: must be >="
-                f" {_LAG * T_s:g} s at this T_s"
-            )
-        net["S_sink"][0, j] = load.P, load.Q
-        net["tau_sink"][0, j], net["least_v2"][0, j] = load.tau_s, load.V_least**2
+    passive = [p for _, n, x in each if not isinstance(x, Fed) for p in x.elements(n)]
+    fed = sorted(
+        ((name, one) for _, name, one in each if isinstance(one, Fed)),
+        key=lambda item: not item[1].is_voltage,
+    )
+    wiring = Wiring(
+        first.bases.omega_b,
+        tuple(units),
+        (*branches, *(part for part in passive if isinstance(part, Branch))),
+        tuple(part for part in passive if isinstance(part, Shunt)),
+        tuple(part for part in passive if isinstance(part, Capacitor)),
+        tuple(fed),
+        grid_node,
+        opened=opened,
+    )
+    _check_paths(wiring)
+    dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
     if grid.finite is not None and grid_node is not None:
-        _pack_grid(records, units, grid.finite)
-    for j, (name, machine) in enumerate(machines.items(), 1):
-        _pack_swing(records, j, machine, machine.X / machine.S, f"network.machines.{name}")
-        net["E"][0, j], now["P_set"][0, j] = machine.E, machine.P
-
+        dynamic.append(("plant.grid.finite", "", grid.finite))
+    network = _network(par, st, wiring, T_s, dynamic)
+    now = network.now
     st["x"][:, V_DC] = 1.0
-    now["unit"][0, :, 0] = now["sequence"][0, 0, 0] = 1.0
+    now["unit"] = now["sequence"][:, 0] = 1.0
     st["sensed"][:, 0] = 1.0
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"] = grid_node is not None
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
-    wiring = Wiring(
-        first.bases.omega_b,
-        tuple(units),
-        tuple(branches),
-        tuple(shunts),
-        tuple(capacitors),
-        tuple(Sink(name, load.node) for name, load in constant_power.items()),
-        tuple(MachineParts(name, m.node, m.X / m.S, m.R / m.S) for name, m in machines.items()),
-        grid_node,
-        opened=opened,
-        transformers=transformers,
-    )
-    _check_paths(wiring)
-    network = Network(records, wiring)
     network.connect(wiring)
     return network
+
+
+def _network(
+    par: Record, st: Record, wiring: Wiring, T_s: float, dynamic: Sequence[tuple[str, str, Dynamic]]
+) -> Network:
+    """Return a plant whose circuits are still to be made.
+
+    Args:
+        dynamic: table, name and options of each component with a record.
+    """
+    cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
+    places = wiring.sources()
+    lags = [name for _, name, one in dynamic if one.lag() is not None]
+    net, now = make_net_and_now(
+        len(par), len(wiring.order) + 2, len(places) + 1, len(cuts) - 1, len(par) + len(lags)
+    )  # two states more for a fault within a branch
+    net["omega_b"], net["T_s"] = wiring.omega_b, T_s
+    _pack_timing(par, net, cuts)
+    parts = []
+    for kind in DYNAMIC:
+        those = [item for item in dynamic if isinstance(item[2], kind)]
+        parts.append(records := np.zeros(len(those), kind.record))
+        for record, (table, name, one) in zip(records, those, strict=True):
+            where = f"{table}.{name}" if name else table
+            if isinstance(one, FiniteGrid):
+                X = 1 / sum(1 / (unit.L_f + unit.L_g) for unit in wiring.units)
+                pack_swing(one, record, X, where, T_s, wiring.omega_b)
+                continue
+            one.pack(record, where, T_s, wiring.omega_b)
+            if name in lags:
+                record["lag"] = len(par) + lags.index(name)
+            if isinstance(one, Fed):
+                record["source"] = place = places[emf(name) if one.is_voltage else name]
+                if one.is_voltage:
+                    net["emf"][0, place] = record["E"]
+    return Network(par, st, net, now, tuple(parts), wiring)
 
 
 def _check_paths(wiring: Wiring) -> None:
@@ -220,8 +198,7 @@ def _check_paths(wiring: Wiring) -> None:
     ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
     ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
     ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
-    ends += [(sink.name, sink.node) for sink in wiring.sinks]
-    ends += [(machine.name, machine.node) for machine in wiring.machines]
+    ends += [(name, one.node) for name, one in wiring.fed]
     ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
     for name, node in ends:
         if node not in reached | {GROUND}:
@@ -233,7 +210,7 @@ def _check_paths(wiring: Wiring) -> None:
 
 def _pack_converter_circuit(
     par: Record, name: str, node: str, options: Plant, first: ConverterParameters
-) -> Unit:
+) -> ConverterCircuit:
     """Pack the elements of a converter, and return them in p.u. of the first one."""
     converter = load_converter(options.converter)
     for what in ("omega_n", "V_n"):
@@ -265,46 +242,20 @@ def _pack_converter_circuit(
         par["i_u_gain"] = 1.0
     else:
         par["k_p"], par["k_i"] = source.k_p, source.k_i
-    return Unit(
+    return ConverterCircuit(
         name, node,
         elements["L_f"] * ratio, elements["R_f"] * ratio, elements["C_f"] / ratio,
         elements["L_g"] * ratio, elements["R_g"] * ratio,
     )  # fmt: skip
 
 
-def _pack_grid(records: PlantRecords, units: Sequence[Unit], grid: FiniteGrid) -> None:
-    L = 1 / sum(1 / (unit.L_f + unit.L_g) for unit in units)
-    _pack_swing(records, 0, grid, L, "plant.grid.finite")
-
-
-def _pack_swing(
-    records: PlantRecords, j: int, swings: FiniteGrid | Machine, L: float, where: str
-) -> None:
-    """Pack a swing equation; L is the reactance, p.u. of the network, against which it swings."""
-    net, T_s = records.net, float(records.net[0]["T_s"])
-    for name in ("H", "D", "droop", "T_gov", "S"):
-        net[name][0, j] = getattr(swings, name)
-    swing = math.sqrt(net[0]["omega_b"] / (2 * swings.H * swings.S * L))
-    governor = math.sqrt(1 / (2 * swings.H * swings.droop * swings.T_gov))
-    rate = max(swing, governor, swings.D / (2 * swings.H), 1 / swings.T_gov)
-    if rate * T_s > _SWING_STEP:
-        raise ValueError(
-            f"{where}: it swings at {rate:.6g} rad/s; allowed are"
-            f" {_SWING_STEP / T_s:.6g} rad/s at this T_s; raise S, H, T_gov or droop"
-        )
-
-
-def _pack_timing(records: PlantRecords) -> None:
+def _pack_timing(par: Record, net: Record, cuts: Sequence[float]) -> None:
     """Cut the period where a command begins to act."""
-    par, net = records.par, records.net
-    cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
-    parts = len(cuts) - 1
-    net["n_parts"] = parts
-    net["stretch"][0, :parts] = np.diff(cuts) * net[0]["T_s"]
+    net["stretch"] = np.diff(cuts) * net[0]["T_s"]
     # a plant that is delayed as a whole goes on before the commands of the tick are in the line
     newest = par["delay"] - (1 if min(par["delay"]) > 0 else 0)
     for part, begin in enumerate(cuts[:-1]):
-        net["age"][0, part, : len(par)] = newest + (begin < par["fraction"])
+        net["age"][0, part] = newest + (begin < par["fraction"])
 
 
 def _pack_measurement(par: Record, options: Plant) -> None:

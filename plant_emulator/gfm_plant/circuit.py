@@ -1,7 +1,7 @@
 """A linear circuit of R-L branches and capacitors between voltage sources, and its modes.
 
 All voltages and currents are complex space vectors in one common frame that rotates at omega_b.
-There the circuit obeys w' = A w + B s with the currents of the branches and the voltages of the
+There w' = A w + B s, with the currents of the branches and the voltages of the
 capacitors as w and the voltages of the sources as s. In energy coordinates (a current times
 sqrt(L), a voltage times sqrt(C)) the lossless part of A is skew-Hermitian, so its modes are nearly
 orthogonal even where eigenvalues repeat, as those of identical converters in parallel do.
@@ -34,13 +34,19 @@ WORST_CONDITION = 1e8
 
 @dataclass(frozen=True)
 class Branch:
-    """R and L in series from node ``start`` to node ``end``, p.u.; L > 0."""
+    """R and L in series from node ``start`` to node ``end``, p.u.; L > 0.
+
+    ``earthed`` is that of `Transformer`, "" if it is none. One that is not ``switched`` has no
+    breaker and feeds nothing.
+    """
 
     name: str
     start: str
     end: str
     L: float
     R: float
+    earthed: str = ""
+    switched: bool = True
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Shunt:
 
 
 @dataclass(frozen=True)
-class Source:
+class VoltageSource:
     """An ideal voltage at a node, against ground."""
 
     name: str
@@ -70,11 +76,14 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Sink:
+class CurrentSource:
     """A current from a node with a capacitor to ground, p.u."""
 
     name: str
     node: str
+
+
+Element = Branch | Capacitor | Shunt | CurrentSource
 
 
 @dataclass(frozen=True)
@@ -101,11 +110,11 @@ class Modes:
 def find_modes(
     branches: Sequence[Branch],
     capacitors: Sequence[Capacitor],
-    sources: Sequence[Source],
+    sources: Sequence[VoltageSource],
     omega_b: float,
     order: Sequence[str],
     shunts: Sequence[Shunt] = (),
-    sinks: Sequence[Sink] = (),
+    sinks: Sequence[CurrentSource] = (),
 ) -> Modes:
     """Return the modes of a circuit; those of the last circuits are kept, so that an event of a
     scenario that has been tried before its run costs no eigenvalues in real time.
@@ -129,11 +138,11 @@ def find_modes(
 def _find_modes(
     branches: tuple[Branch, ...],
     capacitors: tuple[Capacitor, ...],
-    sources: tuple[Source, ...],
+    sources: tuple[VoltageSource, ...],
     omega_b: float,
     order: tuple[str, ...],
     shunts: tuple[Shunt, ...],
-    sinks: tuple[Sink, ...],
+    sinks: tuple[CurrentSource, ...],
 ) -> Modes:
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
     for name, value in stored.items():
@@ -163,7 +172,7 @@ def _find_modes(
     for j, sink in enumerate(sinks, len(sources)):
         if sink.node not in charged:
             raise ValueError(
-                f"node {sink.node}: {sink.name} draws constant power, so the node needs a bank of"
+                f"node {sink.node}: {sink.name} draws a current, so the node needs a bank of"
                 " network.capacitors"
             )
         B[n_b + charged[sink.node], j] = -1.0
@@ -203,8 +212,8 @@ def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:
     """Return the modes of a circuit that is not the same in all directions.
 
     In the frame that stands still a space vector is W = w e^(j omega_b t), and the parts of
-    W e^(-j angle) = W_alpha + j W_beta obey one circuit each. Their modes are real-linear in W, and
-    so linear in w and its mirror image together: W_alpha = (W' + conj W') / 2 and
+    W e^(-j angle) = W_alpha + j W_beta belong to one circuit each. Their modes are real-linear in
+    W, and so linear in w and its mirror image together: W_alpha = (W' + conj W') / 2 and
     W_beta = (W' - conj W') / 2j with W' = W e^(-j angle).
 
     Args:
@@ -229,7 +238,7 @@ def find_voltage(
     node: str,
     branches: Sequence[Branch],
     capacitors: Sequence[Capacitor],
-    sources: Sequence[Source],
+    sources: Sequence[VoltageSource],
     order: Sequence[str],
     shunts: Sequence[Shunt] = (),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -277,7 +286,7 @@ def find_voltage(
     return found[:n_w], found[n_w:]
 
 
-def _places(kind: str, parts: Sequence[Source | Capacitor]) -> dict[str, int]:
+def _places(kind: str, parts: Sequence[VoltageSource | Capacitor]) -> dict[str, int]:
     """Index of the part at each node."""
     found: dict[str, int] = {}
     for k, part in enumerate(parts):

@@ -12,13 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.constant_power import draw_power, measure, see_middle
+from gfm_plant.components import (
+    every_at_rest,
+    every_begin,
+    every_drive,
+    every_end,
+    every_go_back,
+    every_keep,
+    every_middle,
+    every_tick,
+)
 from gfm_plant.dc_link import advance_dc_link
+from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
-from gfm_plant.ramps import advance_grid, grid_power, machine_power, settle
+from gfm_plant.ramps import advance_grid
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import (
     I_F,
@@ -29,7 +39,6 @@ from gfm_plant.solution import (
     enter,
     grid_source,
     half_step,
-    machine_source,
     mirror_sources,
     own,
     read_states,
@@ -63,7 +72,7 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
         if r.i_u_gain == 0.0:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
-    settle(n, now)
+    every_at_rest(plant, circuit(n, now), 0)
 
 
 @compiled
@@ -119,17 +128,17 @@ def plant_step(plant: PlantRecords) -> None:
         )  # fmt: skip
         for j in range(4):
             s.before[4 + j] = s.sensed[j]
-    for k in range(n.n_converters + 2 + n.n_machines):
-        now.unit_before[k, 0], now.unit_before[k, 1] = now.unit[k, 0], now.unit[k, 1]
+    unit, unit_before = field(now, "unit"), field(now, "unit_before")
+    for k in range(now.n_s):
+        unit_before[k] = unit[k]
+    w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
-        now.w_before[i, 0], now.w_before[i, 1] = now.w[i, 0], now.w[i, 1]
-    for j in range(n.n_sinks):
-        now.v_sink_before[j, 0], now.v_sink_before[j, 1] = now.v_sink[j, 0], now.v_sink[j, 1]
-    if n.unbalanced[circuit(n, now)]:
+        w_before[i] = w[i]
+    every_keep(plant, circuit(n, now), 0)
+    if field(n, "unbalanced")[circuit(n, now)]:
         mirror_sources(n, now, plant.st[0].tick)
     for part in range(n.n_parts):
-        if n.stretch[part] > 0.0:
-            _stretch(plant, part)
+        _stretch(plant, part)
 
     worst, largest = 0, 0.0
     for k in range(n.n_converters):
@@ -148,13 +157,8 @@ def plant_step(plant: PlantRecords) -> None:
         _go_back(plant)
         trip(plant, worst, DIVERGED, largest)
         enter(n, now, plant.st[0].tick, circuit(n, now))
-    advance_grid(n, now)
-    if now.unbalance_left > 0.0:
-        now.unbalance_left -= n.T_s
-        if now.unbalance_left < 0.5 * n.T_s:
-            now.unbalance_left = now.sequence[0, 1] = 0.0
-            now.sequence[1, 0] = now.sequence[1, 1] = 0.0
-            now.sequence[0, 0] = 1.0
+    every_tick(plant, circuit(n, now), 0)
+    advance_grid(now, n.T_s)
     if now.check == WATCHING:
         watch(plant)
     if now.faulted:
@@ -172,12 +176,12 @@ def _size(plant: PlantRecords, k: int) -> float:
     if not s.x[V_DC] > 0.0:
         return math.inf
     size = abs(s.x[DELTA]) / _FAR  # the angle of an island may grow without limit
-    first, last = own(k), own(k + 1)
-    for i in range(first, last):
-        size = _larger(size, abs(now.w[i, 0]) + abs(now.w[i, 1]))
+    w = field(now, "w")
+    for i in range(own(k), own(k + 1)):
+        size = _larger(size, abs(w[i].real) + abs(w[i].imag))
     if k == 0:
         for i in range(own(n.n_converters), n.n_states):
-            size = _larger(size, abs(now.w[i, 0]) + abs(now.w[i, 1]))
+            size = _larger(size, abs(w[i].real) + abs(w[i].imag))
     for j in range(4):
         size = _larger(size, abs(s.sensed[j]))
     return _larger(_larger(_larger(size, abs(s.x[V_DC])), abs(s.i_reg)), abs(s.i_source))
@@ -194,12 +198,13 @@ def _go_back(plant: PlantRecords) -> None:
         )  # fmt: skip
         for j in range(4):
             s.sensed[j] = s.before[4 + j]
-    for k in range(n.n_converters + 2 + n.n_machines):
-        now.unit[k, 0], now.unit[k, 1] = now.unit_before[k, 0], now.unit_before[k, 1]
+    unit, unit_before = field(now, "unit"), field(now, "unit_before")
+    for k in range(now.n_s):
+        unit[k] = unit_before[k]
+    w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
-        now.w[i, 0], now.w[i, 1] = now.w_before[i, 0], now.w_before[i, 1]
-    for j in range(n.n_sinks):
-        now.v_sink[j, 0], now.v_sink[j, 1] = now.v_sink_before[j, 0], now.v_sink_before[j, 1]
+        w[i] = w_before[i]
+    every_go_back(plant, circuit(n, now), 0)
 
 
 @compiled
@@ -220,20 +225,21 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
         i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
         i_max = r.i_max if s.trip == 0 else 0.0
         out[10] = min(max(i_dc, -i_max), i_max)
-    v, i = own(k) + V, own(k) + I_F
-    out[11], out[12] = now.w[v, 0], now.w[v, 1]
-    out[13], out[14] = r.current * now.w[i, 0], r.current * now.w[i, 1]
+    v, i = field(now, "w")[own(k) + V], field(now, "w")[own(k) + I_F]
+    out[11], out[12] = v.real, v.imag
+    out[13], out[14] = r.current * i.real, r.current * i.imag
 
 
 @compiled
 def _stretch(plant: PlantRecords, part: int) -> None:
     """Go on by one stretch of the period, under the commands that act in it."""
     n, now = plant.net[0], plant.now[0]
+    age = field(n, "age")
     for k in range(n.n_converters):
         r, s = plant.par[k], plant.st[k]
         if s.trip == 0:
             for j in range(N_COMMANDS):
-                s.u_now[j] = s.u[n.age[part, k], j]
+                s.u_now[j] = s.u[age[part, k], j]
         else:
             s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`
         # the modulator divides by the v_dc that it has at the beginning of its period
@@ -249,7 +255,7 @@ def _stretch(plant: PlantRecords, part: int) -> None:
     for k in range(n.n_converters):
         if _may_peak(plant, k, part):
             cut = part + n.n_parts
-    for _ in range(n.pieces[cut]):
+    for _ in range(field(n, "pieces")[cut]):
         if cut != part:
             for k in range(n.n_converters):
                 if plant.par[k].i_peak < math.inf and plant.st[k].trip == 0:
@@ -271,18 +277,19 @@ def _may_peak(plant: PlantRecords, k: int, part: int) -> bool:
         return False
     if now.faulted:
         return True
-    f, c, o = own(k) + I_F, own(k) + V, own(k) + I_O
-    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
-    E_d, E_q = s.E_commanded[0], s.E_commanded[1]
-    E_r, E_i = E_d * u_r - E_q * u_i, E_d * u_i + E_q * u_r
-    E_r, E_i = E_r - now.w[c, 0], E_i - now.w[c, 1]
-    i_r, i_i = now.w[f, 0], now.w[f, 1]
-    d_r, d_i = i_r - now.w[o, 0], i_i - now.w[o, 1]
-    h = r.omega_b * n.stretch[part]
+    w, at = field(now, "w"), own(k)
+    E = complex(s.E_commanded[0], s.E_commanded[1]) * field(now, "unit")[k] - w[at + V]
+    h = r.omega_b * field(n, "stretch")[part]
     a, b = h / r.L_f, h / r.C_f
-    size = r.current * math.sqrt(i_r * i_r + i_i * i_i) + a * math.sqrt(E_r * E_r + E_i * E_i)
-    size += 0.5 * a * b * r.current * math.sqrt(d_r * d_r + d_i * d_i)
+    size = r.current * _length(w[at + I_F]) + a * _length(E)
+    size += 0.5 * a * b * r.current * _length(w[at + I_F] - w[at + I_O])
     return not size < 0.8 * r.i_peak
+
+
+@inlined
+def _length(z: complex) -> float:
+    """Return |z|; quicker than abs(z), which minds overflow."""
+    return math.sqrt(z.real * z.real + z.imag * z.imag)
 
 
 @compiled
@@ -295,21 +302,21 @@ def _within_peak(plant: PlantRecords, k: int, part: int) -> tuple[float, float]:
     """
     n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
     E_d, E_q, most = s.E_commanded[0], s.E_commanded[1], s.E_most
-    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
-    f, c = own(k) + I_F, own(k) + V
-    i_r, i_i = now.w[f, 0] * r.current, now.w[f, 1] * r.current
-    i_d, i_q = i_r * u_r + i_i * u_i, i_i * u_r - i_r * u_i
-    v_d = now.w[c, 0] * u_r + now.w[c, 1] * u_i
-    v_q = now.w[c, 1] * u_r - now.w[c, 0] * u_i
+    back = field(now, "unit")[k].conjugate()
+    i, v = field(now, "w")[own(k) + I_F], field(now, "w")[own(k) + V] * back
+    i = complex(i.real * r.current, i.imag * r.current) * back
     X = s.u_now[1] * r.L_f
-    drop_d, drop_q = v_d + r.R_f * i_d - X * i_q, v_q + r.R_f * i_q + X * i_d
-    reach = 2.0 * n.half_h[part] * r.omega_b / r.L_f  # p.u. of current per p.u. of voltage
-    to_d, to_q = i_d + reach * (E_d - drop_d), i_q + reach * (E_q - drop_q)
+    drop_d = v.real + r.R_f * i.real - X * i.imag
+    drop_q = v.imag + r.R_f * i.imag + X * i.real
+    half_h = field(n, "half_h")[part]
+    reach = 2.0 * half_h * r.omega_b / r.L_f  # p.u. of current per p.u. of voltage
+    to_d, to_q = i.real + reach * (E_d - drop_d), i.imag + reach * (E_q - drop_q)
     size = math.sqrt(to_d * to_d + to_q * to_q)
     if size <= r.i_peak:
         return E_d, E_q
     scale = r.i_peak / size
-    E_d, E_q = drop_d + (to_d * scale - i_d) / reach, drop_q + (to_q * scale - i_q) / reach
+    E_d = drop_d + (to_d * scale - i.real) / reach
+    E_q = drop_q + (to_q * scale - i.imag) / reach
     size = math.sqrt(E_d * E_d + E_q * E_q)
     if size > most:
         E_d, E_q = E_d * most / size, E_q * most / size
@@ -321,87 +328,53 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the commands that act."""
     n, now = plant.net[0], plant.now[0]
     omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
-    for m in range(n.n_modes[c]):
-        now.forced[m, 0] = now.forced[m, 1] = now.forced[m, 2] = now.forced[m, 3] = 0.0
-    swings = n.H[0] > 0.0 or n.n_machines > 0
-    if swings:
-        _bring(n, now, now.unit, n.half_h[part] / 3.0)
-    for k in range(n.n_converters):
-        _look(plant, k, 0, now.unit)
+    forced, w, half_h = field(now, "forced"), field(now, "w"), field(n, "half_h")[part]
+    for m in range(field(n, "n_modes")[c]):
+        forced[m, 0] = forced[m, 1] = 0j
+    every_begin(plant, c, part)
     for k in range(n.n_converters):
         s = plant.st[k]
-        drive(n, now, c, part, k, s.E[0], s.E[1], s.u_now[1])
-    g = grid_source(n)
-    E_r, E_i = now.V_g * now.sequence[0, 0], now.V_g * now.sequence[0, 1]
-    drive(n, now, c, part, g, E_r, E_i, omega_g)
-    if now.unbalance_left > 0.0:
-        E_r, E_i = now.V_g * now.sequence[1, 0], now.V_g * now.sequence[1, 1]
-        drive(n, now, c, part, g + 1, E_r, E_i, -omega_g)
-    for j in range(1, n.n_machines + 1):
-        omega = now.omega[j] + 0.5 * n.T_s * now.slope[j]
-        drive(n, now, c, part, machine_source(n, j), n.E[j], 0.0, omega)
-
-    if n.n_sinks > 0:
-        draw_power(n, now, c, part)
+        _look(plant, k, 0, field(now, "unit")[k])
+        drive(n, now, c, part, k, complex(s.E[0], s.E[1]), s.u_now[1])
+    for sequence in range(2 if now.unbalance_left > 0.0 else 1):
+        E = now.sequence[sequence]
+        E = complex(now.V_g * E.real, now.V_g * E.imag)
+        drive(n, now, c, part, grid_source(n) + sequence, E, omega_g if sequence == 0 else -omega_g)
+    every_drive(plant, c, part)
 
     half_step(n, now, c, part, 0)
-    if n.n_sinks > 0:
-        see_middle(n, now, c)
-    if swings:
-        read_states(n, now, c)
-    else:
-        for k in range(n.n_converters):
-            i = own(k)
-            now.w[i, 0], now.w[i, 1] = state(n, now, c, i)
-            if plant.par[k].filtered:
-                for j in range(i + 1, i + 3):
-                    now.w[j, 0], now.w[j, 1] = state(n, now, c, j)
+    every_middle(plant, c, part)
     for k in range(n.n_converters):
-        _look(plant, k, 1, now.halfway)
-    if swings:
-        _bring(n, now, now.halfway, 4.0 * n.half_h[part] / 3.0)
+        for i in range(own(k), own(k) + (3 if plant.par[k].filtered else 1)):
+            w[i] = state(n, now, c, i)
+        _look(plant, k, 1, field(now, "halfway")[k])
 
-    half_step(n, now, c, part, 2)
+    half_step(n, now, c, part, 1)
     read_states(n, now, c)
-    if n.n_sinks > 0:
-        measure(n, now, part)
-    if swings:
-        _bring(n, now, now.unit, n.half_h[part] / 3.0)
+    every_end(plant, c, part)
     for k in range(n.n_converters):
-        _look(plant, k, 2, now.unit)
+        _look(plant, k, 2, field(now, "unit")[k])
         r, s = plant.par[k], plant.st[k]
         v_0 = s.x[V_DC]
-        v_1, v_2 = advance_dc_link(r, s, n.half_h[part])
+        v_1, v_2 = advance_dc_link(r, s, half_h)
         if r.filtered:
             _sense(n, s, k, 0, part, v_0, v_1, v_2)
             for j in range(3):
                 _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
-        s.x[DELTA] += 2.0 * n.half_h[part] * n.omega_b * (s.u_now[1] - omega_g)
-
-
-@compiled
-def _bring(n: Any, now: Any, unit: Any, weight: float) -> None:
-    """Add to the energy that a finite grid and the machines get in this tick, when the sources'
-    phasors are at ``unit``; ``weight`` is that of Simpson's rule, s."""
-    if n.H[0] > 0.0:
-        now.energy[0] += weight * grid_power(n, now, unit)
-    for j in range(1, n.n_machines + 1):
-        now.energy[j] -= weight * machine_power(n, now, j, unit)
+        s.x[DELTA] += 2.0 * half_h * n.omega_b * (s.u_now[1] - omega_g)
 
 
 @inlined
-def _look(plant: PlantRecords, k: int, which: int, unit: Any) -> None:
+def _look(plant: PlantRecords, k: int, which: int, unit: complex) -> None:
     """Keep the power that bridge k draws, p.u., and what its sensors see at the beginning (0), the
     middle (1) or the end (2) of a piece, when its frame is at ``unit``."""
-    r, s, now = plant.par[k], plant.st[k], plant.now[0]
-    i = own(k)
-    w_r, w_i = now.w[i, 0] * r.current, now.w[i, 1] * r.current
-    u_r, u_i = unit[k, 0], unit[k, 1]
-    s.drawn[which] = s.E[0] * (u_r * w_r + u_i * w_i) + s.E[1] * (u_r * w_i - u_i * w_r)
+    r, s, w, at = plant.par[k], plant.st[k], field(plant.now[0], "w"), own(k)
+    i, v, i_o = w[at + I_F], w[at + V], w[at + I_O]
+    turned = unit.conjugate() * complex(i.real * r.current, i.imag * r.current)
+    s.drawn[which] = s.E[0] * turned.real + s.E[1] * turned.imag
     if r.filtered:
-        a, b = i + V, i + I_O
         s.seen[which, 0], s.seen[which, 1], s.seen[which, 2] = terminal(
-            now.w[a, 0], now.w[a, 1], now.w[b, 0] * r.current, now.w[b, 1] * r.current
+            v.real, v.imag, i_o.real * r.current, i_o.imag * r.current
         )
 
 
@@ -414,11 +387,12 @@ def _larger(size: float, other: float) -> float:
 @inlined
 def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_2: float) -> None:
     """Pass a quantity through the low-pass of sensor j of converter k."""
+    weights = field(n, "lag_weights")
     s.sensed[j] = (
-        n.sensor_weights[part, k, 0] * s.sensed[j]
-        + n.sensor_weights[part, k, 1] * f_0
-        + n.sensor_weights[part, k, 2] * f_1
-        + n.sensor_weights[part, k, 3] * f_2
+        weights[part, k, 0] * s.sensed[j]
+        + weights[part, k, 1] * f_0
+        + weights[part, k, 2] * f_1
+        + weights[part, k, 3] * f_2
     )
 
 
@@ -429,12 +403,11 @@ def synchronise(plant: PlantRecords, k: int) -> None:
 
     Its DC link has been charged to its reference meanwhile, and its DC source starts from zero.
     """
-    s, now, i = plant.st[k], plant.now[0], own(k) + V
-    v_r, v_i = now.w[i, 0], now.w[i, 1]
-    size = math.sqrt(v_r * v_r + v_i * v_i)
-    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
-    s.x[DELTA] += math.atan2(v_i * u_r - v_r * u_i, v_r * u_r + v_i * u_i)
-    now.unit[k, 0], now.unit[k, 1] = v_r / size, v_i / size
+    s, now = plant.st[k], plant.now[0]
+    v, unit = field(now, "w")[own(k) + V], field(now, "unit")
+    size, ahead = _length(v), v * unit[k].conjugate()
+    s.x[DELTA] += math.atan2(ahead.imag, ahead.real)
+    unit[k] = complex(v.real / size, v.imag / size)
     s.x[V_DC] = s.sensed[0] = 1.0
     s.i_reg = s.i_source = 0.0
     for j in range(N_COMMANDS):
@@ -471,8 +444,8 @@ def _reconnect(plant: PlantRecords) -> None:
 def _write_x(plant: PlantRecords, k: int) -> None:
     """Write the currents and voltages of Eq. (1)-(6): w in the converter's own frame."""
     r, s, now = plant.par[k], plant.st[k], plant.now[0]
-    u_r, u_i = now.unit[k, 0], now.unit[k, 1]
+    back = field(now, "unit")[k].conjugate()
     for i in range(3):
-        scale = 1.0 if i == V else r.current
-        w_r, w_i = now.w[own(k) + i, 0] * scale, now.w[own(k) + i, 1] * scale
-        s.x[2 * i], s.x[2 * i + 1] = w_r * u_r + w_i * u_i, w_i * u_r - w_r * u_i
+        scale, w = 1.0 if i == V else r.current, field(now, "w")[own(k) + i]
+        turned = complex(w.real * scale, w.imag * scale) * back
+        s.x[2 * i], s.x[2 * i + 1] = turned.real, turned.imag

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from gfm_plant.build import CONNECTION, FAR, LINE
 from gfm_plant.circuit import GROUND, Branch
+from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.emulator import reconnect, synchronise
 from gfm_plant.model import DELTA
 from gfm_plant.names import FAULTED_PHASES
@@ -35,7 +36,7 @@ def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) ->
             there is none.
     """
     _needs_grid(plant)
-    if plant.net[0]["H"][0] > 0:
+    if len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
     plant.now["omega_g_to"], plant.now["omega_g_rate"] = omega_g, _rate(rate)
@@ -83,9 +84,9 @@ def grid_load(plant: Network, change: float) -> None:
         ValueError: If the grid is ideal, or `change` is not finite.
     """
     _require("change", change, True, "finite")
-    if plant.net[0]["H"][0] == 0:
+    if not len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
-    plant.now["P_load"][0, 0] += change
+    plant.of(FiniteGrid)["P_load"] += change
 
 
 def fault(
@@ -125,45 +126,15 @@ def fault(
             unchanged.
     """
     wiring = plant.wiring
-    if kind not in FAULTED_PHASES:
-        raise ValueError(f"kind = {kind!r}: must be one of {list(FAULTED_PHASES)}")
-    phases = FAULTED_PHASES[kind][0] if phases is None else phases
-    if phases not in FAULTED_PHASES[kind]:
-        allowed = list(FAULTED_PHASES[kind])
-        raise ValueError(f"phases = {phases!r}: must be one of {allowed} for kind {kind!r}")
-    if Z_0 is not None:
-        if kind not in ("LG", "LLG"):
-            raise ValueError(
-                f"X_0, R_0: no current of kind {kind!r} goes to ground; leave them out"
-            )
-        _require("X_0", Z_0.imag, Z_0.imag >= 0, ">= 0 p.u.")
-        _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
-    if position is not None:
-        inner = LEAST_SEGMENT <= position <= 1 - LEAST_SEGMENT
-        ends = f"0, or in [{LEAST_SEGMENT:g}, {1 - LEAST_SEGMENT:g}]"
-        _require("position", position, position == 0 or inner, ends)
-        lines = wiring.named_lines()
-        for name, _ in wiring.transformers:
-            del lines[name]
-        if line is None:
-            line = LINE if wiring.units[0].node == CONNECTION else wiring.units[0].name
-        if line not in lines:
-            raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
-        node = lines[line].start
-        inside = lines[line].name if position > 0 else None
-    elif node not in wiring.nodes:
-        raise ValueError(f"node = {node!r}: must be one of {sorted(wiring.nodes)}")
-    else:
-        position, inside = 0.0, None
-    if inside is None and node == wiring.grid and wiring.closed:
-        raise ValueError(f"node = {node!r}: is an ideal voltage; put the fault on a line to it")
+    phases = _phases(kind, phases, Z_0)
+    node, inside, where = _place(wiring, position, line, node)
     charged = {unit.terminal for unit in wiring.units} | {c.node for c in wiring.capacitors}
     least = LEAST_FAULT_R if inside is None and node in charged else 0.0
-    where = f"position {position:g}" if line is not None else f"node {node}"
     _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    changed = replace(wiring, fault=FaultPlace(node, inside, position, R, kind, phases, Z_0))
+    place = FaultPlace(node, inside, position or 0.0, R, kind, phases, Z_0)
+    changed = replace(wiring, fault=place)
     if kind in ("LG", "LLG") and changed.zero_sequence() is None:
         raise ValueError(
             f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
@@ -172,6 +143,55 @@ def fault(
     plant.rewire(changed)
     plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
     reconnect(plant.records)
+
+
+def _phases(kind: str, phases: str | None, Z_0: complex | None) -> str:
+    """The phases that a fault connects.
+
+    Raises:
+        ValueError: If there is no such kind, or it cannot have these phases or this impedance.
+    """
+    if kind not in FAULTED_PHASES:
+        raise ValueError(f"kind = {kind!r}: must be one of {list(FAULTED_PHASES)}")
+    allowed = list(FAULTED_PHASES[kind])
+    if phases is not None and phases not in allowed:
+        raise ValueError(f"phases = {phases!r}: must be one of {allowed} for kind {kind!r}")
+    if Z_0 is not None:
+        if kind not in ("LG", "LLG"):
+            raise ValueError(
+                f"X_0, R_0: no current of kind {kind!r} goes to ground; leave them out"
+            )
+        _require("X_0", Z_0.imag, Z_0.imag >= 0, ">= 0 p.u.")
+        _require("R_0", Z_0.real, Z_0.real >= 0, ">= 0 p.u.")
+    return phases or allowed[0]
+
+
+def _place(
+    wiring: Wiring, position: float | None, line: str | None, node: str | None
+) -> tuple[str, str | None, str]:
+    """The node of a fault, or that at the start of its branch; the name of the branch if the fault
+    is inside one; and the words for the place.
+
+    Raises:
+        ValueError: If there is no such place, or no current could flow there.
+    """
+    inside = None
+    if position is not None:
+        inner = LEAST_SEGMENT <= position <= 1 - LEAST_SEGMENT
+        ends = f"0, or in [{LEAST_SEGMENT:g}, {1 - LEAST_SEGMENT:g}]"
+        _require("position", position, position == 0 or inner, ends)
+        lines = {n: one for n, one in wiring.named_lines().items() if not one.earthed}
+        if line is None:
+            line = LINE if wiring.units[0].node == CONNECTION else wiring.units[0].name
+        if line not in lines:
+            raise ValueError(f"line = {line!r}: must be one of {sorted(lines)}")
+        node = lines[line].start
+        inside = lines[line].name if position > 0 else None
+    elif node not in wiring.nodes:
+        raise ValueError(f"node = {node!r}: must be one of {sorted(wiring.nodes)}")
+    if inside is None and node == wiring.grid and wiring.closed:
+        raise ValueError(f"node = {node!r}: is an ideal voltage; put the fault on a line to it")
+    return node, inside, f"node {node}" if line is None else f"position {position or 0.0:g}"
 
 
 def clear_fault(plant: Network) -> None:
@@ -207,17 +227,13 @@ def grid_unbalance(
         _require("duration", duration, duration > 0, "> 0 s")
     turn = complex(-0.5, math.sqrt(0.75))
     positive, negative = (a + b + c) / 3, (a + turn * b + turn.conjugate() * c) / 3
-    plant.now["sequence"][0] = [
-        [positive.real, positive.imag],
-        # of the space vector v = v+ e^(j omega t) + conj(v-) e^(-j omega t)
-        [negative.real, -negative.imag],
-    ]
+    # of the space vector v = v+ e^(j omega t) + conj(v-) e^(-j omega t)
+    plant.now["sequence"] = positive, negative.conjugate()
     # what turns the other way, in a frame that turns with omega_b
     n, g = plant.net[0], _grid_source(plant)
     angle = 2 * math.remainder(float(n["omega_b"] * n["T_s"]) * int(plant.st[0]["tick"]), math.pi)
-    at = plant.now["unit"][0, g]
-    unit = complex(at[0], -at[1]) * cmath.exp(-1j * angle)
-    plant.now["unit"][0, g + 1] = unit.real, unit.imag
+    unit = plant.now["unit"][0]
+    unit[g + 1] = complex(unit[g]).conjugate() * cmath.exp(-1j * angle)
     balanced = a == b == c == 1
     plant.now["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
 
@@ -234,8 +250,8 @@ def phase_jump(plant: Network, degrees: float) -> None:
     plant.st["x"][:, DELTA] -= angle
     g = _grid_source(plant)
     for place, turn in ((g, angle), (g + 1, -angle)):
-        unit = complex(*plant.now["unit"][0, place]) * cmath.exp(1j * turn)
-        plant.now["unit"][0, place] = unit.real, unit.imag
+        unit = plant.now["unit"][0]
+        unit[place] = complex(unit[place]) * cmath.exp(1j * turn)
 
 
 def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
@@ -359,7 +375,7 @@ def check_synchronism(
 
 
 @dataclass(frozen=True)
-class Checked:
+class SynchroCheckResult:
     """How a synchro-check ended.
 
     Attributes:
@@ -376,7 +392,7 @@ class Checked:
     degrees: float
 
 
-def finish_check(plant: Network) -> Checked | None:
+def finish_check(plant: Network) -> SynchroCheckResult | None:
     """Close the breaker whose synchro-check has agreed, or end a check whose time is over; None if
     there is nothing to do."""
     state, check = int(plant.now[0]["check"]), plant.wiring.check
@@ -390,7 +406,7 @@ def finish_check(plant: Network) -> Checked | None:
     else:
         breaker(plant, True)
     differences = V, speed / plant.wiring.omega_b, math.degrees(angle)
-    return Checked(check.name, state != TIME_OVER, *differences)
+    return SynchroCheckResult(check.name, state != TIME_OVER, *differences)
 
 
 def _breaker(plant: Network, name: str) -> tuple[str, str, str]:

@@ -1,8 +1,7 @@
 """The converter of Eq. (1)-(8) with R_f: the one copy of its equations.
 
-Everything that needs the plant takes it from here: the fixed-step emulator, SciPy's solvers in
-the tests, the steady state, and linearisation by complex step. Hence no abs, min or max, and no
-argument has a fixed type: float64 and complex128 both work.
+SciPy's solvers in the tests, the steady state, and linearisation by complex step take it from here.
+Hence no abs, min or max, and no argument has a fixed type: float64 and complex128 both work.
 
 All quantities are in p.u. (`gfm_plant.bases`), time is in s, angles are in rad. The order is
 x = (i_d, i_q, v_d, v_q, i_od, i_oq, delta, v_dc), u = (i_u, omega_u, E_u),
@@ -11,7 +10,7 @@ y = (v_dc, p, omega_u, q, V) and d = (omega_g, V_g), as in the paper.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,54 +19,6 @@ from gfm_runtime.compiled import cached, compiled
 
 N_X, N_U, N_Y = 8, 3, 5
 DELTA, V_DC = 6, 7  # where the angle and the DC voltage sit in x
-
-
-class Rates(NamedTuple):
-    """The circuit as Eq. (1)-(8) use it: a storage element acts through omega_b over its value.
-
-    `per_*` is in 1/s (p.u. of state per p.u. of drive and s), resistors are in p.u. of Z_b.
-    """
-
-    omega_b: float
-    per_L_f: float
-    R_f: float
-    per_C_f: float
-    per_L_g: float
-    R_g: float
-    per_C_dc: float
-
-
-@compiled
-def rates(r: Any, bridge: float) -> Rates:
-    """Return the rates of `r`, one entry of `converter_par_dtype`.
-
-    `bridge` is 1 in operation. 0 takes L_f out of the circuit: with i_d = i_q = 0 the same
-    equations then describe a blocked bridge.
-    """
-    w = r.omega_b
-    return Rates(w, bridge * w / r.L_f, r.R_f, w / r.C_f, w / r.L_g, r.R_g, w / r.C_dc)
-
-
-@compiled
-def circuit(
-    i_d: Any, i_q: Any, v_d: Any, v_q: Any, i_od: Any, i_oq: Any, v_dc: Any,
-    i_dc: Any, omega_u: Any, E_u: Any, v_gd: Any, v_gq: Any, c: Rates,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Return d/dt of the first seven arguments, in p.u./s: Eq. (1)-(6) with R_f, and Eq. (8).
-
-    v_gd = V_g cos(delta) and v_gq = -V_g sin(delta) are the grid voltage in the converter's
-    frame; passing them instead of delta keeps trigonometry out of the emulator's inner loop.
-    """
-    w = c.omega_b * omega_u
-    return (
-        c.per_L_f * (E_u - v_d - c.R_f * i_d) + w * i_q,
-        c.per_L_f * (-v_q - c.R_f * i_q) - w * i_d,
-        c.per_C_f * (i_d - i_od) + w * v_q,
-        c.per_C_f * (i_q - i_oq) - w * v_d,
-        c.per_L_g * (v_d - v_gd - c.R_g * i_od) + w * i_oq,
-        c.per_L_g * (v_q - v_gq - c.R_g * i_oq) - w * i_od,
-        c.per_C_dc * (i_dc - E_u * i_d / v_dc),
-    )
 
 
 @compiled
@@ -81,19 +32,24 @@ def terminal(v_d: Any, v_q: Any, i_od: Any, i_oq: Any) -> tuple[Any, Any, Any]:
 
 @cached
 def f(x: NDArray[Any], u: NDArray[Any], d: NDArray[Any], par: NDArray[np.void]) -> NDArray[Any]:
-    """Return dx/dt, shape (8,), of the state x (8,) under u (3,) and d (2,), all of one dtype.
-
-    The DC source is the paper's controlled current: i_dc = i_u.
+    """Return dx/dt, shape (8,), of the state x (8,) under u (3,) and d (2,), all of one dtype:
+    Eq. (1)-(8) with R_f. The DC source is the paper's controlled current: i_dc = i_u.
     """
-    delta = x[DELTA]
-    c = rates(par[0], 1.0)
-    v_gd, v_gq = d[1] * np.cos(delta), -d[1] * np.sin(delta)
-    slope = circuit(x[0], x[1], x[2], x[3], x[4], x[5], x[V_DC], u[0], u[1], u[2], v_gd, v_gq, c)
+    r, omega_b = par[0], par[0].omega_b
+    i_d, i_q, v_d, v_q, i_od, i_oq, delta, v_dc = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+    i_u, omega_u, E_u, omega_g, V_g = u[0], u[1], u[2], d[0], d[1]
+    v_gd, v_gq = V_g * np.cos(delta), -V_g * np.sin(delta)
+    per_L_f, per_C_f, per_L_g = omega_b / r.L_f, omega_b / r.C_f, omega_b / r.L_g
+    w = omega_b * omega_u
     dx = np.empty_like(x)
-    for i in range(6):
-        dx[i] = slope[i]
-    dx[DELTA] = c.omega_b * (u[1] - d[0])
-    dx[V_DC] = slope[6]
+    dx[0] = per_L_f * (E_u - v_d - r.R_f * i_d) + w * i_q
+    dx[1] = per_L_f * (-v_q - r.R_f * i_q) - w * i_d
+    dx[2] = per_C_f * (i_d - i_od) + w * v_q
+    dx[3] = per_C_f * (i_q - i_oq) - w * v_d
+    dx[4] = per_L_g * (v_d - v_gd - r.R_g * i_od) + w * i_oq
+    dx[5] = per_L_g * (v_q - v_gq - r.R_g * i_oq) - w * i_od
+    dx[6] = omega_b * (omega_u - omega_g)
+    dx[7] = omega_b / r.C_dc * (i_u - E_u * i_d / v_dc)
     return dx
 
 

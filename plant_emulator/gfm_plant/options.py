@@ -11,10 +11,18 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
+from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.names import SENSED
-from gfm_plant.parameters import Element, NonNegative, Positive, check_factors, load_converter
+from gfm_plant.parameters import (
+    Element,
+    NonNegative,
+    Options,
+    Positive,
+    check_factors,
+    load_converter,
+)
 from gfm_plant.records import MAX_DELAY, N_OVERLOADS
 from gfm_runtime.signals import Y_NAMES, carried, names
 
@@ -23,12 +31,6 @@ Command = Literal["i_u", "omega_u", "E_u", "E_q"]
 MEASURED = cast("tuple[Measured, ...]", (*(Y_NAMES[k] for k in SENSED), *names("y_inner")))
 COMMANDS = cast("tuple[Command, ...]", carried("u", inner=True))
 """The channels, in the order of the records."""
-
-
-class Options(BaseModel):
-    """Base of all options: unknown keys, wrong types and NaN are errors; instances are frozen."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 class DcSource(Options):
@@ -47,16 +49,6 @@ class DcSource(Options):
         description="lag between the current that is asked for, within i_max, and the current that "
         "flows, s; none if not given",
     )
-
-
-class FiniteGrid(Options):
-    """A grid that reacts: the swing equation of all its machines as one, with a governor."""
-
-    S: Positive = Field(description="rating of the grid over that of the converter")
-    H: Positive = Field(description="inertia constant, s")
-    D: NonNegative = Field(0.0, description="power of the loads by frequency, p.u./p.u.")
-    droop: Positive = Field(0.05, description="frequency by power of the governors, p.u./p.u.")
-    T_gov: Positive = Field(0.5, description="lag of governors and turbines, s")
 
 
 class Grid(Options):
@@ -334,111 +326,3 @@ class Plant(Options):
                 f"plant.grid.x_over_r = {self.grid.x_over_r}: needs a converter file with R_g > 0"
             )
         return {**self.factors, **{name: line[name] / nominal[name] for name in line}}
-
-
-class Line(Options):
-    """R and L in series between two nodes of a network."""
-
-    start: str = Field(min_length=1, description="node at its start")
-    end: str = Field(min_length=1, description="node at its end")
-    L: Positive = Field(description="p.u. of the first converter")
-    R: NonNegative = Field(0.0, description="p.u. of the first converter")
-    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
-
-
-class Transformer(Options):
-    """A transformer between two nodes: its leakage in series, and its magnetising inductance from
-    the start to ground. It has the ratio of the nominal voltages, so that in p.u. it has none; the
-    angle by which a delta winding turns all voltages is left out, and it does not saturate. For a
-    zero sequence the earthed star point of one side, with a delta on the other, is a path to ground
-    through the leakage."""
-
-    start: str = Field(min_length=1, description="node at its start, such as the converter's side")
-    end: str = Field(min_length=1, description="node at its end")
-    S: Positive = Field(description="rating over that of the first converter")
-    X: Positive = Field(description="leakage reactance, p.u. of its rating")
-    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
-    X_m: Positive | None = Field(
-        None, description="magnetising reactance, p.u. of its rating; none: no magnetising current"
-    )
-    earthed: Literal["end", "start", "both", "none"] = Field(
-        "end",
-        description="where its star points are earthed; the other winding is a delta, and with "
-        "both a zero sequence passes through",
-    )
-    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
-
-
-class Load(Options):
-    """A load between a node and ground: R and L in series that draw P and Q at nominal voltage and
-    frequency; without Q a resistor."""
-
-    node: str = Field(min_length=1, description="where it is")
-    P: NonNegative = Field(
-        description="active power at nominal voltage, p.u. of the first converter"
-    )
-    Q: NonNegative = Field(
-        0.0, description="reactive power at nominal voltage, p.u. of the first converter"
-    )
-    closed: bool = Field(True, description="whether its breaker is closed when the run begins")
-
-    @model_validator(mode="after")
-    def _draws_something(self) -> Load:
-        if self.P == self.Q == 0.0:
-            raise ValueError("P = 0, Q = 0: must draw something")
-        return self
-
-
-class ConstantPowerLoad(Options):
-    """A load whose control holds P and Q, such as a drive or a charger: it draws the current
-    conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
-    as the filter of such a load is."""
-
-    node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
-    P: float = Field(description="active power, p.u. of the first converter; negative: it feeds in")
-    Q: float = Field(0.0, description="reactive power, p.u.")
-    tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
-    V_least: Positive = Field(
-        0.7, description="below this voltage it is an impedance that draws P and Q there, p.u."
-    )
-    closed: bool = Field(True, description="its breaker at the start")
-
-
-class CapacitorBank(Options):
-    """Capacitors between a node and ground."""
-
-    node: str = Field(min_length=1, description="where it is")
-    Q: Positive = Field(
-        description="reactive power at nominal voltage, p.u. of the first converter"
-    )
-
-
-class Machine(Options):
-    """A synchronous machine in its classical model: a constant voltage behind the transient
-    reactance, the swing equation, and a governor. It has no voltage regulator, no dampers, no
-    saliency and no limits."""
-
-    node: str = Field(min_length=1, description="where it is")
-    S: Positive = Field(description="rating over that of the first converter")
-    H: Positive = Field(description="inertia constant, s")
-    P: float = Field(description="power at nominal frequency, p.u. of its rating")
-    E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")
-    X: Positive = Field(0.3, description="transient reactance, p.u. of its rating")
-    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
-    D: NonNegative = Field(0.0, description="damping by frequency, p.u./p.u.")
-    droop: Positive = Field(0.05, description="frequency by power of the governor, p.u./p.u.")
-    T_gov: Positive = Field(0.5, description="lag of governor and turbine, s")
-
-
-class NetworkParts(Options):
-    """What connects several converters, by its names."""
-
-    grid: str | None = Field(
-        None, min_length=1, description="node of the grid of plant.grid; an island if none"
-    )
-    lines: dict[str, Line] = Field({}, description="between nodes, by name")
-    transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
-    loads: dict[str, Load] = Field({}, description="by name")
-    constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
-    capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
-    machines: dict[str, Machine] = Field({}, description="by name")

@@ -42,10 +42,14 @@ ELEMENTS: dict[Element, str] = {
 """The circuit elements and the quantity whose base each is expressed in."""
 
 
-class ConverterParameters(BaseModel):
-    """Nominal elements of one converter and its line, in SI units (`converters/*.toml`)."""
+class Options(BaseModel):
+    """Base of all options: unknown keys, wrong types and NaN are errors; instances are frozen."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class ConverterParameters(Options):
+    """Nominal elements of one converter and its line, in SI units (`converters/*.toml`)."""
 
     source: str = Field(description="where the numbers come from")
     S_n: Positive = Field(description="nominal power, VA")

@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from gfm_plant.layout import field
 from gfm_plant.names import (
     BAD_COMMAND,
     CONTROLLER,
@@ -33,7 +34,7 @@ from gfm_plant.names import (
 )
 from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecords
 from gfm_plant.solution import I_F, V, circuit, enter, own
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 
 _BLOCKED = {
     SAFE_STATE: CONTROLLER_SAFE,
@@ -42,16 +43,31 @@ _BLOCKED = {
     LEFT: CONTROLLER_LEFT,
 }
 _FOLLOW_S = 0.02
-_LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
+LEAST_V = 0.2  # p.u.; a smaller voltage has no angle that a relay could read
+
+
+@inlined
+def has_angle(a: complex, b: complex) -> bool:
+    """Return whether both voltages have an angle that a relay could read."""
+    return min(a.real * a.real + a.imag * a.imag, b.real * b.real + b.imag * b.imag) > (
+        LEAST_V * LEAST_V
+    )
+
+
+@inlined
+def turn(a: complex, b: complex) -> float:
+    """Return the angle from a to b, rad."""
+    return math.atan2(a.real * b.imag - a.imag * b.real, a.real * b.real + a.imag * b.imag)
 
 
 @compiled
 def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
     """Latch a trip of converter k, if none is latched: its bridge blocks, its DC source turns off.
 
-    The current of L_f is taken as interrupted at once. From here on the converter obeys no command;
-    its frame turns with the grid. The circuits are at hand for one converter that trips; a second
-    one trips a tick later, when Python has made those for two (`gfm_plant.grid.take_out`).
+    The current of L_f is taken as interrupted at once. From here on the plant ignores the
+    converter's commands; its frame turns with the grid. The circuits are at hand for one converter
+    that trips; a second one trips a tick later, when Python has made those for two
+    (`gfm_plant.grid.take_out`).
     """
     s, n, now = plant.st[k], plant.net[0], plant.now[0]
     if s.trip == 0 and now.row == 0:
@@ -60,7 +76,8 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
         s.trip_value = value
         s.waits, s.omega_seen = NOT_ASKED, s.u_now[1]
         i = own(k) + I_F
-        s.x[0] = s.x[1] = now.w[i, 0] = now.w[i, 1] = s.i_source = s.E[0] = s.E[1] = 0.0
+        s.x[0] = s.x[1] = s.i_source = s.E[0] = s.E[1] = 0.0
+        field(now, "w")[i] = 0j
         now.row = 1 + k
         enter(n, now, plant.st[0].tick, circuit(n, now))
         s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
@@ -71,9 +88,9 @@ def follow_voltage(plant: PlantRecords, k: int) -> None:
     """Follow the speed of the capacitor's voltage of the blocked converter k over the last tick,
     p.u., through a low-pass of 20 ms: what a phase-locked loop would tell it."""
     n, s, now, i = plant.net[0], plant.st[k], plant.now[0], own(k) + V
-    a, b, c, d = now.w_before[i, 0], now.w_before[i, 1], now.w[i, 0], now.w[i, 1]
-    if min(a * a + b * b, c * c + d * d) > _LEAST_V * _LEAST_V:
-        omega = 1.0 + math.atan2(a * d - b * c, a * c + b * d) / (n.omega_b * n.T_s)
+    before, v = field(now, "w_before")[i], field(now, "w")[i]
+    if has_angle(before, v):
+        omega = 1.0 + turn(before, v) / (n.omega_b * n.T_s)
         s.omega_seen += (1.0 - math.exp(-n.T_s / _FOLLOW_S)) * (omega - s.omega_seen)
 
 
@@ -87,7 +104,7 @@ def start_condition(plant: PlantRecords, k: int) -> int:
     """
     r, s = plant.par[k], plant.st[k]
     v = math.sqrt(s.x[2] ** 2 + s.x[3] ** 2)
-    if v <= _LEAST_V or (r.trip_ticks[2] >= 0 and v < r.trip_limit[2]):
+    if v <= LEAST_V or (r.trip_ticks[2] >= 0 and v < r.trip_limit[2]):
         return WOULD_TRIP + 2
     if r.trip_ticks[1] >= 0 and v > r.trip_limit[1]:
         return WOULD_TRIP + 1
@@ -127,15 +144,14 @@ def _look_back(plant: PlantRecords, k: int, i: float) -> None:
     """Take the RMS of the current i and the speed of the voltage over the last cycle, or over the
     ticks so far while they are fewer."""
     r, s, now = plant.par[k], plant.st[k], plant.now[0]
-    a, b = s.v_before[0], s.v_before[1]
-    c, d = now.w[own(k) + V, 0], now.w[own(k) + V, 1]
+    before, v = complex(s.v_before[0], s.v_before[1]), field(now, "w")[own(k) + V]
     if s.looked == 0:
         s.omega_v = s.u_now[1]
-    elif min(a * a + b * b, c * c + d * d) > _LEAST_V * _LEAST_V:
-        s.sums[1] += math.atan2(a * d - b * c, a * c + b * d)
+    elif has_angle(before, v):
+        s.sums[1] += turn(before, v)
     else:  # it goes on as it was
         s.sums[1] += r.omega_b * r.T_s * (s.omega_v - 1.0)
-    s.v_before[0], s.v_before[1] = c, d
+    s.v_before[0], s.v_before[1] = v.real, v.imag
     s.sums[0] += i * i
     s.looked += 1
     if s.looked % r.place_ticks != 0:
@@ -175,7 +191,7 @@ def wait_reason(plant: PlantRecords, k: int) -> str:
     if quantity == "omega_u":
         value, quantity = float(s["omega_seen"]), "omega of V"
     elif sign < 0:
-        limit = max(_LEAST_V, limit if r["trip_ticks"][what] >= 0 else 0.0)
+        limit = max(LEAST_V, limit if r["trip_ticks"][what] >= 0 else 0.0)
     return (
         f"{name.replace('_', '-')}: {quantity} = {value:.6g} p.u. at its capacitor, must be"
         f" {'at most' if sign > 0 else 'at least'} {limit:.6g} p.u."

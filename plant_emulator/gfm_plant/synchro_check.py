@@ -11,26 +11,27 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gfm_plant.layout import field
+from gfm_plant.protection import LEAST_V, turn
 from gfm_plant.records import PlantRecords
-from gfm_plant.solution import circuit, grid_source, machine_source
+from gfm_plant.solution import circuit, grid_source
 from gfm_runtime.compiled import compiled
 
 NONE, WATCHING, AGREED, TIME_OVER = range(4)
 """What a check is doing."""
 
 _FOLLOW_S = 0.02
-_LEAST_V = 0.2  # p.u.
 
 
 @compiled
 def watch(plant: PlantRecords) -> None:
     """Look at the two sides after a tick, and say in ``check`` if the time has come."""
     n, now = plant.net[0], plant.now[0]
-    a_r, a_i = _voltage(n, now, 0)
-    b_r, b_i = _voltage(n, now, 1)
-    a, b = math.sqrt(a_r * a_r + a_i * a_i), math.sqrt(b_r * b_r + b_i * b_i)
-    angle = math.atan2(a_i * b_r - a_r * b_i, a_r * b_r + a_i * b_i)
-    agree = min(a, b) > _LEAST_V and not n.unbalanced[circuit(n, now)]
+    one, other = _voltage(n, now, 0), _voltage(n, now, 1)
+    a = math.sqrt(one.real * one.real + one.imag * one.imag)
+    b = math.sqrt(other.real * other.real + other.imag * other.imag)
+    angle = turn(other, one)
+    agree = min(a, b) > LEAST_V and not field(n, "unbalanced")[circuit(n, now)]
     if agree and now.check_looks > 0:
         turned = angle - now.check_seen[2]
         turned -= 2.0 * math.pi * math.floor(turned / (2.0 * math.pi) + 0.5)
@@ -50,22 +51,19 @@ def watch(plant: PlantRecords) -> None:
 
 
 @compiled
-def _voltage(n: Any, now: Any, side: int) -> tuple[float, float]:
+def _voltage(n: Any, now: Any, side: int) -> complex:
     """Return the voltage of a side in the common frame, p.u."""
-    c = circuit(n, now)
-    v_r = v_i = 0.0
+    c, w, unit, emf = circuit(n, now), field(now, "w"), field(now, "unit"), field(n, "emf")
+    by_w, by_source = field(n, "check_w"), field(n, "check_s")
+    v = 0j
     for i in range(n.n_states):
-        v_r += n.check_w[c, side, i] * now.w[i, 0]
-        v_i += n.check_w[c, side, i] * now.w[i, 1]
+        v += complex(by_w[c, side, i] * w[i].real, by_w[c, side, i] * w[i].imag)
     g = grid_source(n)
-    by = now.V_g * n.check_s[c, side, g]
+    by = now.V_g * by_source[c, side, g]
     if by != 0.0:
         for k in range(2):  # its two sequences
-            s_r, s_i = by * now.sequence[k, 0], by * now.sequence[k, 1]
-            v_r += s_r * now.unit[g + k, 0] - s_i * now.unit[g + k, 1]
-            v_i += s_r * now.unit[g + k, 1] + s_i * now.unit[g + k, 0]
-    for j in range(1, n.n_machines + 1):
-        k = machine_source(n, j)
-        v_r += n.check_s[c, side, k] * n.E[j] * now.unit[k, 0]
-        v_i += n.check_s[c, side, k] * n.E[j] * now.unit[k, 1]
-    return v_r, v_i
+            v += complex(by * now.sequence[k].real, by * now.sequence[k].imag) * unit[g + k]
+    for k in range(g + 2, now.n_s):
+        by = by_source[c, side, k] * emf[k]
+        v += complex(by * unit[k].real, by * unit[k].imag)
+    return v

@@ -16,25 +16,24 @@ from gfm_plant.circuit import (
     GROUND,
     Branch,
     Capacitor,
+    CurrentSource,
     Modes,
     Shunt,
-    Sink,
-    Source,
+    VoltageSource,
     find_modes,
     find_voltage,
     join_axes,
 )
+from gfm_plant.components.part import Fed, emf
 from gfm_plant.names import FAULTED_PHASES
 
 GRID_SOURCE = "grid"
-MAGNETISING = ".m"
-"""Behind the name of a transformer: its magnetising inductance, a branch to ground."""
 ALPHA, BETA = 0, 1
 """The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
 
 @dataclass(frozen=True)
-class Unit:
+class ConverterCircuit:
     """A converter as the circuit sees it: bridge, filter, and the line to its node.
 
     Attributes:
@@ -69,26 +68,6 @@ class Unit:
     def line(self) -> str:
         """The name of its line."""
         return f"{self.name}.i_o"
-
-
-@dataclass(frozen=True)
-class Machine:
-    """A synchronous machine as the circuit sees it: a voltage behind a reactance.
-
-    Attributes:
-        node: where it is connected.
-        X, R: its transient reactance and its resistance, p.u. of the network.
-    """
-
-    name: str
-    node: str
-    X: float
-    R: float
-
-    @property
-    def emf(self) -> str:
-        """The node, and the source, of its voltage."""
-        return f"{self.name}.emf"
 
 
 @dataclass(frozen=True)
@@ -170,32 +149,27 @@ class Wiring:
         branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
         shunts: loads that are resistors.
         capacitors: banks of them.
-        sinks: loads of constant power.
-        machines: the synchronous machines, whose breakers have their names.
+        fed: by their names the components with sources, voltages before currents.
         grid: node of the grid, None: there is none.
         closed: whether the grid's breaker is closed.
         opened: names of branches whose breakers are open.
         fault: where one is, or may be again, or None.
         blocked: indices of converters whose bridges are out of every circuit.
         check: the synchro-check that waits to close a breaker, or None.
-        transformers: names of the branches that are one, and where it is earthed: as
-            `options.Transformer`.
     """
 
     omega_b: float
-    units: tuple[Unit, ...]
+    units: tuple[ConverterCircuit, ...]
     branches: tuple[Branch, ...] = ()
     shunts: tuple[Shunt, ...] = ()
     capacitors: tuple[Capacitor, ...] = ()
-    sinks: tuple[Sink, ...] = ()
-    machines: tuple[Machine, ...] = ()
+    fed: tuple[tuple[str, Fed], ...] = ()
     grid: str | None = None
     closed: bool = True
     opened: frozenset[str] = frozenset()
     fault: FaultPlace | None = None
     blocked: frozenset[int] = frozenset()
     check: Check | None = None
-    transformers: tuple[tuple[str, str], ...] = ()
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -206,7 +180,7 @@ class Wiring:
         beyond: tuple[str, ...] = () if self.split is None else ("beyond",)
         if self.fault is not None and self.fault.kind in ("LG", "LLG"):
             beyond += ("fault",)
-        others = [part.name for part in (*self.branches, *self.machine_branches)]
+        others = [part.name for part in (*self.branches, *self.fed_branches)]
         others += [bank.name for bank in self.capacitors]
         return (*own, *others, *beyond)
 
@@ -215,7 +189,7 @@ class Wiring:
         """The nodes between the parts, each once."""
         ends = [unit.node for unit in self.units]
         ends += [node for branch in self.branches for node in (branch.start, branch.end)]
-        ends += [machine.node for machine in self.machines]
+        ends += [one.node for _, one in self.fed if one.is_voltage]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
         ends += [sink.node for sink in self.sinks]
         return tuple(dict.fromkeys(node for node in ends if node != GROUND))
@@ -231,9 +205,23 @@ class Wiring:
         return tuple(Branch(u.line, u.terminal, u.node, u.L_g, u.R_g) for u in self.units)
 
     @property
-    def machine_branches(self) -> tuple[Branch, ...]:
-        """From the machines' voltages to their nodes."""
-        return tuple(Branch(m.name, m.emf, m.node, m.X, m.R) for m in self.machines)
+    def fed_branches(self) -> tuple[Branch, ...]:
+        """From the voltages of components to their nodes."""
+        each = (part for name, one in self.fed for part in one.elements(name))
+        return tuple(part for part in each if isinstance(part, Branch))
+
+    @property
+    def sinks(self) -> tuple[CurrentSource, ...]:
+        """The currents of components."""
+        each = (part for name, one in self.fed for part in one.elements(name))
+        return tuple(part for part in each if isinstance(part, CurrentSource))
+
+    def sources(self) -> dict[str, int]:
+        """The place of each source in the compiled plant; that of the grid is followed by its
+        negative sequence."""
+        names = [unit.bridge for unit in self.units] + [GRID_SOURCE, ""]
+        names += [emf(name) if one.is_voltage else name for name, one in self.fed]
+        return {name: place for place, name in enumerate(names) if name}
 
     def named_lines(self) -> dict[str, Branch]:
         """Lines and transformers by the name that people use: a converter's line has that of the
@@ -245,8 +233,7 @@ class Wiring:
     def has_load(self) -> bool:
         """Whether anything is left to feed without the grid."""
         return bool(self.shunts or self.sinks) or any(
-            branch.end == GROUND and not branch.name.endswith(MAGNETISING)
-            for branch in self.branches
+            branch.end == GROUND and branch.switched for branch in self.branches
         )
 
     def to_grid(self) -> dict[str, float]:
@@ -254,7 +241,7 @@ class Wiring:
         found: dict[str, float] = {}
         if self.grid is None or not self.closed:
             return found
-        for branch in self._whole((*self.units_lines, *self.branches, *self.machine_branches)):
+        for branch in self._whole((*self.units_lines, *self.branches, *self.fed_branches)):
             if self.grid in (branch.start, branch.end):
                 found[branch.name] = 1.0 if branch.end == self.grid else -1.0
         return found
@@ -273,11 +260,9 @@ class Wiring:
         """By the name that people use: the branch or shunt that a breaker opens, and the nodes at
         its two ends."""
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
-        lines = (*self.branches, *self.machine_branches)
-        found |= {
-            b.name: (b.name, b.start, b.end) for b in lines if not b.name.endswith(MAGNETISING)
-        }
-        to_ground: tuple[Shunt | Sink, ...] = (*self.shunts, *self.sinks)
+        lines = (*self.branches, *self.fed_branches)
+        found |= {b.name: (b.name, b.start, b.end) for b in lines if b.switched}
+        to_ground: tuple[Shunt | CurrentSource, ...] = (*self.shunts, *self.sinks)
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
     def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
@@ -315,12 +300,12 @@ class Wiring:
         """
         if self.fault is None or self.fault.Z_0 is not None:
             return None if self.fault is None else self.fault.Z_0
-        earthed, found = dict(self.transformers), []
+        found = []
         for branch in self._whole((*self.units_lines, *self.branches)):
-            if branch.end == GROUND or earthed.get(branch.name) == "none":
+            if branch.end == GROUND or branch.earthed == "none":
                 continue
             ends = {"end": {branch.start}, "start": {branch.end}}.get(
-                earthed.get(branch.name, ""), {self.grid} if self.closed else set()
+                branch.earthed, {self.grid} if self.closed else set()
             )  # which of its ends are at ground
             one, other = (GROUND if end in ends else end for end in (branch.start, branch.end))
             found.append((one, other, 1 / complex(branch.R, branch.L)))
@@ -366,7 +351,7 @@ class Wiring:
 
     def _circuit(
         self, blocked: frozenset[int], faulted: bool, axis: int
-    ) -> tuple[list[Branch], list[Capacitor], list[Source], list[Shunt], list[Branch]]:
+    ) -> tuple[list[Branch], list[Capacitor], list[VoltageSource], list[Shunt], list[Branch]]:
         """The parts of a circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis."""
         filters, sources = [], []
@@ -384,18 +369,18 @@ class Wiring:
             if k not in blocked:
                 i_f = unit.states[0]
                 filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
-                sources.append(Source(unit.bridge, unit.bridge))
+                sources.append(VoltageSource(unit.bridge, unit.bridge))
         branches = [
             *self._whole(self.units_lines),
             *filters,
-            *self._whole((*self.branches, *self.machine_branches)),
+            *self._whole((*self.branches, *self.fed_branches)),
             *through_fault,
         ]
-        sources += [Source(machine.emf, machine.emf) for machine in self.machines]
+        sources += [VoltageSource(emf(name), emf(name)) for name, one in self.fed if one.is_voltage]
         capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]
         capacitors += self.capacitors
         if self.grid is not None and self.closed:
-            sources.append(Source(GRID_SOURCE, self.grid))
+            sources.append(VoltageSource(GRID_SOURCE, self.grid))
         whole, held = branches, {GROUND} | {source.node for source in sources}
         held |= {one.node for one in capacitors} | {one.node for one in shunts}
         if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may

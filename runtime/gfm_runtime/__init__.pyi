@@ -3,7 +3,7 @@ from .elements import Element
 from .errors import LawError
 from .kernel import law_dtype, pack_law, state_dtype, step
 from .law import HomeGrid, Law, Limits, Parameter
-from .lawfile import build_law, parse_law, read_law_file
+from .lawfile import build_law, parse_law, read_law_file, tied
 from .realisation import LawStateSpace, realise
 from .signals import SIGNALS, Signal
 from .switchover import change_law
@@ -36,5 +36,6 @@ __all__ = [
     "realise",
     "state_dtype",
     "step",
+    "tied",
     "tuned_names",
 ]

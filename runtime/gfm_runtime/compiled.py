@@ -122,5 +122,16 @@ compiled: Any = _decorator(**FREE)
 #: otherwise emit a call, pass every word of every array on the stack, and save registers
 inlined: Any = _decorator(**FREE, forceinline=True)
 
+
+def inlined_as(name: str, function: Callable[..., Any]) -> Any:
+    """As ``inlined``, for a function that is made at run time and calls functions it was made with.
+
+    It is kept as part of its callers alone, under this name, which tells it from others that were
+    made in the same place.
+    """
+    function.__name__ = function.__qualname__ = name
+    return njit(pipeline_class=_Named, **FREE, forceinline=True)(function)
+
+
 #: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
 cached: Any = _decorator(nogil=True, error_model="numpy")

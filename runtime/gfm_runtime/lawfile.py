@@ -1,7 +1,7 @@
 """Law files: a law element by element in TOML, with every number named and its source stated.
 
 The catalogue (``gfm_runtime/laws/*.toml``) and a user's own laws pass through the same loader
-and the same checks. ``docs/law-files.md`` shows one line by line.
+and the same checks. ``docs/laws.md`` shows one line by line.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import gfm_plant
+from gfm_design.margins.all_margins import loop_margins
 from gfm_design.model.closed_loop import INPUTS, ClosedLoop
 from gfm_design.model.network import LINES, NetworkLoop
 from gfm_hil.engine.inproc import run_ticks, stack
@@ -251,7 +252,7 @@ def test_margins_of_a_converter_are_those_of_the_network() -> None:
     and so with each of its gains (``confirmed``)."""
     network = loop(with_finite_grid(Path()))
     for name in ("A", "B"):
-        found = network.converter(name).margins()
+        found = loop_margins(network.converter(name))
         assert all(c.confirmed for c in (*found.u, *found.y))
         places = next(m.u for m in network.members if m.name == name)
         sigma = []

@@ -360,7 +360,7 @@ def _run_files() -> st.SearchStrategy[bytes]:
 def _segment(place: Path) -> Iterator[Take]:
     """An input is the content of a link's memory; ``@owner@`` stands for a living owner."""
     name = f"fuzz-{os.getpid()}"
-    path = segment.FOLDER / f"{segment.PREFIX}{name}"
+    path = scratch.private_folder() / f"{segment.PREFIX}{name}"
 
     def take(content: bytes) -> None:
         for role in ("plant", "controller"):
@@ -391,7 +391,7 @@ def _segments() -> st.SearchStrategy[bytes]:
     controller = ShmLink("controller", f"shm://{name}")
     try:
         controller.send(b"GFMHIL {}")
-        whole = (segment.FOLDER / f"{segment.PREFIX}{name}").read_bytes()
+        whole = (scratch.private_folder() / f"{segment.PREFIX}{name}").read_bytes()
     finally:
         controller.close()
     whole = whole.replace(segment._PLANT.pack(*segment.myself()), _OWNER)

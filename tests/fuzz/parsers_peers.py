@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.handshake import _what_runs, shake_hands
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
 from gfm_hil.links.can.layout import plan_of
-from gfm_hil.links.can.node import Node, bring, receive
-from gfm_hil.links.can.segments import LONGEST, SegmentSender
+from gfm_hil.links.can.node import TRANSPORT, Node, process
 from gfm_hil.links.can.vectors import VectorSender
-from gfm_hil.links.can.wire import frame_dtype
+from gfm_hil.links.can.wire import MOST, frame_dtype
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.links.serial.framing import Unstuffer, stuffed
 from gfm_hil.scenario import check_scenario
@@ -127,7 +127,7 @@ def _can(place: Path) -> Iterator[Take]:
         for fd, role in ((True, "controller"), (False, "plant")):
             node = Node(plans[fd], role, CanOptions(fd=fd))
             untouched = [part.copy() for part in (node.sender, node.sockets, node.out)]
-            room = np.full(LONGEST + 128, 0xA5, np.uint8)
+            room = np.full(MOST + 128, 0xA5, np.uint8)
             reader = FrameReader("y" if role == "controller" else "u")
             values = np.empty(NY if role == "controller" else NU)
             for at in range(0, len(content), 69):
@@ -135,9 +135,8 @@ def _can(place: Path) -> Iterator[Take]:
                 frame["id"], frame["length"] = struct.unpack("<IB", piece[:5])
                 frame["length"] %= 65  # no kernel delivers more
                 frame["data"] = np.frombuffer(piece[5:], np.uint8)
-                bring(node.handle, frame)
-                size = receive(node.handle, room[64:-64])
-                assert -2 <= size <= LONGEST
+                size = process(node.handle, frame[0], room[64:-64])
+                assert TRANSPORT <= size <= MOST
                 if size > 0:
                     with contextlib.suppress(FrameError):
                         reader.unpack(room[64 : 64 + size].tobytes(), values)
@@ -154,7 +153,7 @@ def _can_seeds() -> list[bytes]:
         plan = plan_of(read_dbc(write_dbc(fd)))
         sender, writer = VectorSender(plan, group, 3), FrameWriter(group)
         frames = [f for k in range(4) for f in sender.frames(writer.pack(k, 2, 0, values))]
-        frames += SegmentSender(plan, role).frames(b'GFMHIL {"kind": "hello", "role": "plant"}' * 4)
+        frames.append((plan.transport[role], b"\x07GFMHIL "))
         seeds.append(b"".join(struct.pack("<IB64s", n, len(d), d) for n, d in frames))
     return seeds
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.links import link_kind, open_link
-from gfm_hil.links.can.bus_time import classic_time, fd_time
+from gfm_hil.links.can.bus_time import frame_time
 from gfm_hil.links.can.emulation import (
     PLACES,
     arrive,
@@ -24,7 +24,7 @@ from gfm_hil.links.can.wire import ERROR, frame_dtype
 from ..support.can import frame_of
 
 BITRATE = 1_000_000
-FRAME = classic_time(8, BITRATE)
+FRAME = frame_time(8, False, BITRATE, BITRATE)
 
 
 class World:
@@ -69,7 +69,7 @@ def test_a_frame_takes_its_time():
 def test_a_frame_of_can_fd_takes_its_own():
     world = World(fd=True)
     world.arrive(5, length=12)
-    time = fd_time(12, BITRATE, 8 * BITRATE)
+    time = frame_time(12, True, BITRATE, 8 * BITRATE)
     assert world.heard_at(0.999 * time) == []
     assert world.heard_at(1.001 * time) == [5]
 
@@ -148,4 +148,4 @@ def test_a_link_waits_for_what_is_on_the_bus(tmp_path: Path, portable):
 def test_shorter_frames_take_less(length):
     world = World()
     world.arrive(5, length=length)
-    assert world.heard_at(1.001 * classic_time(length, BITRATE)) == [5]
+    assert world.heard_at(1.001 * frame_time(length, False, BITRATE, BITRATE)) == [5]

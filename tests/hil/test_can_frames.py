@@ -10,14 +10,13 @@ from hypothesis import strategies as st
 
 from gfm_hil.links.can.dbc import INT16, INVALID, VECTORS, offset, read_dbc, write_dbc
 from gfm_hil.links.can.layout import plan_of, unpack_vector
-from gfm_hil.links.can.segments import OTHER_DBC, SegmentSender
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import crc8
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_runtime.signals import Group, carried_rows, group, names
 from gfm_runtime.states import RUNNING, SAFE
 
-from ..support.can import Joiner, VectorReceiver
+from ..support.can import VectorReceiver
 
 DBC = {fd: read_dbc(write_dbc(fd)) for fd in (True, False)}
 PLAN = {fd: plan_of(dbc) for fd, dbc in DBC.items()}
@@ -61,7 +60,7 @@ class Bus:
         """Ticks accepted, or the faults of refused frames."""
         out: list = []
         for number, payload in frames:
-            assert self.receiver.knows(number)
+            assert self.receiver.belongs(number)
             message = self.receiver.take(number, payload)
             if message is None:
                 continue
@@ -339,39 +338,6 @@ def test_real_time_ticks_that_are_skipped_are_never_taken_for_newer_ones(story):
     assert sum(bus.reader.faults.values()) == bus.reader.faults["lost"] <= bus.receiver.incomplete
 
 
-@given(st.binary(max_size=1000), either)
-def test_a_message_in_segments_arrives_whole(text, fd):
-    sender, receiver = SegmentSender(PLAN[fd], "plant"), Joiner(PLAN[fd], "controller")
-    for _ in range(2):
-        *head, last = sender.frames(text)
-        assert all(receiver.take(payload) is None for _, payload in head)
-        assert receiver.take(last[1]) == text
-    assert receiver.damaged == 0
-
-
-@given(either, st.data())
-def test_a_message_without_all_its_segments_does_not(fd, data):
-    sender, receiver = SegmentSender(PLAN[fd], "plant"), Joiner(PLAN[fd], "controller")
-    frames = sender.frames(bytes(range(200)))
-    lost = data.draw(st.integers(0, len(frames) - 1))
-    del frames[lost]
-    assert [receiver.take(payload) for _, payload in frames] == [None] * len(frames)
-    assert [receiver.take(payload) for _, payload in sender.frames(b"next")][-1] == b"next"
-
-
-def test_a_damaged_message_is_counted():
-    sender, receiver = SegmentSender(PLAN[True], "plant"), Joiner(PLAN[True], "controller")
-    ((_, payload),) = sender.frames(b"hello")
-    assert receiver.take(payload[:12] + b"\xff" + payload[13:]) is None
-    assert receiver.take(payload[:-1]) is None
-    assert receiver.damaged == 2
-
-
-def test_a_message_too_long_is_refused():
-    with pytest.raises(ValueError, match="2000 bytes; at most 1012 fit"):
-        SegmentSender(PLAN[False], "plant").frames(bytes(2000))
-
-
 @given(vectors, either, st.data())
 def test_every_value_of_an_inner_stage_comes_back_within_half_a_count(name, fd, data):
     plan, rows = INNER_PLAN[fd], carried_rows(name, True)
@@ -412,13 +378,6 @@ def test_the_frames_of_an_inner_stage_count_only_in_its_runs():
     assert plan_of(older).digest == PLAN[True].digest != INNER_PLAN[True].digest
     with pytest.raises(ValueError, match=r"frames MeasurementsInner….*inner stage"):
         plan_of(older, True)
-
-
-def test_another_dbc_is_named():
-    other = plan_of(read_dbc(write_dbc(True).replace(" 288 ", " 290 ")))
-    receiver = Joiner(PLAN[True], "controller")
-    assert receiver.take(SegmentSender(other, "plant").frames(b"hello")[0][1]) == OTHER_DBC
-    assert (receiver.theirs, receiver.digest) == (other.digest, PLAN[True].digest)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from matplotlib.figure import Figure
@@ -14,6 +13,8 @@ from matplotlib.patches import Circle, Rectangle
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram
 from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
+from gfm_plant import NetworkParts
+from gfm_plant.components.part import Component
 
 Make = Callable[..., Scenario]
 FAULT = {"t": 0.02, "type": "fault", "position": 0.25, "R": 0.1}
@@ -96,20 +97,26 @@ def test_a_network_at_a_finite_grid(make: Make) -> None:
     assert at["farm"] < at["bank\nQ 0.1 p.u."] and breakers(scenario) == [True, True]
 
 
-def test_a_part_that_the_diagram_does_not_know_is_a_box_with_its_name() -> None:
+def test_a_component_without_a_symbol_is_a_box_with_its_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Shunt(Component):
+        node: str
+
+    class Cable(Component):
+        start: str
+        end: str
+
     scenario = load_scenario("three_share_a_load")
     assert scenario.network is not None
-    node = scenario.network.converters["A"].node
-    other = {
-        "reactors": {"shunt": SimpleNamespace(node=node)},
-        "cables": {"sea": SimpleNamespace(start=node, end="platform")},
-    }
-    network = scenario.network.model_copy(update=other)
-    axes = fill_diagram(Figure(), scenario.model_copy(update={"network": network}))
-    shown = [text.get_text() for text in axes.texts]
-    assert {"shunt\nreactors", "sea\ncables", "platform"} <= {*shown}
-    boxes = [p for p in axes.patches if isinstance(p, Rectangle) and p.get_width() == 0.7]
     known = fill_diagram(Figure(), scenario).patches
+    node, own = scenario.network.converters["A"].node, [*scenario.network.components()]
+    others = [("s", "shunt", Shunt(node=node)), ("c", "sea", Cable(start=node, end="platform"))]
+    monkeypatch.setattr(NetworkParts, "components", lambda self: iter([*own, *others]))
+    axes = fill_diagram(Figure(), scenario)
+    shown = [text.get_text().strip() for text in axes.texts]
+    assert {"shunt", "sea", "platform"} <= {*shown}
+    boxes = [p for p in axes.patches if isinstance(p, Rectangle) and p.get_width() == 0.7]
     assert len(boxes) == len([p for p in known if isinstance(p, Rectangle)
                               and p.get_width() == 0.7]) + 2  # fmt: skip
 

@@ -10,6 +10,8 @@ import pytest
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.loop_records import limited_reader, make_loop
+from gfm_hil.engine.plant_ticks import _acts
 from gfm_hil.links.frame import FrameError, FrameReader, judge
 from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import names
@@ -22,7 +24,7 @@ by_role = pytest.mark.parametrize("role", ROLES)
 
 def limited(role: Role, scenario: Scenario) -> FrameReader:
     """The reader of a side in real time, the plant's at tick 100, after a good frame of tick 90."""
-    reader = FrameReader.of(role, scenario)
+    reader = limited_reader(role, scenario, scenario.late_policy.hold)
     if role == "plant":
         reader.record["newest"] = 100
     reader.unpack(Forger(reader.group).forge(90, 0), np.zeros(len(names(reader.group))))
@@ -108,14 +110,14 @@ def test_a_peer_that_leaves_is_heard_under_its_last_tick_and_the_next(role, make
 
 def test_in_lockstep_a_tick_comes_again_as_often_as_the_plant_may_ask(make):
     link = {"type": "inproc", "peer_timeout_s": 0.1, "repeat_s": 0.01}
-    reader = FrameReader.of("controller", make(link=link))
+    reader = limited_reader("controller", make(link=link))
     assert [fault_of(reader, n, 0) for n in range(13)] == [""] * 11 + ["tick"] * 2
     assert fault_of(reader, 13, 1) == ""  # a newer tick may repeat as often
     assert [fault_of(reader, 14 + n, 1) for n in range(11)] == [""] * 10 + ["tick"]
 
 
 def test_the_states_of_the_protection(make):
-    reader = FrameReader.of("controller", make(**REALTIME))
+    reader = limited_reader("controller", make(**REALTIME))
     assert reader.e2e == "initial"
     assert (fault_of(reader, 0, FAR), reader.e2e) == ("tick", "initial")
     assert (fault_of(reader, 0, 0), reader.e2e) == ("", "valid")
@@ -161,3 +163,30 @@ def test_a_far_first_tick_does_not_set_the_clock(make, attack_now):
     start = shake_hands("controller", link, scenario, lambda: False, print)
     assert begin <= start.t0_ns + 7 * T_NS <= time.monotonic_ns()
     attack_now("the next good y says when tick 0 was")
+
+
+@pytest.mark.attack("1.17", "CAN, every = 4: a u for tick 16 comes at tick 0", "acts at tick 20")
+def test_a_command_from_the_future_is_not_kept_until_it_fits(make, attack_now):
+    reader = limited_reader("plant", make(**REALTIME), hold=10, every=4)
+    reader.record["newest"] = 0
+    assert fault_of(reader, 0, 16) == "tick"
+    reader.record["newest"] = 23
+    assert fault_of(reader, 0, 16 - 10) == ""  # a late one, and the next one acts from tick 20 on
+    assert fault_of(reader, 4, 16) == ""
+    assert reader.faults["lost"] == 0  # the sequence counts ticks
+    attack_now("refused")
+
+
+def test_over_a_slow_link_u_acts_n_ticks_late(make):
+    """In real time, with an exchange every 4 ticks: u[8] is lost, and u[20] comes 2 ticks late."""
+    loop, u, n = make_loop(make(**REALTIME), 0, 0, 10, 4), np.zeros(3), 4
+    queue = [(tick, tick) for tick in (0, 4, 12, 16)] + [(20, 26), (24, 26), (28, 28)]
+    acts: dict[int, float | None] = {}
+    for k in range(32):
+        found = _acts(loop[0], u, k)
+        while not found and queue and queue[0][1] <= k:  # as the loop looks at the link
+            loop["ahead"] = loop["u_ahead"] = queue.pop(0)[0]
+            found = _acts(loop[0], u, k)
+        acts[k] = float(u[0]) if found else None
+    expected = {k: max(0, k // n - 1) * n for k in range(32)}
+    assert acts == {**expected, **dict.fromkeys((12, 13, 14, 15, 24, 25))}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.links.can.dbc import INNER, SEGMENT, STATUS, VECTORS
+from gfm_hil.links.can.dbc import INNER, STATUS, TRANSPORT, VECTORS
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.recording.run import Run
 from gfm_hil.results.export import export_run
@@ -103,9 +103,9 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
         said_last = (count + 1) * LAST
         nobody_took = count if role == "controller" and options.get("every", 1) > 1 else 0
         assert 0 < len(there) - len(rebuilt) <= said_last + nobody_took
-    segments = {dbc.get_message_by_name(name).frame_id for name in SEGMENT.values()}
-    assert not segments & {m.arbitration_id for m in found}
-    assert segments <= {m.arbitration_id for m in heard}
+    transport = {dbc.get_message_by_name(name).frame_id for name in TRANSPORT.values()}
+    assert not transport & {m.arbitration_id for m in found}
+    assert transport <= {m.arbitration_id for m in heard}
 
 
 def test_cantools_decodes_what_the_run_recorded(tmp_path):

@@ -164,9 +164,8 @@ import sys
 from pathlib import Path
 from gfm_hil.core import temporary as scratch
 from gfm_hil.recording import parts as recording
-from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
-recording._MEMORY = segment.FOLDER = shared = Path(sys.argv[1])
+recording._MEMORY = scratch.MEMORY = shared = Path(sys.argv[1])
 with scratch.temporary("gfmhil-run-") as place:
     recording.keep_in_memory(place, 10)
     assert (place / "parts").is_symlink()
@@ -190,7 +189,7 @@ def test_a_lock_on_a_shared_folder_hinders_nothing(shared, other, attack_now):
         [sys.executable, "-c", START, str(shared)],
         env={**os.environ, "TMPDIR": str(shared)}, check=True, timeout=PATIENCE_S,
     )  # fmt: skip
-    assert list(shared.iterdir()) == []
+    assert [path.name for path in shared.iterdir()] == ["gfmhil-0"]
     attack_now("starts: only files of the own user are locked")
 
 
@@ -211,19 +210,21 @@ def test_a_lock_that_is_kept_is_told(tmp_path, attack_now):
 @as_root
 @pytest.mark.parametrize("role", ["controller", "plant"])
 @pytest.mark.attack(
-    "2.5", "another user makes the shared memory that root's plant waits for", "it was joined"
+    "2.5",
+    "another user makes the folder with the shared memory that root's plant waits for",
+    "it was joined",
 )
 def test_memory_of_another_user_is_refused(role, shared, other, monkeypatch, attack_now):
-    monkeypatch.setattr(segment, "FOLDER", shared)
+    monkeypatch.setattr(scratch, "MEMORY", shared)
     other(
-        "open('gfmhil-link-x', 'wb').write(sys.stdin.buffer.read())",
+        "os.mkdir('gfmhil-0', 0o777)\nopen('gfmhil-0/link-x', 'wb').write(sys.stdin.buffer.read())",
         header(segment.VERSION, segment.myself()),
     )
-    path = shared / "gfmhil-link-x"
-    with pytest.raises(UserError, match=rf"belongs to another user \(uid {OTHER}\)") as found:
+    before = (shared / "gfmhil-0/link-x").stat()
+    with pytest.raises(UserError, match=rf"gfmhil-0 is not a folder .* uid {OTHER}, mode 0777\)"):
         ShmLink(role, "shm://x")
-    assert path.stat().st_uid == OTHER
-    attack_now(f"either side refuses it: {str(found.value).rpartition(': ')[2]}")
+    assert (shared / "gfmhil-0/link-x").stat() == before
+    attack_now("either side refuses the folder, with owner and mode")
 
 
 @as_root
@@ -231,7 +232,7 @@ def test_memory_of_another_user_is_refused(role, shared, other, monkeypatch, att
     "2.6", "another user leaves files, links and pipes named gfmhil-link-x", "root removed them"
 )
 def test_what_is_not_ours_is_not_swept(shared, other, monkeypatch, tmp_path, attack_now):
-    monkeypatch.setattr(segment, "FOLDER", shared)
+    monkeypatch.setattr(scratch, "MEMORY", shared)
     precious = tmp_path / "precious"
     precious.touch()
     other(
@@ -242,22 +243,39 @@ os.symlink({str(precious)!r}, "gfmhil-link-link")
 """
     )
     ShmLink("controller", "shm://mine").close()
-    assert {p.name.rpartition("-")[2] for p in shared.iterdir()} == {"empty", "pipe", "link"}
+    assert {p.name.rpartition("-")[2] for p in shared.iterdir()} == {"empty", "pipe", "link", "0"}
     assert precious.exists()
     attack_now("all three stay; the own run starts")
 
 
+@as_root
 @pytest.mark.attack(
-    "2.7", "shared memory of the own user that others may open (mode 0666)", "it was joined"
+    "2.12", "another user puts a link in place of the folder with the shared memory", "not tried"
+)
+def test_a_link_in_place_of_the_folder_is_refused(shared, other, monkeypatch, tmp_path, attack_now):
+    monkeypatch.setattr(scratch, "MEMORY", shared)
+    precious = tmp_path / "link-old"
+    precious.touch()
+    other(f"os.symlink({str(tmp_path)!r}, 'gfmhil-0')")
+    with pytest.raises(UserError, match="is not a folder of our user alone"):
+        ShmLink("controller", "shm://mine")
+    assert precious.exists()
+    attack_now("refused; nothing behind the link is swept")
+
+
+@pytest.mark.attack(
+    "2.7", "the folder with the shared memory is open to others (mode 0755)", "it was used"
 )
 def test_memory_that_is_open_to_others_is_refused(tmp_path, monkeypatch, attack_now):
-    monkeypatch.setattr(segment, "FOLDER", tmp_path)
+    monkeypatch.setattr(scratch, "MEMORY", tmp_path)
     controller = ShmLink("controller", "shm://x")
-    (path,) = tmp_path.iterdir()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    path.chmod(0o666)
-    with pytest.raises(UserError, match=r"other users may open .* \(mode 0666, must be 0600\)"):
+    folder = scratch.private_folder()
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (folder, *folder.iterdir())]
+    assert modes == [0o700, 0o600]
+    folder.chmod(0o755)
+    with pytest.raises(UserError, match=r"is not a folder of our user alone .* mode 0755"):
         ShmLink("plant", "shm://x")
+    folder.chmod(0o700)
     controller.close()
     attack_now("refused, with the mode")
 

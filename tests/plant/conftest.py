@@ -43,7 +43,7 @@ class Rest(NamedTuple):
     def phasor(self, state: str) -> complex:
         """A current or voltage in the converter's own frame."""
         w = self.now["w"][0, self.plant.wiring.order.index(state)]
-        return complex(*w) / complex(*self.now["unit"][0, 0])
+        return complex(w) / complex(self.now["unit"][0, 0])
 
     def near(self, i_u: float = 0.0, omega_u: float = 0.0, E_u: float = 0.0) -> NDArray[np.float64]:
         """Return the command of the equilibrium plus these offsets."""

@@ -5,7 +5,6 @@ import math
 import pytest
 
 from gfm_plant import Bases
-from gfm_plant.bases import QUANTITIES
 
 
 @pytest.mark.parametrize(
@@ -30,22 +29,6 @@ def test_values_worked_by_hand(quantity: str, si: float, pu: float) -> None:
     bases = Bases()
     assert bases.to_pu(si, quantity) == pytest.approx(pu, rel=1e-6)
     assert bases.to_si(pu, quantity) == pytest.approx(si, rel=1e-6)
-
-
-@pytest.mark.parametrize("quantity", QUANTITIES)
-def test_there_and_back(quantity: str) -> None:
-    bases = Bases(S_n=1e6, V_n=690.0, omega_n=120 * math.pi, V_dcref=1100.0)
-    assert bases.to_si(bases.to_pu(3.7, quantity), quantity) == pytest.approx(3.7, rel=1e-15)
-
-
-def test_bases_hang_together() -> None:
-    b = Bases()
-    assert b.Z_b == pytest.approx(36.1)
-    assert b.L_b * b.omega_b == pytest.approx(b.Z_b)
-    assert b.C_b * b.omega_b == pytest.approx(1 / b.Z_b)
-    assert b.C_dcb * b.omega_b == pytest.approx(1 / b.Z_dc)
-    assert math.sqrt(3) * b.V_b * b.I_b == pytest.approx(b.S_b)
-    assert b.V_dcref * b.I_dcb == pytest.approx(b.S_b)
 
 
 @pytest.mark.parametrize("value", [0.0, -380.0, math.nan, math.inf])

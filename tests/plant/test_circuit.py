@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, Source, find_modes
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, VoltageSource, find_modes
 
 OMEGA_B = 100 * np.pi
-GRID = Source("grid", "g")
+GRID = VoltageSource("grid", "g")
+E, F = VoltageSource("e", "e"), VoltageSource("f", "e")
 
 
 def moved(m: Modes, w: Any, s: Any, t: float) -> Any:
@@ -20,7 +21,7 @@ def moved(m: Modes, w: Any, s: Any, t: float) -> Any:
     return m.states @ (grown * (m.modes @ w) + (grown - 1) / m.rates * (m.drive @ s))
 
 
-def converter(k: int, node: str, L: float = 0.1) -> tuple[list[Branch], Capacitor, Source]:
+def converter(k: int, node: str, L: float = 0.1) -> tuple[list[Branch], Capacitor, VoltageSource]:
     """Filter L, C and a line of a converter to a node."""
     return (
         [
@@ -28,7 +29,7 @@ def converter(k: int, node: str, L: float = 0.1) -> tuple[list[Branch], Capacito
             Branch(f"i_o{k}", f"t{k}", node, L, 0.01),
         ],
         Capacitor(f"v{k}", f"t{k}", 0.2),
-        Source(f"bridge{k}", f"bridge{k}"),
+        VoltageSource(f"bridge{k}", f"bridge{k}"),
     )
 
 
@@ -91,7 +92,7 @@ def test_switching_keeps_the_flux_of_a_loop() -> None:
     """Two inductors that an opened breaker puts in series share (L1 i1 + L2 i2) / (L1 + L2)."""
     m = find_modes(
         [Branch("a", "e", "n", 0.3, 0.1), Branch("b", "n", GROUND, 0.2, 0.5)], [],
-        [Source("e", "e")], OMEGA_B, ["a", "b"],
+        [E], OMEGA_B, ["a", "b"],
     )  # fmt: skip
     after = m.states @ (m.modes @ np.array([1.0, 0.4j]))
     np.testing.assert_allclose(after, np.full(2, (0.3 + 0.2 * 0.4j) / 0.5), atol=1e-14)
@@ -103,11 +104,11 @@ A, B = Branch("a", "e", "n", 0.1, 0.0), Branch("b", "n", "g", 0.1, 0.0)
 @pytest.mark.parametrize(
     ("branches", "capacitors", "sources", "message"),
     [
-        ([A], [], [Source("e", "e")], "node n: only a ends there"),
-        ([Branch("a", "e", "g", 0.0, 0.1)], [], [Source("e", "e"), GRID], "a = 0.0: must be > 0"),
-        ([A, B], [Capacitor("c", "n", -1.0)], [Source("e", "e"), GRID], "c = -1.0: must be > 0"),
-        ([A, B], [], [Source("e", "e"), Source("f", "e"), GRID], "node e: e and f, one source"),
-        ([A, B], [Capacitor("c", "g", 1.0)], [Source("e", "e"), GRID], "node g: a source and a"),
+        ([A], [], [E], "node n: only a ends there"),
+        ([Branch("a", "e", "g", 0.0, 0.1)], [], [E, GRID], "a = 0.0: must be > 0"),
+        ([A, B], [Capacitor("c", "n", -1.0)], [E, GRID], "c = -1.0: must be > 0"),
+        ([A, B], [], [E, F, GRID], "node e: e and f, one source"),
+        ([A, B], [Capacitor("c", "g", 1.0)], [E, GRID], "node g: a source and a"),
     ],
 )
 def test_circuits_that_cannot_be(

@@ -116,5 +116,5 @@ def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
     run(*arguments, 1000)
     after = rtsys.get_allocation_stats().alloc
     _nrt_python.memsys_disable_stats()
-    boxed = len(plant.plant.records) + 3  # the arguments, once per call; nothing per tick
+    boxed = len(plant.plant.memory) + 3  # the arguments, once per call; nothing per tick
     assert after - before <= boxed

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gfm_plant import Plant, breaker, grid_frequency, grid_load, make_plant
+from gfm_plant.components import FiniteGrid
 from gfm_plant.model import DELTA, f
 
 GRID = {"S": 2.0, "H": 3.0, "D": 1.0, "droop": 0.05, "T_gov": 0.4}
@@ -23,7 +24,7 @@ def test_rests_where_it_starts(rest: Callable[..., Any]) -> None:
 def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
     """The converter's u is held, so its angle runs away from the grid's: both interact."""
     plant = rest(grid={"finite": GRID}, dc_source={"mode": "regulated"})
-    s, c = plant.now[0], GRID
+    s, c = plant.plant.of(FiniteGrid)[0], GRID
 
     def slope(_: float, z: Any) -> Any:
         w, P = z[8] - 1.0, z[9]
@@ -38,9 +39,9 @@ def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
         ]])  # fmt: skip
 
     grid_load(plant.plant, 0.01)
-    P_set, load = float(s["P_set"][0]), float(s["P_load"][0])
+    P_set, load = float(s["P_set"]), float(s["P_load"])
     t = np.arange(1, 3001) * 1e-4
-    z = np.concatenate([plant.x, [1.0, s["P_turbine"][0], plant.u[0]]])
+    z = np.concatenate([plant.x, [1.0, s["P_turbine"], plant.u[0]]])
     exact = solve_ivp(slope, (0, t[-1]), z, "DOP853", t, rtol=1e-11, atol=1e-12).y
     found = np.empty((len(t), 2))
     for k in range(len(t)):

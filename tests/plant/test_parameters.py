@@ -11,7 +11,7 @@ from gfm_plant import load_converter
 def test_the_papers_converter() -> None:
     paper = load_converter("paper")
     assert (paper.L_f, paper.R_f, paper.C_f, paper.C_dc) == (2e-3, 0.06, 20e-6, 500e-6)
-    assert paper.bases.Z_b == pytest.approx(36.1)
+    assert paper.bases.base_of("R") == pytest.approx(36.1)
     assert paper.pu() == pytest.approx(
         {
             "L_f": 0.0174048,

@@ -12,6 +12,7 @@ from numba import njit
 from pydantic import ValidationError
 
 from gfm_plant import TRIP_REASONS, Plant, grid_voltage, make_plant, trip_reason
+from gfm_plant.layout import field
 from gfm_plant.protection import protect
 
 CYCLE = 200  # ticks of 100 µs in 20 ms
@@ -26,7 +27,7 @@ def look(plant: Any, i: Any, v: Any, seen: Any) -> None:
     for k in range(len(i)):
         s.tick += 1
         s.x[0], s.x[1] = i[k], 0.0
-        now.w[1, 0], now.w[1, 1] = v[k, 0], v[k, 1]
+        field(now, "w")[1] = complex(v[k, 0], v[k, 1])
         s.x[2], s.x[3] = 1.0, 0.0
         protect(plant, 0)
         seen[k, 0], seen[k, 1], seen[k, 2] = s.i_rms, s.omega_v, s.trip

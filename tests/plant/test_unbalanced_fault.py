@@ -46,7 +46,7 @@ class Phases:
     """
 
     def __init__(self, plant: Any, at: float, R: float, kind: str, which: str) -> None:
-        self.r, self.E, self.unit = plant.par[0], plant.u[2], complex(*plant.now["unit"][0, 0])
+        self.r, self.E, self.unit = plant.par[0], plant.u[2], complex(plant.now["unit"][0, 0])
         self.at, self.R, self.kind, self.shorted = at, R, kind, SHORTED[which]
 
     def sources(self, t: float) -> tuple[Any, Any]:
@@ -132,7 +132,7 @@ def test_fault_and_clearing_against_three_phases(
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
     plant.advance(37)
     t = 37 * 1e-4
-    w = plant.now["w"][0, [I_F, V, I_O, I_O]] @ [1, 1j]
+    w = plant.now["w"][0, [I_F, V, I_O, I_O]]
     model = (Phases if at else AtCapacitor)(plant, at, R, kind, which)
     s = np.concatenate([phases(x * cmath.exp(1j * W * t)) for x in w])
     fault(plant.plant, at, R, duration=0.02, kind=kind, phases=which)
@@ -140,14 +140,14 @@ def test_fault_and_clearing_against_three_phases(
     s = solve_ivp(model.slope, (t, t + 0.01), s, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     back = cmath.exp(-1j * W * (t + 0.01))
     exact = np.array([vector(x) * back for x in s.reshape(4, 3)])
-    found = plant.now["w"][0, [I_F, V, I_O]] @ [1, 1j]
+    found = plant.now["w"][0, [I_F, V, I_O]]
     assert found == pytest.approx(exact[[0, 1, 2 if at else 3]], abs=1e-9)
     plant.advance(100)
     s = solve_ivp(model.slope, (t + 0.01, t + 0.02), s, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     back = cmath.exp(-1j * W * (t + 0.02))
     exact = np.array([vector(x) * back for x in s.reshape(4, 3)])
     exact[2] = at * exact[2] + (1 - at) * exact[3]  # the line keeps its flux
-    found = plant.now["w"][0, [I_F, V, I_O]] @ [1, 1j]
+    found = plant.now["w"][0, [I_F, V, I_O]]
     assert plant.now["faulted"][0] == 0
     assert found == pytest.approx(exact[:3], abs=1e-9)
 
@@ -166,7 +166,7 @@ def test_steady_state_by_sequence_networks(
     plant.advance(30_000)
     cycle = np.empty((200, 2), complex)
     for k in range(200):
-        cycle[k] = plant.now["w"][0, [V, I_O]] @ [1, 1j]
+        cycle[k] = plant.now["w"][0, [V, I_O]]
         plant.advance()
     t = (30_000 + np.arange(200)) * 1e-4
     Z_f, Z_g = complex(r["R_f"], r["L_f"]), complex(r["R_g"], r["L_g"])
@@ -250,10 +250,10 @@ def test_protection_sees_it_and_the_grid_goes_on_feeding_it(rest: Callable[..., 
     Z_c, Z_grid = 1 / (1j * r["C_f"]) + 0.1 * Z_g, 0.9 * Z_g
     Z_1 = Z_c * Z_grid / (Z_c + Z_grid)
     U = Z_c / (Z_c + Z_grid)
-    i_g = [plant.now["w"][0, plant.plant.wiring.order.index("beyond")] @ [1, 1j]]
+    i_g = [plant.now["w"][0, plant.plant.wiring.order.index("beyond")]]
     for _ in range(199):
         plant.advance()
-        i_g.append(plant.now["w"][0, plant.plant.wiring.order.index("beyond")] @ [1, 1j])
+        i_g.append(plant.now["w"][0, plant.plant.wiring.order.index("beyond")])
     I_1 = U / (2 * Z_1)
     assert np.mean(i_g) == pytest.approx((U - Z_1 * I_1 - 1) / Z_grid, abs=1e-6)
 
@@ -273,7 +273,7 @@ def test_a_line_that_changes_takes_the_path_of_the_zero_sequence_with_it(
     assert plant.st["x"][0] == pytest.approx(other.st["x"][0], abs=1e-12)
     clear_fault(plant.plant)
     plant.advance(20_000)
-    assert plant.now["w"][0, plant.plant.wiring.order.index("fault")].tolist() == [0.0, 0.0]
+    assert plant.now["w"][0, plant.plant.wiring.order.index("fault")] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -295,7 +295,7 @@ def test_impossible_faults_change_nothing(
     before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):
         fault(plant.plant, 0.5, **{"R": 0.1, **more})
-    assert plant.plant.records == before.records
+    assert [r.tobytes() for r in plant.plant.memory] == [r.tobytes() for r in before.memory]
 
 
 def test_an_island_needs_a_path_to_ground(rest: Callable[..., Any]) -> None:

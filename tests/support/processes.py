@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import ROLES
+from gfm_hil.core.temporary import private_folder
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import toml_text
 
@@ -24,7 +25,7 @@ def places(folder: Path) -> set[Path]:
     """What a run in progress has outside its folder: memory, the folder of a socket."""
     words = Path(f"/proc/{roles_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
     kind, _, name = words[words.index("--endpoint") + 1].partition("://")
-    found = {Path("/dev/shm") / f"gfmhil-link-{name}" if kind == "shm" else Path(name).parent}
+    found = {private_folder() / f"link-{name}" if kind == "shm" else Path(name).parent}
     if (folder / "parts").is_symlink():
         found.add((folder / "parts").resolve())
     return found

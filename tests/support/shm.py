@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from gfm_hil.core.temporary import private_folder
 from gfm_hil.links.shm import segment
 
 
 def segment_of(endpoint: str) -> Path:
-    return segment.FOLDER / (segment.PREFIX + endpoint.removeprefix("shm://"))
+    return private_folder() / (segment.PREFIX + endpoint.removeprefix("shm://"))
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from numba import njit
 
 from gfm_hil.links import open_link
 from gfm_hil.links.ring import LONGEST
-from gfm_hil.realtime.clock import give_way
+from gfm_hil.realtime.clock import yield_processor
 
 
 @njit
@@ -51,7 +51,7 @@ def flood(send, receive, handle, mine, n):
             expected_size = fill(expected, received, 1 - mine)
             idle = False
         if idle:
-            give_way()
+            yield_processor()
     return received, wrong
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,9 +38,9 @@ from gfm_design.norms.hinf import balance
 from gfm_design.norms.performance import (
     D_Q,
     PAPER_WEIGHTS,
-    Channel,
     StateSpace,
     Weight,
+    WeightedChannel,
     channel_norms,
 )
 from gfm_plant import Plant, load_converter, make_plant
@@ -53,9 +53,6 @@ from gfm_runtime.law import Law
 from gfm_runtime.realisation import realise
 from gfm_runtime.signals import NY, REF_NAMES, Y_NAMES, carried
 from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, discretise
-
-if TYPE_CHECKING:
-    from gfm_design.margins.all_margins import LoopMargins
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -431,7 +428,7 @@ class ClosedLoop:
 
     def channels(
         self, weights: tuple[Weight, ...] = PAPER_WEIGHTS, D_q: float = D_Q
-    ) -> tuple[Channel, ...]:
+    ) -> tuple[WeightedChannel, ...]:
         """The norm of every weighted channel W_ij T_ij; a sampled loop has the weights by Tustin.
 
         Raises:
@@ -446,16 +443,6 @@ class ClosedLoop:
             Unstable: the loop is not stable; it has no gamma.
         """
         return max(channel.norm for channel in self.channels(weights, D_q))
-
-    def margins(self) -> LoopMargins:
-        """Gain, phase, disk and delay margins of a sampled loop; takes a second.
-
-        Raises:
-            UnstableLoop: the loop is unstable and has no margins.
-        """
-        from gfm_design.margins.all_margins import loop_margins  # which looks at loops itself
-
-        return loop_margins(self)
 
     def step_response(
         self, of: str = "P_ref", seconds: float = 1.0, every: float = T_S

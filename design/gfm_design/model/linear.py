@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.operating_point import OperatingPoint
+from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.swing import swing_matrix
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
-from gfm_plant.options import FiniteGrid
 from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import Law
@@ -168,7 +169,7 @@ def linearise_plant(
         B[V_DC, 0] = per_i_dc * (1 - regulated)
     if grid is not None:  # omega_g is a state, and so is the power of the turbines
         A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
-        own, per_power = swing_equation(grid.H, grid.D, grid.droop, grid.T_gov, grid.S)
+        own, per_power = swing_matrix(grid.H, grid.D, grid.droop, grid.T_gov, grid.S)
         A[swing, :N_X], B_d[swing, 1] = slopes[-1, :N_X] * per_power, slopes[-1, -1] * per_power
         A[swing : swing + 2, swing : swing + 2] = own
     if sensors:
@@ -180,15 +181,6 @@ def linearise_plant(
         prompt = np.eye(NY_INNER - NY, n + sensors)
         C = np.vstack([C, r["gain"][len(_MEASURED) :, None] * prompt])
     return LinearPlant(A, B, B_d, C, C_true)
-
-
-def swing_equation(
-    H: float, D: float, droop: float, T_gov: float, S: float
-) -> tuple[Matrix, float]:
-    """The swing equation and the governor of ``gfm_plant.ramps``: d/dt of (omega, power of the
-    turbines) by themselves, (2,2), and d(omega)/dt by a power that comes, p.u. of the network."""
-    own = np.array([[-D / (2 * H), 1 / (2 * H)], [-1 / (droop * T_gov), -1 / T_gov]])
-    return own, 1 / (2 * H * S)
 
 
 def _rates(x: Vector, u: Vector, d: Vector, par: Record) -> Vector:

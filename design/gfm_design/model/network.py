@@ -36,12 +36,13 @@ from gfm_design.model.linear import (
     linearise_law,
     linearise_plant,
     sampled_plant,
-    swing_equation,
 )
 from gfm_design.model.operating_point import OperatingPoint, operating_points
 from gfm_design.norms.performance import StateSpace
 from gfm_plant import Network
-from gfm_plant.constant_power import PowerLoad
+from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.part import Fed, LinearPart, emf
+from gfm_plant.components.swing import SWING_PARAMETERS, swing_matrix
 from gfm_plant.model import V_DC
 from gfm_plant.records import N_OWN
 from gfm_plant.wiring import GRID_SOURCE
@@ -80,7 +81,7 @@ class NetworkMode(Mode):
 
 
 @dataclass(frozen=True)
-class Member:
+class LinearConverter:
     """A converter of the network.
 
     Attributes:
@@ -150,7 +151,11 @@ class NetworkLoop:
     view: type[ClosedLoop] = ClosedLoop
 
     def __init__(
-        self, network: LinearNetwork, members: Sequence[Member], T_s: float, u_delay: Matrix
+        self,
+        network: LinearNetwork,
+        members: Sequence[LinearConverter],
+        T_s: float,
+        u_delay: Matrix,
     ) -> None:
         self.network, self.members, self.T_s = network, tuple(members), T_s
         self.u_delay, self.y_delay = u_delay, np.zeros(len(network.plant.C))
@@ -173,12 +178,12 @@ class NetworkLoop:
             NoEquilibrium: there is no operating point, or a limit of an inner stage acts there.
         """
         refs = [np.asarray(ref, float) for ref in references]
-        points, machines = operating_points(plant, laws, refs)
+        points, rests = operating_points(plant, laws, refs)
         resting = plant.copy()
         x, u = (np.array([getattr(op, name) for op in points]) for name in ("x", "commands"))
-        resting.start(x, u, machines)
+        resting.start(x, u, rests)
         T_s = float(plant.net[0]["T_s"])
-        members, delays, at_u, at_y = list[Member](), list[float](), 0, 0
+        members, delays, at_u, at_y = list[LinearConverter](), list[float](), 0, 0
         each = zip(plant.wiring.units, plant.par, laws, refs, points, strict=True)
         for unit, r, law, ref, op in each:
             inner = law.law.inner
@@ -187,7 +192,7 @@ class NetworkLoop:
             n_u, n_y = (NU, NY) if stage is None else (NU_INNER, NY_INNER)
             places = slice(at_u, at_u + n_u), slice(at_y, at_y + n_y)
             title = f"{unit.name} ({law.law.name})"
-            members.append(Member(unit.name, title, linear, stage, op, ref, *places))
+            members.append(LinearConverter(unit.name, title, linear, stage, op, ref, *places))
             delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
             at_u, at_y = at_u + n_u, at_y + n_y
         return cls(linearise_network(resting, members), members, T_s, np.array(delays))
@@ -404,13 +409,13 @@ class _Others:
         return LinearPlant(p.A, p.B[:, one.u], p.B_d, p.C[one.y], p.C_true[own])
 
 
-def _states(n: int, members: Sequence[Member]) -> list[slice]:
+def _states(n: int, members: Sequence[LinearConverter]) -> list[slice]:
     """Where the states of each controller are, behind n of the plant."""
     ends = n + np.cumsum([0, *(len(m.controller.A) for m in members)])
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
 
-def _closed(p: LinearPlant, members: Sequence[Member]) -> Matrix:
+def _closed(p: LinearPlant, members: Sequence[LinearConverter]) -> Matrix:
     """The matrix of a sampled plant with the loops of some converters closed."""
     n, places = len(p.A), _states(len(p.A), members)
     A = np.zeros((places[-1].stop,) * 2) if places else np.zeros((n, n))
@@ -422,7 +427,7 @@ def _closed(p: LinearPlant, members: Sequence[Member]) -> Matrix:
     return A
 
 
-def linearise_network(plant: Network, members: Sequence[Member]) -> LinearNetwork:
+def linearise_network(plant: Network, members: Sequence[LinearConverter]) -> LinearNetwork:
     """A network at rest, as ``Network.start`` leaves it, around that rest."""
     return _Writing(plant, members).written()
 
@@ -437,31 +442,34 @@ class _Writing:
     from a frame that turns at its speed at rest.
     """
 
-    def __init__(self, plant: Network, members: Sequence[Member]) -> None:
+    def __init__(self, plant: Network, members: Sequence[LinearConverter]) -> None:
         wiring, now, N = plant.wiring, plant.now[0], len(members)
         self.plant, self.members, self.omega_b = plant, members, wiring.omega_b
         self.modes, self.sources = wiring.modes(wiring.blocked, False)
-        self.loads = [load for load in plant.loads if load.name not in wiring.opened]
-        self.w = _complex(now["w"][: len(wiring.order)])
+        self.w = now["w"][: len(wiring.order)]
+        fed = [item for item in plant.fed() if item[1].is_voltage or item[0] not in wiring.opened]
+        voltages = [(name, one, record) for name, one, record in fed if one.is_voltage]
         at_node = {m.name: unit.node for m, unit in zip(members, wiring.units, strict=True)}
-        at_node |= {machine.name: machine.node for machine in wiring.machines}
-        sizes = [1 + len(self._alone(k).A) - V_DC for k in range(N)] + [3] * len(wiring.machines)
+        at_node |= {name: one.node for name, one, _ in voltages}
         speeds = [float(m.op.u[OMEGA_ROW]) for m in members]
-        speeds += [float(omega) for omega in now["omega"][1 : 1 + len(wiring.machines)]]
-        unit = [*now["unit"][:N], *now["unit"][N + 2 : N + 2 + len(wiring.machines)]]
+        speeds += [float(record["omega"]) for *_, record in voltages]
         if wiring.grid is not None and wiring.closed:
             at_node[GRID] = wiring.grid
-            sizes.append(3 if plant.net[0]["H"][0] > 0.0 else 1)
             speeds.append(float(now["omega_g"]))
-            unit.append(now["unit"][N])
-        #: of each part that turns: its island and its unit phasor; its angle is its first state
+        #: of each part that turns: its island; its angle is its first state
         self.islands = wiring.islands()
         self.island = {name: self._island(node) for name, node in at_node.items()}
-        self.unit = dict(zip(at_node, _complex(np.array(unit)), strict=True))
         self.speed = np.ones(len(self.islands))  # p.u.; that of a dead one does not matter
         self.speed[list(self.island.values())] = speeds
-        owners = [*at_node, *(load.name for load in self.loads)]
-        ends = 2 * len(self.modes.rates) + np.cumsum([0, *sizes, *[2] * len(self.loads)])
+        #: of each component with a source
+        self.fed = {name: self._linear(one, record) for name, one, record in fed}
+        self.at_w = {name: int(record["sees"]) for name, _, record in fed}
+        self.fed_island = {name: self._island(one.node) for name, one, _ in fed}
+        sizes = {m.name: 1 + len(self._alone(k).A) - V_DC for k, m in enumerate(members)}
+        sizes[GRID] = 3 if len(plant.of(FiniteGrid)) else 1
+        sizes |= {name: len(part.A) for name, part in self.fed.items()}
+        owners = dict.fromkeys([*at_node, *self.fed])  # currents behind what turns
+        ends = 2 * len(self.modes.rates) + np.cumsum([0, *(sizes[name] for name in owners)])
         self.z = slice(0, int(ends[0]))
         self.at = {
             n: slice(int(a), int(b)) for n, (a, b) in zip(owners, pairwise(ends), strict=True)
@@ -469,7 +477,7 @@ class _Writing:
         of_w = {name: (u.name, u.node) for u in wiring.units for name in u.states}
         of_w |= {branch.name: (LINES, branch.start) for branch in wiring.branches}
         of_w |= {bank.name: (LINES, bank.node) for bank in wiring.capacitors}
-        of_w |= {machine.name: (machine.name, machine.node) for machine in wiring.machines}
+        of_w |= {branch.name: (branch.name, branch.end) for branch in wiring.fed_branches}
         self.owner_of_w = [of_w[name][0] for name in wiring.order]
         self.island_of_w = np.array([self._island(of_w[name][1]) for name in wiring.order])
         self.n = int(ends[-1])
@@ -480,54 +488,67 @@ class _Writing:
     def _island(self, node: str) -> int:
         return next(k for k, nodes in enumerate(self.islands) if node in nodes)
 
+    def _linear(self, one: Fed, record: Any) -> LinearPart:
+        """A component with a source around its rest."""
+        slip = self.omega_b * (self.speed[self._island(one.node)] - 1.0)
+        source = complex(self.plant.now[0]["unit"][record["source"]])
+        source *= float(record["E"]) if one.is_voltage else 0.0
+        seen = complex(self.w[record["sees"]])
+        return one.linear(record, seen, source, slip, self.omega_b)
+
     def _alone(self, k: int) -> LinearPlant:
         """Converter k on a line to a grid: its DC link, DC source and sensors are those here."""
         op, inner = self.members[k].op, self.members[k].stage is not None
         return linearise_plant(self.plant.par[k : k + 1], op, float(op.u[OMEGA_ROW]), inner=inner)
 
     def written(self) -> LinearNetwork:
-        wiring, net, now = self.plant.wiring, self.plant.net[0], self.plant.now[0]
+        net, now = self.plant.net[0], self.plant.now[0]
         slip = self.omega_b * (self.speed[self.island_of_w] - 1.0)
         turns = self.modes.modes @ (1j * slip[:, None] * self.modes.states)
         self.A[self.z, self.z] = _real(np.diag(self.modes.rates) - turns)
         for k, member in enumerate(self.members):
             self._converter(k, member)
-        for j, machine in enumerate(wiring.machines, 1):
-            E, given = float(net["E"][j]), np.zeros(len(self.w))
-            given[wiring.order.index(machine.name)] = E
-            self._source(machine.emf, machine.name, E)
-            self._swing(j, machine.name, -given)
         if GRID in self.at:
-            V_g, brought = float(now["V_g"]), net["to_grid"][: len(self.w)]
-            by_V = self._source(GRID_SOURCE, GRID, V_g)
-            self.B_d[self.z, 1] = _parts(by_V)
-            angle = self.at[GRID].start
-            if net["H"][0] > 0.0:
-                self._swing(0, GRID, V_g * brought)
-                power = (self.unit[GRID].conjugate() * (brought @ self.w)).real
-                self.B_d[angle + 1, 1] = power / (2 * net["H"][0] * net["S"][0])
+            V_g, to_grid = float(now["V_g"]), net["to_grid"][: len(self.w)]
+            unit = complex(now["unit"][len(self.members)])
+            self.B_d[self.z, 1] = _parts(self._source(GRID_SOURCE, GRID, V_g, unit))
+            angle, finite = self.at[GRID].start, self.plant.of(FiniteGrid)
+            if len(finite):
+                own, per_power = swing_matrix(*(float(finite[0][x]) for x in SWING_PARAMETERS))
+                power = V_g * unit.conjugate() * (to_grid @ self.w)
+                by_z = V_g * unit.conjugate() * (to_grid @ self.modes.states)
+                self.A[angle, angle + 1] = self.omega_b
+                self.A[angle + 1, self.z] = per_power * _rows(by_z)[0]
+                self.A[angle + 1, angle] = per_power * power.imag
+                self.A[angle + 1 : angle + 3, angle + 1 : angle + 3] = own
+                self.B_d[angle + 1, 1] = per_power * power.real / V_g
             else:
                 self.B_d[angle, 0] = self.omega_b
-        for j, load in enumerate(self.loads):
-            self._load(load, int(net["voltage_at"][j]), complex(*now["v_sink"][j]))
+        for name, part in self.fed.items():
+            at, seen = self.at[name], _rows(self.modes.states[self.at_w[name]])
+            source = emf(name) if emf(name) in self.sources else name
+            drive = self.modes.drive[:, [self.sources.index(source)]]
+            self.A[at, at], self.A[at, self.z] = part.A, part.by_seen @ seen
+            self.A[self.z, at] = _real(drive) @ part.source
         return self._against_references()
 
-    def _source(self, source: str, part: str, e: complex) -> Complex:
-        """Write what the angle of a source of voltage e in its own frame does to the circuit;
-        returns what a voltage along its d axis does to the modes."""
-        by_e = self.modes.drive[:, self.sources.index(source)] * self.unit[part]
+    def _source(self, source: str, part: str, e: complex, unit: complex) -> Complex:
+        """Write what the angle of a source of voltage e in its own frame, which is at ``unit``,
+        does to the circuit; returns what a voltage along its d axis does to the modes."""
+        by_e = self.modes.drive[:, self.sources.index(source)] * unit
         self.A[self.z, self.at[part].start] = _parts(1j * e * by_e)
         return np.asarray(by_e)
 
-    def _converter(self, k: int, member: Member) -> None:
+    def _converter(self, k: int, member: LinearConverter) -> None:
         alone, r, own = self._alone(k), self.plant.par[k], self.at[member.name]
-        by_e = self._source(self.plant.wiring.units[k].bridge, member.name, member.op.e)
+        unit = complex(self.plant.now[0]["unit"][k])
+        by_e = self._source(self.plant.wiring.units[k].bridge, member.name, member.op.e, unit)
         for j, axis in enumerate((1.0, 1j)[: len(range(member.u.start + 2, member.u.stop))]):
             self.B[self.z, member.u.start + 2 + j] = _parts(axis * by_e)
         self.B[own.start, member.u.start + OMEGA_ROW] = self.omega_b
         # the states that the converter alone has, by those here
         seen = np.zeros((len(alone.A), self.n))
-        back = self.unit[member.name].conjugate()
+        back = unit.conjugate()
         for j, scale in enumerate((r["current"], 1.0, r["current"])):
             rows = slice(2 * j, 2 * j + 2)
             seen[rows, self.z] = _rows(scale * back * self.modes.states[N_OWN * k + j])
@@ -537,30 +558,6 @@ class _Writing:
         self.A[rest] = alone.A[V_DC:] @ seen
         self.B[rest, member.u] = alone.B[V_DC:]
         self.C[member.y], self.C_true[NY * k : NY * (k + 1)] = alone.C @ seen, alone.C_true @ seen
-
-    def _swing(self, j: int, part: str, comes: Matrix) -> None:
-        """Write swing equation j; ``comes`` @ w is the current whose power comes to the part, times
-        its voltage."""
-        net, angle = self.plant.net[0], self.at[part].start
-        own, per_power = swing_equation(
-            *(float(net[x][j]) for x in ("H", "D", "droop", "T_gov", "S"))
-        )
-        back = self.unit[part].conjugate()
-        self.A[angle, angle + 1] = self.omega_b
-        self.A[angle + 1, self.z] = per_power * _rows(back * (comes @ self.modes.states))[0]
-        self.A[angle + 1, angle] = per_power * (back * (comes @ self.w)).imag
-        self.A[angle + 1 : angle + 3, angle + 1 : angle + 3] = own
-
-    def _load(self, load: PowerLoad, at_w: int, f: complex) -> None:
-        """Write a load of constant power, which has measured the voltage f."""
-        own, V = self.at[load.name], abs(f)
-        slip = self.omega_b * (self.speed[self.island_of_w[at_w]] - 1.0)
-        self.A[own, self.z] = _rows(self.modes.states[at_w]) / load.tau
-        self.A[own, own] = _real(np.array([[-1.0 / load.tau - 1j * slip]]))
-        turn = _real(np.array([[f / V if V > 0.0 else 1.0]]))
-        by_f = turn @ load.admittance(V, 0.0).real @ turn.T
-        drive = self.modes.drive[:, [self.sources.index(load.name)]]
-        self.A[self.z, own] = _real(drive) @ by_f
 
     def _against_references(self) -> LinearNetwork:
         """Angles against those of the islands' references, which come last."""
@@ -574,10 +571,9 @@ class _Writing:
             r = np.zeros(self.n)
             r[[self.at[name].start for name in those]] = 1.0
             r[self.z] = _parts(1j * self.modes.modes @ (self.w * (self.island_of_w == k)))
-            for j, load in enumerate(self.loads):
-                if self.island_of_w[self.plant.net[0]["voltage_at"][j]] == k:
-                    f = complex(*self.plant.now[0]["v_sink"][j])
-                    r[self.at[load.name]] = _parts(np.array([1j * f]))
+            for name, part in self.fed.items():
+                if self.fed_island[name] == k:
+                    r[self.at[name]] = part.turn
             turns.append(r)
         kept = np.delete(np.arange(self.n), references)
         order, turn = np.concatenate([kept, references]), np.array(turns).T[kept]
@@ -589,7 +585,7 @@ class _Writing:
         for m in (A, C, C_true):
             m[:, last] = 0.0  # but for rounding
         names = [*self.at, LINES]
-        if self.plant.net[0]["H"][0] == 0.0 and GRID in names:
+        if GRID in names and not len(self.plant.of(FiniteGrid)):
             names.remove(GRID)  # an ideal grid takes part in nothing
         parts = {name: self._share(name)[np.ix_(order, order)] for name in names}
         return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts)
@@ -602,11 +598,6 @@ class _Writing:
         if part in self.at:
             share[self.at[part], self.at[part]] = np.eye(self.at[part].stop - self.at[part].start)
         return share
-
-
-def _complex(pairs: Matrix) -> Complex:
-    """Complex numbers from pairs of reals."""
-    return np.asarray(pairs[:, 0] + 1j * pairs[:, 1])
 
 
 def _parts(v: Complex) -> Matrix:

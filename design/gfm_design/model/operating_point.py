@@ -78,7 +78,7 @@ def operating_point(
         NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
-    side = _Side(par, law, np.asarray(ref))
+    side = _ConverterRest(par, law, np.asarray(ref))
     z = side.first(V_g, omega_g)
 
     def residual(z: Vector) -> Vector:
@@ -92,13 +92,14 @@ def operating_point(
 
 def operating_points(
     plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
-) -> tuple[list[OperatingPoint], list[tuple[float, float]]]:
+) -> tuple[list[OperatingPoint], list[tuple[Vector, float]]]:
     """Solve for the common operating point of several converters, each under its law.
 
-    Unknowns are those of each converter, the voltages of the nodes, and the angles of the machines;
-    of each island also the frequency. The currents that meet at a node add up to nothing, and each
-    machine gives what its governor asks for. An island is what closed lines connect, but not to the
-    grid, with a converter or a machine in it; a part of the network without any is dead.
+    Unknowns are those of each converter, the voltages of the nodes, and those of components, such
+    as the angle of a machine; of each island also the frequency. The currents that meet at a node
+    add up to nothing, and each machine gives what its governor asks for. An island is what closed
+    lines connect, but not to the grid, with a converter or a machine in it; a part of the network
+    without any is dead.
 
     Args:
         plant: as it is to start.
@@ -106,47 +107,64 @@ def operating_points(
 
     Returns:
         That of each converter, its angle against the grid or, in an island, its first node; and of
-        each machine the angle of its voltage, rad, and its speed, p.u.
+        each component with a source its unknowns and its speed, p.u., as `Network.start` takes
+        them.
 
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
     """
-    wiring, now = plant.wiring, plant.now[0]
-    sides = [
-        _Side(plant.par[k : k + 1], law, np.asarray(ref))
-        for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
-    ]
-    fixed = wiring.grid if wiring.closed else None
-    free = [node for node in wiring.nodes if node != fixed]
-    feeding = {unit.node for unit in wiring.units} | {one.node for one in wiring.machines}
-    islands = [nodes for nodes in wiring.islands() if fixed not in nodes and feeding & {*nodes}]
-    island_of = {node: k for k, nodes in enumerate(islands) for node in nodes}
-    alive = {*island_of} | {node for nodes in wiring.islands() if fixed in nodes for node in nodes}
-    sizes = [side.size for side in sides]
-    ends = np.cumsum(sizes)
+    rest = _NetworkRest(plant, laws, refs)
+    z = _newton(rest.residual, rest.first(refs))
+    if z is None:
+        each = zip(plant.wiring.units, laws, strict=True)
+        names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
+        raise NoEquilibrium(f"{names}: have no common steady state")
+    return rest.found(z)
 
-    n, M = plant.net[0], len(wiring.machines)
-    nodes_end = ends[-1] + 2 * len(free)
 
-    def parts(z: Vector) -> tuple[list[Vector], dict[str, complex], dict[str, float]]:
-        own = np.split(z[: ends[-1]], ends[:-1])
-        pairs = z[ends[-1] : nodes_end].reshape(-1, 2)
-        volts = {node: complex(*pair) for node, pair in zip(free, pairs, strict=True)}
-        if fixed is not None:
-            volts[fixed] = complex(now["V_g"])
-        omegas = z[len(z) - len(islands) :]
-        by_grid = float(now["omega_g"])
-        speeds = {
-            node: float(omegas[island_of[node]]) if node in island_of else by_grid
-            for node in wiring.nodes
-        }
+class _NetworkRest:
+    """The unknowns z of a network at rest, and what must vanish.
+
+    z has the unknowns of each converter, the two parts of each node's voltage, the unknowns of each
+    component with a source, and the speed of each island.
+    """
+
+    def __init__(self, plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]) -> None:
+        self.wiring = wiring = plant.wiring
+        self.V_g, self.omega_g = complex(plant.now[0]["V_g"]), float(plant.now[0]["omega_g"])
+        self.sides = [
+            _ConverterRest(plant.par[k : k + 1], law, np.asarray(ref))
+            for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
+        ]
+        self.fixed = wiring.grid if wiring.closed else None
+        self.free = [node for node in wiring.nodes if node != self.fixed]
+        feeding = {unit.node for unit in wiring.units}
+        feeding |= {one.node for _, one in wiring.fed if one.is_voltage}
+        groups = wiring.islands()
+        self.islands = [g for g in groups if self.fixed not in g and feeding & {*g}]
+        self.island_of = {node: k for k, nodes in enumerate(self.islands) for node in nodes}
+        self.alive = {*self.island_of, *(n for g in groups if self.fixed in g for n in g)}
+        self.sizes = [side.size for side in self.sides]
+        self.sizes += [2 * len(self.free), *(one.unknowns for _, one in wiring.fed)]
+
+    def _split(self, z: Vector) -> tuple[list[Vector], dict[str, complex], dict[str, float]]:
+        """The unknowns of each converter and component, and each node's voltage and speed."""
+        *own, omegas = np.split(z, np.cumsum(self.sizes))
+        pairs = own.pop(len(self.sides)).reshape(-1, 2)
+        volts = {node: complex(*pair) for node, pair in zip(self.free, pairs, strict=True)}
+        if self.fixed is not None:
+            volts[self.fixed] = self.V_g
+        at = self.island_of
+        speeds = {n: float(omegas[at[n]]) if n in at else self.omega_g for n in self.wiring.nodes}
         return own, volts, speeds
 
-    def residual(z: Vector) -> Vector:
-        own, volts, speeds = parts(z)
+    def residual(self, z: Vector) -> Vector:
+        """What must vanish: the slopes of each converter, what components want, and the currents
+        that meet at each node; the voltage of each island's first node has no imaginary part."""
+        wiring, (own, volts, speeds) = self.wiring, self._split(z)
         missing = dict.fromkeys(wiring.nodes, 0j)  # current that comes to each node
         rows = []
-        for side, unit, mine in zip(sides, wiring.units, own, strict=True):
+        for side, unit, mine in zip(self.sides, wiring.units, own, strict=False):
             v, omega = volts[unit.node], speeds[unit.node]
             rows.append(side.residual(mine, abs(v), omega, cmath.phase(v)))
             i_o = complex(mine[4], mine[5]) * cmath.exp(1j * mine[DELTA])
@@ -159,53 +177,44 @@ def operating_points(
                 if branch.end != GROUND:
                     missing[branch.end] += i
         for shunt in wiring.shunts:
-            if shunt.name in wiring.opened:
-                continue
-            missing[shunt.node] -= volts[shunt.node] / shunt.R
+            if shunt.name not in wiring.opened:
+                missing[shunt.node] -= volts[shunt.node] / shunt.R
         for capacitor in wiring.capacitors:
             omega = speeds[capacitor.node]
             missing[capacitor.node] -= 1j * omega * capacitor.C * volts[capacitor.node]
-        for load in plant.loads:
-            if load.name not in wiring.opened:
-                slip = wiring.omega_b * (speeds[load.node] - 1.0)
-                missing[load.node] -= load.at_rest(volts[load.node], slip)[1]
-        for j, machine in enumerate(wiring.machines, 1):
-            omega = speeds[machine.node]
-            emf = float(n["E"][j]) * cmath.exp(1j * z[nodes_end + j - 1])
-            i = (emf - volts[machine.node]) / complex(machine.R, omega * machine.X)
-            missing[machine.node] += i
-            asked = now["P_set"][j] - (omega - 1.0) * (1.0 / n["droop"][j] + n["D"][j])
-            rows.append(np.array([(emf * i.conjugate()).real / n["S"][j] - asked]))
-        met = [part for node in free for part in (missing[node].real, missing[node].imag)]
-        return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in islands]])
+        fed = zip(wiring.fed, own[len(self.sides) :], strict=True)
+        for (name, one), mine in sorted(fed, key=lambda item: item[0][1].is_voltage):
+            if one.is_voltage or name not in wiring.opened:
+                v, omega = volts[one.node], speeds[one.node]
+                i, wanted = one.steady(v, omega, wiring.omega_b, mine)
+                missing[one.node] += i
+                rows.append(np.array(wanted))
+        met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
+        return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
 
-    first = _first_voltages(wiring, refs)
-    starts = [side.first(first[u.node], 1.0) for u, side in zip(wiring.units, sides, strict=True)]
-    volts = np.array([[first[node] if node in alive else 0.0, 0.0] for node in free]).ravel()
-    z0 = np.concatenate([*starts, volts, np.zeros(M), np.ones(len(islands))])
-    z = _newton(residual, z0)
-    if z is None:
-        names = [
-            f"{u.name} ({side.law.law.name})" for u, side in zip(wiring.units, sides, strict=True)
-        ]
-        raise NoEquilibrium(f"{', '.join(names)}: have no common steady state")
-    own, _, speeds = parts(z)
-    points = [
-        side.found(mine, speeds[unit.node])
-        for side, unit, mine in zip(sides, wiring.units, own, strict=True)
-    ]
-    angles = z[nodes_end : nodes_end + M]
-    return points, [
-        (float(angle), speeds[machine.node])
-        for angle, machine in zip(angles, wiring.machines, strict=True)
-    ]
+    def first(self, refs: Sequence[Vector]) -> Vector:
+        """Where the search begins."""
+        first = _first_voltages(self.wiring, refs)
+        each = zip(self.wiring.units, self.sides, strict=True)
+        starts = [side.first(first[unit.node], 1.0) for unit, side in each]
+        volts = [[first[node] if node in self.alive else 0.0, 0.0] for node in self.free]
+        others = np.zeros(sum(self.sizes[len(starts) + 1 :]))
+        return np.concatenate([*starts, np.ravel(volts), others, np.ones(len(self.islands))])
+
+    def found(self, z: Vector) -> tuple[list[OperatingPoint], list[tuple[Vector, float]]]:
+        """The operating points, and the unknowns and the speed of each component with a source."""
+        own, _, speeds = self._split(z)
+        each = zip(self.sides, self.wiring.units, own, strict=False)
+        points = [side.found(mine, speeds[unit.node]) for side, unit, mine in each]
+        rests = zip(own[len(points) :], self.wiring.fed, strict=True)
+        return points, [(mine, speeds[one.node]) for mine, (_, one) in rests]
 
 
 def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     """Where the search for the voltage of each node begins, p.u.: at the nominal one, but where
     only converters far below it feed, as at a black start, at theirs."""
     found = dict.fromkeys(wiring.nodes, 1.0)
-    stiff = {machine.node for machine in wiring.machines}
+    stiff = {one.node for _, one in wiring.fed if one.is_voltage}
     stiff |= {wiring.grid} if wiring.grid is not None and wiring.closed else set()
     for nodes in wiring.islands():
         own = [ref[4] for unit, ref in zip(wiring.units, refs, strict=True) if unit.node in nodes]
@@ -214,7 +223,7 @@ def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     return found
 
 
-class _Side:
+class _ConverterRest:
     """One converter under its law: unknowns, what must vanish, and what is found.
 
     The unknowns are the plant's state (8,), the DC current, E_u, and the law's states.

@@ -38,7 +38,7 @@ class Peaks(NamedTuple):
     channel: NDArray[np.intp]
 
 
-class Model(NamedTuple):
+class PeakModel(NamedTuple):
     """1/height of K peaks around a point, to second order: base (K,), slope (K,n), bend (K,n,n)."""
 
     base: Vector
@@ -91,7 +91,7 @@ def peaks(loop: StateSpace, weights: tuple[Weight, ...]) -> Peaks | None:
     return Peaks(height[order], top[order], channel[order])
 
 
-def model(loops: Loops, weights: tuple[Weight, ...], at: Vector, of: Peaks) -> Model:
+def model(loops: Loops, weights: tuple[Weight, ...], at: Vector, of: Peaks) -> PeakModel:
     """The peaks ``of`` the loop at ``at``, to second order over its coordinates."""
     base, first, second = _derivatives(loops, at)
     rows, columns = _places(weights)
@@ -125,7 +125,7 @@ def model(loops: Loops, weights: tuple[Weight, ...], at: Vector, of: Peaks) -> M
     g_ab -= g_aw[:, :, None] * g_aw[:, None] / np.where(moves, g_ww, np.inf)[:, None, None]
     inverse = 1.0 / of.height
     bend = inverse[:, None, None] * (g_ab + g_a[:, :, None] * g_a[:, None])
-    return Model(inverse, inverse[:, None] * g_a, bend)
+    return PeakModel(inverse, inverse[:, None] * g_a, bend)
 
 
 def _places(weights: tuple[Weight, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

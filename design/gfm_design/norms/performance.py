@@ -98,7 +98,7 @@ PAPER_WEIGHTS: tuple[Weight, ...] = (
 
 
 @dataclass(frozen=True)
-class Channel:
+class WeightedChannel:
     """||W_ij T_ij||: its norm, and the frequency [rad/s] at which it is reached."""
 
     i: int
@@ -122,7 +122,7 @@ def channel_system(loop: StateSpace, weight: Weight, T_s: float | None = None) -
 
 def channel_norms(
     loop: StateSpace, weights: tuple[Weight, ...] = PAPER_WEIGHTS, T_s: float | None = None
-) -> tuple[Channel, ...]:
+) -> tuple[WeightedChannel, ...]:
     """The norm of every weighted channel, with the guarantee of ``hinf_norm``.
 
     Args:
@@ -136,5 +136,5 @@ def channel_norms(
     channels = []
     for weight in weights:
         norm: Norm = hinf_norm(*channel_system(loop, weight, T_s), T_s=T_s)
-        channels.append(Channel(weight.i, weight.j, norm.gain, norm.omega))
+        channels.append(WeightedChannel(weight.i, weight.j, norm.gain, norm.omega))
     return tuple(channels)

@@ -19,9 +19,9 @@ from gfm_design.model.linear import LinearLaw, LinearPlant, inverse_tustin
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_design.norms.performance import (
     PAPER_WEIGHTS,
-    Channel,
     StateSpace,
     Weight,
+    WeightedChannel,
     channel_norms,
 )
 from gfm_design.norms.screen import Screen
@@ -168,7 +168,7 @@ class PaperProblem:
         except np.linalg.LinAlgError:
             return point
 
-    def channels(self, values: Vector) -> tuple[Channel, ...]:
+    def channels(self, values: Vector) -> tuple[WeightedChannel, ...]:
         """Every channel's norm, guaranteed, with the decay if there is one. Raises ``Unstable``."""
         loop = self.closed_loop(values)
         return channel_norms(self._shifted(loop.performance()), self.weights, loop.T_s)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.norms.peaks import Loops, Model, model, peaks
+from gfm_design.norms.peaks import Loops, PeakModel, model, peaks
 from gfm_design.norms.performance import Weight
 
 Vector = NDArray[np.float64]
@@ -41,7 +41,7 @@ def polish(
     """
     at, reach = np.clip(start, low, high), _FIRST
     now = peaks(loops(at), weights)
-    nearby: Model | None = None
+    nearby: PeakModel | None = None
     past: list[float] = []
     while now is not None and len(past) < rounds and reach > _SMALLEST:
         past.append(float(now.height[0]))
@@ -67,7 +67,7 @@ def polish(
     return np.clip(at, low, high)
 
 
-def _best_step(nearby: Model, low: Vector, high: Vector) -> Vector:
+def _best_step(nearby: PeakModel, low: Vector, high: Vector) -> Vector:
     """The step in [low, high] after which the least of the models is greatest."""
     from scipy.optimize import minimize
 

@@ -13,7 +13,7 @@ from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.least_stable import least_stable
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, Weight
+from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel
 from gfm_design.norms.weights import read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
@@ -46,7 +46,7 @@ class Gamma:
     """
 
     law: str
-    channels: tuple[Channel, ...]
+    channels: tuple[WeightedChannel, ...]
 
     @property
     def value(self) -> float:
@@ -265,13 +265,13 @@ def margins(
     Raises:
         UnstableLoop: the loop is unstable and has no margins.
         UserError: no such scenario, or there is no operating point; or the converter is one of a
-            network, whose loop has ``margins()`` without the ranges.
+            network, for which ``loop_margins`` has the others.
     """
     loop = as_law(law).closed_loop(on, **more)
     if loop.around is not None:
         raise UserError(
             f"{title_of(loop)}: ranges of elements and grids are those of one converter on its"
-            " line; Law.closed_loop(...).margins() has the other margins"
+            " line; loop_margins(Law.closed_loop(...)) has the other margins"
         )
     return _margins(loop)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_design.norms.performance import Channel
+from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.scenario import Scenario, toml_text
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
@@ -16,7 +16,7 @@ from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
 _PAPERS_GRID = GridSpec().model_dump(mode="json")
 
 
-def channels_as_json(channels: Sequence[Channel]) -> dict[str, Any]:
+def channels_as_json(channels: Sequence[WeightedChannel]) -> dict[str, Any]:
     """gamma and its channels as plain data; a peak that is only a limit has no frequency."""
     rows = [
         {

@@ -5,19 +5,18 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
 from gfm_hil.api.studies import conform
 from gfm_hil.cli.common import add_map, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.terminal import fitting, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.realtime.priority import processors
+from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, shipped_sets
@@ -26,7 +25,7 @@ from gfm_runtime import law_names
 
 EXIT_FAILED = 1
 _EXIT = {PASS: 0, FAIL: EXIT_FAILED, CANNOT: 4, INFORMATIVE: 4}
-_COLOURS = {PASS: "green", FAIL: "red", CANNOT: "yellow", INFORMATIVE: "blue"}
+_STYLES = {PASS: "good", FAIL: "bad", CANNOT: "warn", INFORMATIVE: "dim"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -94,7 +93,8 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps([_plain(case) for case in cases], indent=2))
         else:
-            terminal().print(_list(cases))
+            rows = [[*_plain(case).values()] for case in cases]
+            terminal().print(Table(("test", "runs", "title", "source"), rows, text=None))
         return 0
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
@@ -125,14 +125,16 @@ def _diff(options: argparse.Namespace) -> int:
         console = terminal()
         for note in found.notes:
             console.print(escape(note), highlight=False, soft_wrap=True)
-        table = Table("", "law", "test", "part", "clause", "verdict", "measured", box=None,
-                      pad_edge=False)  # fmt: skip
-        for row in found.rows:
-            where = map(escape, (row.law, row.test, row.part, row.clause.clause))
-            shown = f"[red]{row.change}[/]" if row.counts else row.change
-            table.add_row(shown, *where, row.verdict, escape(row.value))
-        if found.rows:
-            console.print(table)
+        heads = "", "law", "test", "part", "clause", "verdict", "measured"
+        rows = [
+            [
+                Cell(row.change, "bad" if row.counts else ""), row.law, row.test, row.part,
+                row.clause.clause, row.verdict, row.value,
+            ]
+            for row in found.rows
+        ]  # fmt: skip
+        if rows:
+            console.print(Table(heads, rows, text=None))
         console.print(found.words, highlight=False)
     return EXIT_FAILED if found.worse else 0
 
@@ -142,19 +144,11 @@ def _plain(case: Case) -> dict[str, Any]:
     return {"test": case.id, "runs": runs, "title": case.test.title, "source": source}
 
 
-def _list(cases: Sequence[Case]) -> Table:
-    table = Table("test", "runs", "title", "source", box=None, pad_edge=False)
-    for case in cases:
-        runs = str(len(case.test.runs()))
-        table.add_row(case.id, runs, case.test.title, case.test.source.words())
-    return table
-
-
 def _print(result: Conformity, wall_s: float) -> None:
     """The short table that ends the command."""
     console = terminal()
+    rows: list[list[Any]] = []
     if len(result.laws) == 1:
-        table = Table("test", "", "why", box=None, pad_edge=False)
         for case in result.cases:
             verdict = result.matrix[result.laws[0], case.id]
             wrong = [
@@ -163,10 +157,12 @@ def _print(result: Conformity, wall_s: float) -> None:
                 if f.verdict == verdict != PASS
                 for text in dict.fromkeys(v.text for v in f.wrong) or [f.reason]
             ]
-            table.add_row(case.id, f"[{_COLOURS[verdict]}]{verdict}[/]", escape("\n".join(wrong)))
-        console.print(table)
+            rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
+        console.print(Table(("test", "", "why"), rows, text=None))
     else:
-        for table in fitting(console, result.laws, lambda laws: _matrix(result, laws)):
+        cells = {at: Cell(f"{SIGNS[v]} {v}", _STYLES[v]) for at, v in result.matrix.items()}
+        rows = [[case.id, *(cells[law, case.id] for law in result.laws)] for case in result.cases]
+        for table in Table(["test", *result.laws], rows, text=None).fitting(console):
             console.print(table)
     verdicts = list(result.matrix.values())
     told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
@@ -175,11 +171,3 @@ def _print(result: Conformity, wall_s: float) -> None:
     console.print(f"{told}; {runs}", highlight=False)
     report = Path(result.folder or ".") / "report.html"
     console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)
-
-
-def _matrix(result: Conformity, laws: Sequence[str]) -> Table:
-    table = Table("test", *map(escape, laws), box=None, pad_edge=False)
-    for case in result.cases:
-        cells = [result.matrix[law, case.id] for law in laws]
-        table.add_row(case.id, *[f"[{_COLOURS[v]}]{SIGNS[v]} {v}[/]" for v in cells])
-    return table

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import check_empty
 
 _FOLDERS = (
     Path(__file__).resolve().parents[1] / "deploy",  # a wheel carries them here
@@ -34,8 +35,7 @@ def call(options: argparse.Namespace) -> int:
     if source is None:
         raise UserError("gfmhil deploy: this installation came without the files of deploy/")
     out = Path(options.out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out}: is not an empty folder; choose another --out")
+    check_empty(out)
     for path in sorted(p for pattern in FILES for p in source.glob(pattern) if p.is_file()):
         target = out / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)

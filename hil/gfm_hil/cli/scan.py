@@ -14,8 +14,8 @@ from gfm_hil.api.studies import scan
 from gfm_hil.cli.common import add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
-from gfm_hil.core.terminal import numbers, terminal
-from gfm_hil.results.report import cell
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.table import Table, shown
 from gfm_hil.scenario import find_scenario, shipped_scenarios
 from gfm_hil.studies.scan import AMPLITUDE, POINTS, WINDOW_S, FrequencyScan
 from gfm_runtime import law_names, tuned_names
@@ -127,16 +127,19 @@ def _print(found: FrequencyScan, content: dict[str, Any], folder: Path) -> None:
     console = terminal(highlight=False)
     console.print(f"[bold]{escape(found.name)}[/] · {escape(found.scenario.title)}")
     dev = found.deviation
-    head = ["f \\[Hz]", "|Y_dd|", "|Y_qq|", "λ_min(Y+Yᴴ)", "|Δp/Δω_g|"]
-    table = numbers(*head, *([] if dev is None else ["off the model \\[%]"]))
-    rows = range(0, len(found.frequency), max(1, len(found.frequency) // _ROWS))
-    for k in rows:
-        values = [
-            found.frequency[k], abs(found.Y[k, 0, 0]), abs(found.Y[k, 1, 1]), found.passivity[k],
-            abs(found.nfp[k]), *([] if dev is None else [100.0 * dev[k]]),
-        ]  # fmt: skip
-        table.add_row(*(f"{value:.4g}" for value in values))
-    console.print(table)
+    heads = ["f [Hz]", "|Y_dd|", "|Y_qq|", "λ_min(Y+Yᴴ)", "|Δp/Δω_g|"]
+    heads += [] if dev is None else ["off the model [%]"]
+    rows = [
+        [
+            f"{x:.4g}"
+            for x in (
+                found.frequency[k], abs(found.Y[k, 0, 0]), abs(found.Y[k, 1, 1]),
+                found.passivity[k], abs(found.nfp[k]), *([] if dev is None else [100.0 * dev[k]]),
+            )
+        ]
+        for k in range(0, len(found.frequency), max(1, len(found.frequency) // _ROWS))
+    ]  # fmt: skip
+    console.print(Table(heads, rows))
     if dev is not None:
         console.print(
             f"largest deviation from the linear model: {100 * dev.max():.2g} % at "
@@ -151,7 +154,7 @@ def _print(found: FrequencyScan, content: dict[str, Any], folder: Path) -> None:
             why = f": {grid['unstable_poles']} unstable poles"
         console.print(
             f"SCR {grid['scr']:g}, X/R {grid['x_over_r']:g}: {verdict}{why}, margin "
-            f"{cell(grid['margin'])} at {grid['margin_at_hz']:.4g} Hz",
+            f"{shown(grid['margin'])} at {grid['margin_at_hz']:.4g} Hz",
             soft_wrap=True,
         )
     console.print(escape(f"folder: {folder}"), soft_wrap=True)

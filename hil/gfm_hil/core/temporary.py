@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+MEMORY = Path("/dev/shm")  # of shm_open(3) on Linux
 PATIENCE_S = 10.0  # a process of ours holds an exclusive lock for milliseconds
 _LOOK_S = 0.01
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
@@ -26,6 +27,24 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
 def is_private(found: os.stat_result) -> bool:
     """Whether a file or folder belongs to our user and no other user has any access to it."""
     return found.st_uid == os.geteuid() and not found.st_mode & 0o077
+
+
+def private_folder() -> Path:
+    """The folder of our user in memory, made if it is not there; nobody else has any access to it.
+
+    Raises:
+        PermissionError: what is there belongs to another user, is open to others or no folder.
+    """
+    place = MEMORY / f"gfmhil-{os.geteuid()}"
+    with contextlib.suppress(FileExistsError):
+        place.mkdir(0o700)
+    found = place.lstat()
+    if not stat.S_ISDIR(found.st_mode) or not is_private(found):
+        mode = stat.S_IMODE(found.st_mode)
+        raise PermissionError(
+            f"{place} is not a folder of our user alone (owner uid {found.st_uid}, mode {mode:04o})"
+        )
+    return place
 
 
 def is_guarded(folder: os.stat_result) -> bool:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console
-from rich.table import Column, Table
 
 _ANY = 100_000  # columns; more than any table takes
-
-T = TypeVar("T")
 
 
 def terminal(**options: Any) -> Console:
@@ -23,27 +20,6 @@ def terminal(**options: Any) -> Console:
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _ANY
     return console
-
-
-def fitting(
-    console: Console, columns: Sequence[T], table_of: Callable[[Sequence[T]], Table]
-) -> Iterator[Table]:
-    """Tables of as many columns each as the console shows without wrapping, at least one."""
-    free, left = console.options.update(max_width=_ANY), list(columns)
-    while left:
-        count = len(left)
-        while count > 1 and console.measure(table_of(left[:count]), options=free).maximum > (
-            console.width
-        ):
-            count -= 1
-        yield table_of(left[:count])
-        left = left[count:]
-
-
-def numbers(first: str, *others: str, title: str = "") -> Table:
-    """An empty table without lines: the first column is text, the others are numbers."""
-    columns = (Column(head, justify="right", no_wrap=" " not in head) for head in others)
-    return Table(first, *columns, title=title, title_justify="left", box=None, pad_edge=False)
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

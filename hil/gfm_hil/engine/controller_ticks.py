@@ -4,14 +4,17 @@ The plant's frames drive it. In real time it also watches the clock: it counts t
 without a newer frame, and more than ``late_policy.hold`` of them lead to the safe state. It sleeps
 until shortly before the next frame, which a phase lock to the frames received so far foretells: it
 needs no clock in common with the plant.
+
+Over a link with ``every`` = n > 1, y[k] comes at every n-th tick only. When it comes, the loop
+first computes the ticks since the last one, with the y of that one, and sends no u of them.
 """
 
 from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
 from gfm_hil.engine.tick import answer
-from gfm_hil.links.frame import judge, pack, pack_again, unpack
-from gfm_hil.realtime.clock import AHEAD_NS, between_looks, give_way, now_ns, sleep_until
+from gfm_hil.links.frame import judge, pack, pack_again, skip, unpack
+from gfm_hil.realtime.clock import AHEAD_NS, now_ns, sleep_until, spin_or_yield, yield_processor
 from gfm_hil.recording.recorder import record_controller
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.controller import missed
@@ -59,21 +62,39 @@ def receive(end, records, r, ctl, event, sent):
     """
     sequence, frame, message = end.out
     while not r.pending:
-        before = r.tick
-        why = _next_frame(end, records, r, ctl, sent)
-        if why != ReturnReason.GO_ON:
-            return why
-        if r.tick <= before:
-            r.tick = before
-            pack_again(sequence, frame, message)  # a reset may have changed state and u since
-            end.send(end.handle, message)
-            continue
+        if r.tick == r.received:
+            if r.left != 0:
+                return _parting(r, end.reader[0].state)
+            why = _next_frame(end, records, r, ctl, sent)
+            if why != ReturnReason.GO_ON:
+                return why
+            if r.received == r.tick:
+                pack_again(sequence, frame, message)  # a reset may have changed state and u since
+                end.send(end.handle, message)
+                continue
+            r.tick = max(r.tick, r.received - r.every) if r.done > 0 else r.received - 1
+        r.tick += 1
+        if r.every > 1:
+            _between(end, records, r)
         if r.tick >= event:
             r.pending = 1
             return ReturnReason.EVENT
         break
     r.pending = 0
     return ReturnReason.GO_ON
+
+
+@inlined
+def _between(end, records, r):
+    """Take the y received once its tick is there; note the times of a tick before it."""
+    _, _, y, _, _, times, _ = records
+    got, _ = end.into
+    if r.tick == r.received and r.left == 0:
+        for j in range(len(y)):
+            y[j] = got[0].values[j]
+    else:
+        times[r.tick, 0] = r.t0 + r.tick * r.T
+        times[r.tick, 1], times[r.tick, 4] = now_ns(), 0
 
 
 @inlined
@@ -87,11 +108,14 @@ def reply(end, records, r, controller, event, changes):
     sequence, frame, message = end.out
     k = r.tick
     times[k, 2] = now_ns()
-    pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
-    end.send(end.handle, message)
+    if r.every == 1 or k % r.every == 0:
+        pack(sequence, frame, message, k, ctl[0].state, ctl[0].reason, u)
+        end.send(end.handle, message)
+    else:
+        skip(sequence)
     times[k, 3] = now_ns()
     if r.realtime and end.spins == 0:
-        give_way()  # to the link's own thread: a sleep takes 9 µs before it leaves
+        yield_processor()  # to the link's own thread: a sleep takes 9 µs before it leaves
     record_controller(rows[k], ctl, states, est)
     r.done += 1
     progress[0], progress[1] = k + 1, ctl[0].reason
@@ -103,7 +127,8 @@ def reply(end, records, r, controller, event, changes):
 
 @inlined
 def _next_frame(end, records, r, ctl, sent):
-    """Wait for a good frame of the plant: GO_ON, its tick in ``r``; or why to return.
+    """Wait for a good frame of the plant: GO_ON, its tick in ``r.received`` if it is newer than
+    ``r.tick``; or why to return.
 
     The time since the last answer was ``sent`` (0: there was none), which the link's own thread
     took, is a gap between two looks at the clock like any other.
@@ -119,8 +144,8 @@ def _next_frame(end, records, r, ctl, sent):
     before = now_ns()
     gap = before - sent if r.realtime and sent > 0 else 0
     if r.realtime and r.done > 0 and flags[STOP] == 0:
-        due = r.t0 + (r.tick + 1) * r.T
-        wake = min(due + int(r.phase) - AHEAD_NS, before + r.T)
+        due = r.t0 + (r.tick + r.every) * r.T
+        wake = min(due + int(r.phase) - AHEAD_NS, before + r.every * r.T)
         if end.spins == 0 and due > before:
             # Others need the processor too. Without any rest the kernel would throttle all real
             # time on it for 50 ms in each second.
@@ -143,7 +168,7 @@ def _next_frame(end, records, r, ctl, sent):
             gap = max(gap, now - before)
             before = now
             if size > 0:
-                k = unpack(reader, _Y_ID, got, got_bytes, size, y)
+                k = unpack(reader, _Y_ID, got, got_bytes, size, y[: r.at_once])
                 if k > r.tick:  # only a newer tick is a sign of life
                     r.heard = now
                 if k >= 0:
@@ -152,7 +177,8 @@ def _next_frame(end, records, r, ctl, sent):
                 judge(reader, True, True)
                 return ReturnReason.SILENT
             if r.realtime and r.done > 0:  # before tick 0 nothing can be stale
-                while ctl[0].stale < (now - r.heard) // r.T and ctl[0].state != SAFE:
+                overdue = (now - r.heard) // r.T - (r.every - 1)
+                while ctl[0].stale < overdue and ctl[0].state != SAFE:
                     missed(ctl)
                 judge(reader, ctl[0].stale > ctl[0].hold, True)
                 if ctl[0].state != r.seen:
@@ -164,17 +190,29 @@ def _next_frame(end, records, r, ctl, sent):
             r.woken = flags[WAKE]
             return ReturnReason.WOKEN
         if size <= 0:
-            between_looks(looks, end.spins)
-    if reader[0].state == SAFE and not r.survives_trip:
-        return ReturnReason.PEER_SAFE
-    if reader[0].state == STOPPED:
-        return ReturnReason.PEER_STOPPED
+            spin_or_yield(looks, end.spins)
+    why = _parting(r, reader[0].state)
+    if why != ReturnReason.GO_ON:
+        if r.every == 1 or r.done == 0 or k <= r.tick + 1:
+            return why
+        r.received, r.left = k - 1, 1  # the ticks up to there are computed first
+        return ReturnReason.GO_ON
     if r.realtime:
         _lock(r, k, now, now - awake > _LOOKED_NS, slept)
     if k > r.tick:
         times[k, 0] = r.t0 + k * r.T
         times[k, 1], times[k, 4] = now, gap
-    r.tick = k
+        r.received = k
+    return ReturnReason.GO_ON
+
+
+@inlined
+def _parting(r, state):
+    """Whether the plant's state ends the run: PEER_SAFE, PEER_STOPPED, or GO_ON."""
+    if state == SAFE and not r.survives_trip:
+        return ReturnReason.PEER_SAFE
+    if state == STOPPED:
+        return ReturnReason.PEER_STOPPED
     return ReturnReason.GO_ON
 
 

@@ -23,6 +23,7 @@ from gfm_hil.engine.loop_records import (
     Records,
     ReturnReason,
     Side,
+    limited_reader,
     make_loop,
 )
 from gfm_hil.engine.plant_ticks import plant_ticks
@@ -68,8 +69,10 @@ class _End:
         plant = role == "plant"
         self.bench, self.link = bench, link
         self.writer = FrameWriter("y" if plant else "u", bench.inner)
-        self.reader = FrameReader.of(role, scenario)
-        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns)
+        hold = int(bench.controller.ctl["hold"][0])  # of the watchdog, for both sides
+        every = getattr(link, "every", 1)
+        self.reader = limited_reader(role, scenario, hold, every)
+        self.loop = make_loop(scenario, 0 if plant else -1, t0_ns, hold, every)
         sleeps_soon = share.crowded and port.patient is not None
         self.loop["spin_limit"] = _SOON if sleeps_soon else port.spin_limit
         w, r = self.writer, self.reader

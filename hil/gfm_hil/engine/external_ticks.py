@@ -22,7 +22,7 @@ from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, Ret
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.log import Status
 from gfm_hil.scenario.events.base import Event
-from gfm_hil.scenario.events.gains import GainChange, Retuned, ready_gains
+from gfm_hil.scenario.events.gains import GainChange, ready_gains
 from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled
 from gfm_runtime.controller import accept, bad_output, follow_plant, measured, next_law
@@ -31,6 +31,7 @@ from gfm_runtime.states import READY, RUNNING, SAFE
 
 if TYPE_CHECKING:
     from gfm_hil.controllers import PilController
+    from gfm_hil.scenario.events.gains import Retuned
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")

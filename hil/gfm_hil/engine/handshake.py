@@ -29,10 +29,11 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import PeerLost, lines
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
+from gfm_hil.engine.loop_records import limited_reader
 from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.frame import FrameError, FrameReader
+from gfm_hil.links.frame import FrameError
 from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import TABLE_VERSION, carried, table_hash
 
@@ -52,9 +53,6 @@ _MUST_FIT = {
     "laws": "law or law file",
     "digest": "scenario",
 }
-
-Notice = Callable[[str], None]
-
 
 _Text = Annotated[str, Field(max_length=100)]
 _Name = Annotated[str, Field(pattern="^[!-~]([ -~]{0,62}[!-~])?$")]  # printable ASCII
@@ -124,8 +122,8 @@ class Meeting:
         self._lead_ns = _LEAD_NS if controllers == 1 else _LEAD_OF_SEVERAL_NS
         self._lock = threading.Lock()
 
-    def come(self) -> None:
-        """One more is there."""
+    def arrived(self) -> None:
+        """Count one more controller."""
         with self._lock:
             self._missing -= 1
             if self._missing == 0:
@@ -138,34 +136,7 @@ class Meeting:
 
 
 class _Refused(Exception):
-    """A greeting that cannot be one; says why."""
-
-
-class _Heard:
-    """What came over a link that is no good greeting.
-
-    Attributes:
-        refused: messages that begin as a greeting does.
-    """
-
-    def __init__(self, link: Link) -> None:
-        self._connected = getattr(link, "connected", _nothing)
-        self.refused, self._others, self._why = 0, 0, ""
-
-    def refuse(self, why: _Refused) -> None:
-        """Count a greeting."""
-        self.refused, self._why = self.refused + 1, str(why)
-
-    def no_greeting(self) -> None:
-        """Count a message that does not even begin as one."""
-        self._others += 1
-
-    def __str__(self) -> str:
-        if self.refused:
-            return f"; greetings refused: {self.refused}, the last one because {self._why}"
-        if self._others:
-            return f"; messages that are no greeting: {self._others}"
-        return "; a peer is connected but says nothing" if self._connected() else ""
+    """A greeting that is malformed; says why."""
 
 
 def shake_hands(
@@ -173,13 +144,13 @@ def shake_hands(
     link: Link,
     scenario: Scenario,
     stopped: Callable[[], bool],
-    notice: Notice,
+    notice: Callable[[str], None],
     meeting: Meeting | None = None,
     name: str = OUR_CONTROLLER,
 ) -> Start:
     """Meet the other side and agree on the time of tick 0.
 
-    ``notice`` is told, within a second and then every five, that the other side is awaited, and
+    Within a second and then every five, ``notice`` gets a line that the other side is awaited, and
     what came instead.
 
     Args:
@@ -190,86 +161,142 @@ def shake_hands(
         PeerLost: no good greeting came within ``link.start_timeout_s``, or the other side runs
             something else.
     """
-    boot, meeting = _boot(), meeting or Meeting()
-    mine = {"role": role, "boot": boot, **_what_runs(scenario)}
-    if role == "plant":
-        mine["run"] = meeting.run
-    else:
-        mine["name"] = name
-    run, controller = mine.get("run"), mine.get("name")
-    begin = time.monotonic_ns()
-    deadline = latest = begin + int(scenario.link.start_timeout_s * 1e9)
-    say_at, again_at = begin + 500_000_000, begin + _AGAIN_NS
-    other = "plant" if role == "controller" else "controller"
-    met = one_clock = False
-    answered = -_REPEAT_NS
-    heard = _Heard(link)
-
-    def agreed(t0_ns: int) -> Start:
-        return Start(t0_ns, one_clock, heard.refused, run, controller)
-
+    side = _Side(role, link, scenario, meeting or Meeting(), name)
+    reconnect = getattr(link, "again", None)
+    say_at, again_at = side.begin + 500_000_000, side.begin + _AGAIN_NS
     while not stopped():
         if role == "plant":
-            link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
-        message = await_message(link, min(time.monotonic_ns() + _REPEAT_NS, deadline), stopped)
+            side.send_hello()
+        wait_until = min(time.monotonic_ns() + _REPEAT_NS, side.deadline)
+        message = await_message(link, wait_until, stopped)
         now = time.monotonic_ns()
+        start = side.take(message, now)
+        if start is not None:
+            return start
+        if now >= side.deadline:
+            break
+        if now >= again_at and not side.met:
+            if reconnect is not None:
+                reconnect()
+            again_at = now + _AGAIN_NS
+        if now >= say_at and not side.met:
+            notice(f"waiting for the {side.other} at {scenario.link.endpoint} …{side.heard()}")
+            say_at = now + 5_000_000_000
+    if stopped():
+        raise PeerLost(f"interrupted while waiting for the {side.other}{side.heard()}")
+    raise side.lost()
+
+
+class _Side:
+    """What one side of the handshake has said, and what it has learned of the other.
+
+    Attributes:
+        other: the role of the peer.
+        begin, deadline: ns; until when to wait.
+        met: a HELLO came that fits ours.
+    """
+
+    def __init__(
+        self, role: Role, link: Link, scenario: Scenario, meeting: Meeting, name: str
+    ) -> None:
+        self._role, self._link, self._scenario, self._meeting = role, link, scenario, meeting
+        self.other: Role = "plant" if role == "controller" else "controller"
+        own = {"run": meeting.run} if role == "plant" else {"name": name}
+        self._mine = {"role": role, "boot": _boot(), **_what_runs(scenario), **own}
+        self._run, self._controller = self._mine.get("run"), self._mine.get("name")
+        self.begin = time.monotonic_ns()
+        self.deadline = self._latest = self.begin + int(scenario.link.start_timeout_s * 1e9)
+        self.met = self._one_clock = False
+        self._answered = -_REPEAT_NS
+        self._refused, self._others, self._why = 0, 0, ""
+
+    def send_hello(self) -> None:
+        self._send({**self._mine, "kind": "hello"})
+
+    def _send(self, greeting: dict[str, Any]) -> None:
+        self._link.send(_PREFIX + json.dumps(greeting).encode())
+
+    def take(self, message: bytes | None, now: int) -> Start | None:
+        """Process what came, if anything; returns what both sides agreed on once they have.
+
+        Raises:
+            PeerLost: the other side runs something else.
+        """
         try:
             greeting = None if message is None else _read(message)
             if isinstance(greeting, _Hello):
-                # Answer before comparing, so that both sides see a misfit, and answer once for
-                # all the greetings that had piled up.
-                if role == "controller" and now - answered >= _REPEAT_NS:
-                    answered = now
-                    link.send(_PREFIX + json.dumps({**mine, "kind": "hello"}).encode())
-                _compare(mine, greeting)
-                one_clock = bool(boot) and greeting.boot == boot
-                if role == "plant":
-                    controller = greeting.name
-                else:
-                    run = greeting.run
-                if role == "plant" and not met:
-                    meeting.come()
-                # from here on silence means that the other side is gone
-                quiet = now + int(scenario.peer_timeout_s * 1e9)
-                deadline = max(deadline, min(quiet, latest)) if met else quiet
-                met = True
-            elif isinstance(greeting, _Go) and met:
-                if not one_clock:
-                    return agreed(now + _LEAD_NS)
-                _check_time(greeting.t0, begin, now)
-                return agreed(greeting.t0)
+                self._meet(greeting, now)
+            elif isinstance(greeting, _Go) and self.met:
+                return self._start_at(greeting.t0, now)
             elif message is not None and greeting is None:
-                tick = _tick(message, scenario) if met else None
+                tick = _tick(message, self._scenario) if self.met else None
                 if tick is not None:  # it runs: START was lost
-                    t0 = now - round(tick * scenario.T_s * 1e9)
-                    return agreed(t0)
-                heard.no_greeting()
+                    return self._agreed(now - round(tick * self._scenario.T_s * 1e9))
+                self._others += 1
         except _Refused as problem:
-            heard.refuse(problem)
-        if met and role == "plant" and meeting.t0_ns:
-            go: dict[str, Any] = {"kind": "start", "t0": meeting.t0_ns}
-            link.send(_PREFIX + json.dumps(go).encode())
-            return agreed(meeting.t0_ns)
-        if now >= deadline:
-            break
-        if now >= again_at and not met:
-            getattr(link, "again", _nothing)()
-            again_at = now + _AGAIN_NS
-        if now >= say_at and not met:
-            notice(f"waiting for the {other} at {scenario.link.endpoint} …{heard}")
-            say_at = now + 5_000_000_000
-    if stopped():
-        raise PeerLost(f"interrupted while waiting for the {other}{heard}")
-    if met:
-        raise PeerLost(f"the {other} came but did not start{heard if heard.refused else ''}")
-    raise PeerLost(
-        f"the {other} did not come within {scenario.link.start_timeout_s:g} s "
-        f"at {scenario.link.endpoint}{heard}"
-    )
+            self._refused, self._why = self._refused + 1, str(problem)
+        if self.met and self._role == "plant" and self._meeting.t0_ns:
+            self._send({"kind": "start", "t0": self._meeting.t0_ns})
+            return self._agreed(self._meeting.t0_ns)
+        return None
 
+    def _meet(self, hello: _Hello, now: int) -> None:
+        # Answer before comparing, so that both sides see a misfit, and answer once for all the
+        # greetings that had piled up.
+        if self._role == "controller" and now - self._answered >= _REPEAT_NS:
+            self._answered = now
+            self.send_hello()
+        _compare(self._mine, hello)
+        self._one_clock = bool(hello.boot) and hello.boot == self._mine["boot"]
+        if self._role == "controller":
+            self._run = hello.run
+        else:
+            self._controller = hello.name
+            if not self.met:
+                self._meeting.arrived()
+        # from here on silence means that the other side is gone
+        quiet = now + int(self._scenario.peer_timeout_s * 1e9)
+        self.deadline = max(self.deadline, min(quiet, self._latest)) if self.met else quiet
+        self.met = True
 
-def _nothing() -> None:
-    """Of a link that has no second way, or cannot know whether a peer is there."""
+    def _start_at(self, t0: int, now: int) -> Start:
+        """Take the plant's time of tick 0.
+
+        Raises:
+            _Refused: it lies before this side began to wait, or far ahead.
+        """
+        if not self._one_clock:
+            return self._agreed(now + _LEAD_NS)
+        if not self.begin <= t0 <= now + _MOST_LEAD_NS:
+            raise _Refused(
+                f"t0 = {t0} lies {(t0 - now) * 1e-9:.3g} s ahead: must be at most "
+                f"{_MOST_LEAD_NS * 1e-9:g} s ahead, and not before this side began to wait"
+            )
+        return self._agreed(t0)
+
+    def _agreed(self, t0_ns: int) -> Start:
+        return Start(t0_ns, self._one_clock, self._refused, self._run, self._controller)
+
+    def heard(self) -> str:
+        """What came that is no good greeting, to append to a message."""
+        if self._refused:
+            return f"; greetings refused: {self._refused}, the last one because {self._why}"
+        if self._others:
+            return f"; messages that are no greeting: {self._others}"
+        connected = getattr(self._link, "connected", None)
+        silent = connected is not None and connected()
+        return "; a peer is connected but says nothing" if silent else ""
+
+    def lost(self) -> PeerLost:
+        """The error at the deadline."""
+        if self.met:
+            heard = self.heard() if self._refused else ""
+            return PeerLost(f"the {self.other} came but did not start{heard}")
+        link = self._scenario.link
+        return PeerLost(
+            f"the {self.other} did not come within {link.start_timeout_s:g} s "
+            f"at {link.endpoint}{self.heard()}"
+        )
 
 
 def _what_runs(scenario: Scenario) -> dict[str, Any]:
@@ -293,7 +320,7 @@ def _boot() -> str:
 def _tick(message: bytes, scenario: Scenario) -> int | None:
     """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
-        return FrameReader.of("controller", scenario).unpack(
+        return limited_reader("controller", scenario).unpack(
             message, np.empty(len(carried("y", scenario.has_inner)))
         )
     except FrameError:
@@ -314,20 +341,6 @@ def _read(message: bytes) -> _Hello | _Go | None:
         return _GREETING.validate_json(message[len(_PREFIX) :])
     except ValidationError as problem:
         raise _Refused(lines(problem)[0]) from None
-
-
-def _check_time(t0: int, begin: int, now: int) -> None:
-    """See that tick 0 is neither before this side asked for it nor far away.
-
-    Raises:
-        _Refused: it is.
-    """
-    if not begin <= t0 <= now + _MOST_LEAD_NS:
-        most = _MOST_LEAD_NS * 1e-9
-        raise _Refused(
-            f"t0 = {t0} lies {(t0 - now) * 1e-9:.3g} s ahead: must be at most {most:g} s ahead, "
-            "and not before this side began to wait"
-        )
 
 
 def _compare(mine: dict[str, Any], theirs: _Hello) -> None:

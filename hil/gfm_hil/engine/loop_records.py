@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.core.roles import Role
+from gfm_hil.links.frame import LAST_TIMES, LONGEST_JUMP, FrameReader
 from gfm_hil.scenario import Scenario
-from gfm_runtime.signals import NU_INNER
-from gfm_runtime.states import RUNNING
+from gfm_runtime.signals import NU_INNER, NY_INNER
+from gfm_runtime.states import RUNNING, STOPPED
 
 
 class ReturnReason(IntEnum):
@@ -39,7 +42,14 @@ loop_dtype = np.dtype(
         ("realtime", "i8"),
         ("clock_every", "i8"),  # reads of the link between two reads of the clock, at first
         ("spin_limit", "i8"),  # lockstep: empty reads after which the loop may sleep
-        ("tick", "i8"),  # plant: the next one; controller: the last one received, -1 before
+        ("tick", "i8"),  # plant: the next one; controller: the last one computed, -1 before
+        ("every", "i8"),  # ticks to an exchange of y and u
+        ("at_once", "i8"),  # values that a frame puts into y or u when it comes: all, or none
+        ("received", "i8"),  # controller: tick of the last y
+        ("left", "i8"),  # controller, every > 1: the plant has left after tick ``received``
+        ("ahead", "i8"),  # plant, every > 1: tick of the newest u, -1 before the first
+        ("acting", "i8"),  # plant, every > 1: tick of the u that acts, -1 before the first
+        ("u_ahead", "f8", (NU_INNER,)),
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns
         ("patience", "i8"),  # silence after which the other side is gone, ns
@@ -128,18 +138,50 @@ class ControllerRecords(NamedTuple):
 _CLOCK_EVERY = 64
 
 
-def make_loop(scenario: Scenario, tick: int, t0_ns: int) -> np.ndarray:
+def make_loop(scenario: Scenario, tick: int, t0_ns: int, hold: int, every: int = 1) -> np.ndarray:
     """A scenario's loop before its first tick; see ``loop_dtype``."""
     loop = np.zeros(1, loop_dtype)
-    link, policy = scenario.link, scenario.late_policy
+    link = scenario.link
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
     loop["survives_trip"], loop["others"] = scenario.survives_trips, scenario.network is not None
+    loop["every"], loop["at_once"] = every, NY_INNER if every == 1 else 0
+    loop["received"], loop["ahead"], loop["acting"] = tick, -1, -1
     loop["seen"], loop["unseen"] = RUNNING, -1
-    loop["hold"], loop["extrapolate"] = policy.hold, policy.extrapolate
+    loop["hold"], loop["extrapolate"] = hold, scenario.late_policy.extrapolate
     loop["T"] = round(scenario.T_s * 1e9)
     loop["patience"] = int(scenario.peer_timeout_s * 1e9)
     loop["repeat"] = int(link.repeat_s * 1e9)
     if tick < 0 and scenario.mode == "lockstep" and scenario.network is not None:
         loop["patience"] *= 2  # the plant may wait for another controller, and then goes on
     return loop
+
+
+def limited_reader(role: Role, scenario: Scenario, hold: int = 0, every: int = 1) -> FrameReader:
+    """The reader of one side's frames, with the limits that its scenario sets.
+
+    In lockstep the sides wait for each other, so an exchange comes after the one before. In real
+    time a gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone. The
+    plant's loop writes its own tick into ``newest`` at every tick.
+
+    Args:
+        hold: of the plant in real time: how many ticks late a u may be.
+        every: ticks to an exchange.
+    """
+    lockstep, plant = scenario.mode == "lockstep", role == "plant"
+    gap = 0 if lockstep else math.ceil(scenario.peer_timeout_s / scenario.T_s)
+    delta = gap + every
+    asked = math.ceil(min(scenario.peer_timeout_s / scenario.link.repeat_s, LONGEST_JUMP))
+    limits = {
+        "delta": delta,
+        "jump": min(delta + asked + LAST_TIMES, LONGEST_JUMP),
+        "again": asked if lockstep else 0,
+        "every": every,
+    }
+    if not plant:
+        limits["newest"] = scenario.ticks - 1
+    elif not lockstep:
+        limits["behind"] = hold + (2 * every - 1 if every > 1 else 0)
+    if scenario.survives_trips:
+        limits["leaving"] = STOPPED
+    return FrameReader("u" if plant else "y", scenario.has_inner, **limits)

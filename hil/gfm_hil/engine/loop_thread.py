@@ -14,7 +14,7 @@ from gfm_hil.engine.drive import Share, drive_controller, drive_plant
 from gfm_hil.engine.loop_records import FLAGS, STOP
 from gfm_hil.links.frame import FrameReader
 from gfm_hil.links.pump import ported
-from gfm_hil.realtime.priority import stand_back
+from gfm_hil.realtime.priority import restore_priority
 
 _LOOK_S = 0.05
 
@@ -63,7 +63,7 @@ def run_loop(
         timeline.put_off = True
     thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
     thread.start()
-    stand_back()
+    restore_priority()
     try:
         while thread.is_alive():
             thread.join(_LOOK_S)

@@ -6,20 +6,23 @@ deadline t_0 + k T_s on CLOCK_MONOTONIC, and u[k] has until the next deadline. A
 there by then is a miss: the plant holds the last u of that converter, and after
 ``late_policy.hold`` misses in a row it blocks it. One converter alone then ends the run. Among
 several, a controller that leaves or falls silent trips its converter, and the others go on.
+
+Over a link with ``every`` = n > 1, y[k] is sent at every n-th tick only, and its u[k] acts from
+tick k + n on (before tick n u[0] acts): a delay of n ticks, in lockstep as in real time.
 """
 
 from __future__ import annotations
 
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
 from gfm_hil.engine.tick import apply_peer_state, asks_to_start, sample, take
-from gfm_hil.links.frame import INVALID, judge, pack, pack_again, unpack
+from gfm_hil.links.frame import INVALID, judge, pack, pack_again, skip, unpack
 from gfm_hil.realtime.clock import (
     AHEAD_NS,
-    between_looks,
-    give_way,
     now_ns,
     sleep_until,
+    spin_or_yield,
     wait_until,
+    yield_processor,
 )
 from gfm_hil.recording.recorder import record_command
 from gfm_plant import plant_is_delayed, plant_step
@@ -114,17 +117,40 @@ def _ask(side, plant, i, k, due):
         return 0
     state, reason = (SAFE, PLANT_TRIP) if r.tripped != 0 else (0, 0)
     sequence, frame, message = end.out
-    pack(sequence, frame, message, k, state, reason, records.y)
-    end.send(end.handle, message)
+    if r.every == 1 or k % r.every == 0:
+        pack(sequence, frame, message, k, state, reason, records.y)
+        end.send(end.handle, message)
+    else:
+        skip(sequence)
     sent = now_ns()
     times[k, 2] = sent
     if r.realtime and end.spins == 0:
-        give_way()  # to the link's own thread, before the first look
+        yield_processor()  # to the link's own thread, before the first look
     if r.unseen >= 0:
         times[r.unseen, 3] = sent
         r.unseen = -1
     r.came = AWAITED
+    if r.every > 1 and _acts(r, records.u, k):
+        r.came = FRESH
+        times[k, 3] = sent
+        return 0
     return 1
+
+
+@inlined
+def _acts(r, u, k):
+    """Whether the u that acts in tick k has come; puts it into u.
+
+    In lockstep the newest u must have come as well: only as long as the plant has sent no later y
+    does asking again bring one that was lost.
+    """
+    asked = k - k % r.every
+    acting = max(0, asked - r.every)
+    if r.acting != acting and r.ahead == acting:
+        r.acting = acting
+        for j in range(len(u)):
+            u[j] = r.u_ahead[j]
+    return r.acting == acting and (r.realtime != 0 or r.ahead == asked)
 
 
 @inlined
@@ -175,7 +201,7 @@ def _await(sides, k, awaited, gap, spins, patience, repeat, hurried):
             if not r.realtime and flags[STOP] != 0:
                 _give_up(sides, LEAVING)
                 return gap
-            between_looks(looks, spins)
+            spin_or_yield(looks, spins)
 
 
 @inlined
@@ -194,7 +220,13 @@ def _look(side, k, looks):
         return _OVER
     if size == 0:
         return _NOTHING
-    tick = unpack(reader, _U_ID, got, got_bytes, size, records.u)
+    tick = unpack(reader, _U_ID, got, got_bytes, size, records.u[: r.at_once])
+    if r.every > 1:
+        if tick > r.ahead:
+            r.ahead = tick
+            for j in range(len(records.u)):
+                r.u_ahead[j] = got[0].values[j]
+        tick = k if _acts(r, records.u, k) else -1
     if tick == k:
         r.came = FRESH
         return _OVER

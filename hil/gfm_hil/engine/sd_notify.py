@@ -14,7 +14,7 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.realtime.priority import stand_back
+from gfm_hil.realtime.priority import restore_priority
 from gfm_hil.scenario import Scenario
 
 _PATIENCE_S = 1.0  # the service manager does not read; the next message says it again
@@ -80,7 +80,7 @@ class Watched:
         return int(self._progress[0])
 
     def _look(self) -> None:
-        stand_back()  # the thread inherited the loop's priority and processor
+        restore_priority()  # the thread inherited the loop's priority and processor
         seen = 0
         every = min(_STATUS_S, (self._limit_s or 4 * _STATUS_S) / 4)
         while not self._over.wait(every):

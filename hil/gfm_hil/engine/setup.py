@@ -135,14 +135,14 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         if scenario.network is None:
             grid = scenario.plant.grid
             starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
-            machines = list[tuple[float, float]]()
+            rests = list[tuple[NDArray[np.float64], float]]()
         else:
-            starts, machines = operating_points(plant, laws, refs)
+            starts, rests = operating_points(plant, laws, refs)
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
     x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
-    plant.start(x, u, machines)
+    plant.start(x, u, rests)
     inner = scenario.has_inner
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):

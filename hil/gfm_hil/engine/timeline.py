@@ -21,7 +21,7 @@ from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.setup import Bench
 from gfm_hil.recording.log import Outcome, Status
 from gfm_hil.scenario.events.base import Event, PlantEvent, nominal_hz
-from gfm_plant import Checked, Network, finish_check, trip_reason, wait_reason
+from gfm_plant import Network, SynchroCheckResult, finish_check, trip_reason, wait_reason
 from gfm_plant.names import CONTROLLER, NOT_ASKED
 from gfm_runtime.signals import carried
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
@@ -189,7 +189,7 @@ class Timeline:
             return "tripped" if heard else "safe", safe_reason(ctl)
         return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
 
-    def checked(self, found: Checked, tick: int) -> None:
+    def checked(self, found: SynchroCheckResult, tick: int) -> None:
         """Log how a synchro-check has ended."""
         kind = "breaker" if found.name else "grid-breaker"
         name, f_b = found.name or "grid breaker", nominal_hz(self._bench.plant)

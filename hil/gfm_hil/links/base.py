@@ -27,6 +27,8 @@ class Link(Protocol):
     while the peer has not come, and ``connected()``, which returns whether a peer is at the other
     end, or None if the link cannot know. The loop calls ``start()`` before its first tick and
     ``stop()`` after its last message.
+    A slow link has ``every``, the number of ticks to an exchange of y and u: the loops then send
+    only at every such tick.
     """
 
     @property

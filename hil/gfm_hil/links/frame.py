@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,7 @@ Fault = Literal[
     "size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence", "tick",
     "state",
 ]  # fmt: skip
-FAULTS: tuple[Fault, ...] = (
-    "size", "magic", "version", "source", "crc", "repeated", "lost", "out_of_sequence", "tick",
-    "state",
-)  # fmt: skip
+FAULTS: tuple[Fault, ...] = get_args(Fault)
 (
     SIZE, BAD_MAGIC, VERSION, SOURCE, CRC, REPEATED, LOST, OUT_OF_SEQUENCE, TICK, STATE,
 ) = range(len(FAULTS))  # fmt: skip
@@ -53,6 +49,7 @@ reader_dtype = np.dtype(
         ("jump", "i8"),  # how many frames in a row may be missing
         ("again", "i8"),  # how often it may repeat a tick
         ("leaving", "i8"),  # lowest state that says that the peer leaves
+        ("every", "i8"),  # ticks to a frame; the sequence counts ticks and repeats
     ],
     align=True,
 )
@@ -88,7 +85,7 @@ def buffer(count: int, data_id: int) -> tuple[np.ndarray, np.ndarray]:
 def make_reader() -> np.ndarray:
     """A reader in its initial state that limits neither ticks nor missing frames."""
     reader = np.zeros(1, reader_dtype)
-    reader["tick"], reader["leaving"] = -1, SAFE
+    reader["tick"], reader["leaving"], reader["every"] = -1, SAFE, 1
     for limit in ("newest", "behind", "delta", "again"):
         reader[limit] = _NO_LIMIT
     reader["jump"] = LONGEST_JUMP
@@ -121,8 +118,14 @@ def pack_again(sequence, frame, message):
     whatever the sender has done since."""
     f = frame[0]
     f.sequence = sequence[0]
-    sequence[0] = (sequence[0] + 1) % _WRAP
+    skip(sequence)
     f.crc = crc32(message, len(message) - _CRC_BYTES)
+
+
+@inlined
+def skip(sequence):
+    """Leave out a number: of a tick without an exchange."""
+    sequence[0] = (sequence[0] + 1) % _WRAP
 
 
 @inlined
@@ -167,9 +170,11 @@ def unpack(reader, data_id, frame, message, size, values):
         r.faults[fault] += 1
         r.fault = fault
         return -1
-    r.faults[LOST] += ahead
-    r.next = (np.int64(f.sequence) + 1) % _WRAP
     tick = np.int64(f.tick)
+    if ahead > 0:
+        passed = tick - max(r.tick, 0)
+        r.faults[LOST] += max(0, ahead - (passed - passed // r.every))
+    r.next = (np.int64(f.sequence) + 1) % _WRAP
     if tick > r.tick:
         for j in range(len(values)):
             values[j] = f.values[j]
@@ -208,10 +213,6 @@ def judge(reader, overdue, latched):
     elif reader[0].e2e == INVALID and not latched:
         reader[0].e2e = INITIAL
 
-
-if TYPE_CHECKING:
-    from gfm_hil.core.roles import Role
-    from gfm_hil.scenario import Scenario
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 
@@ -260,35 +261,17 @@ class FrameReader:
     as ``state``.
 
     Args:
-        group: ``"y"`` or ``"u"``. Without ``of``, the reader limits neither the tick nor the gap.
+        group: ``"y"`` or ``"u"``.
         inner: as for ``FrameWriter``.
+        limits: fields of ``reader_dtype``; without them the reader limits neither the tick nor
+            the gap.
     """
 
-    @classmethod
-    def of(cls, role: Role, scenario: Scenario) -> FrameReader:
-        """The reader of one side, with the limits that its scenario sets.
-
-        In lockstep the sides wait for each other, so a tick comes after the one before. In real
-        time a gap of more ticks than fit into ``link.peer_timeout_s`` means that the peer is gone.
-        The plant's loop writes its own tick into ``newest`` at every tick.
-        """
-        reader = cls("u" if role == "plant" else "y", scenario.has_inner)
-        lockstep, r = scenario.mode == "lockstep", reader.record
-        r["delta"] = 1 if lockstep else math.ceil(scenario.peer_timeout_s / scenario.T_s) + 1
-        asked = math.ceil(min(scenario.peer_timeout_s / scenario.link.repeat_s, LONGEST_JUMP))
-        r["jump"] = min(int(r["delta"][0]) + asked + LAST_TIMES, LONGEST_JUMP)
-        r["again"] = asked if lockstep else 0
-        if role == "controller":
-            r["newest"] = scenario.ticks - 1
-        elif not lockstep:
-            r["behind"] = scenario.late_policy.hold
-        if scenario.survives_trips:
-            r["leaving"] = STOPPED
-        return reader
-
-    def __init__(self, group: Vector, inner: bool = False) -> None:
+    def __init__(self, group: Vector, inner: bool = False, **limits: int) -> None:
         self.group = group
         self.record = make_reader()
+        for name, limit in limits.items():
+            self.record[name] = limit
         self.data_id = DATA_IDS[group]
         self.frame, self.message = buffer(len(carried(group, inner)), self.data_id)
 

@@ -31,7 +31,7 @@ class PumpedLink:
     """
 
     def __init__(self, link: Link) -> None:
-        self._link = link
+        self._link, self.every = link, getattr(link, "every", 1)
         self._memory = np.zeros((2 * ring.RING + 2 * _HEADS) // ring.WORD, np.int64)
         base = self._memory.ctypes.data
         rings, heads = [base, base + ring.RING], [base + 2 * ring.RING + _HEADS * k for k in (0, 1)]

@@ -26,8 +26,8 @@ _SPINS_A_YIELD = 16  # polls per yield, once a peer that delivers directly is la
 #: wake this long before a deadline and spin the rest: a sleep may end this late
 AHEAD_NS = 40_000
 
-#: give_way(): yield the processor
-give_way: Any = types.ExternalFunction("sched_yield", types.int32())
+#: yield_processor(): yield the processor
+yield_processor: Any = types.ExternalFunction("sched_yield", types.int32())
 _raise: Any = types.ExternalFunction("raise", types.int32(types.int32))
 
 
@@ -101,16 +101,16 @@ def wait_until(deadline_ns, spins):
         gap = max(gap, now - before)
         before = now
         if spins == 0:
-            give_way()
+            yield_processor()
     return gap
 
 
 @compiled
-def between_looks(looks, spins):
+def spin_or_yield(looks, spins):
     """Spin or yield after a waiting loop's ``looks``-th empty poll. If the peer delivers directly
     (``spins`` > 0), it spins for ``spins`` polls and then yields every 16th poll only, since a
     yield takes as long as a message; else it yields every time."""
     if looks <= spins or (spins > 0 and looks % _SPINS_A_YIELD != 0):
         pause()
     else:
-        give_way()
+        yield_processor()

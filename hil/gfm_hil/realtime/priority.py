@@ -108,7 +108,7 @@ def _lock_memory() -> bool:
         return False
 
 
-def stand_back() -> None:
+def restore_priority() -> None:
     """Give the calling thread, which only watches, ordinary priority on its former processors."""
     try:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -6,10 +6,10 @@ lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -26,11 +26,6 @@ from gfm_runtime import law_titles
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
-_Side = Literal["load", "bank", "machine", "grid", "box"]
-#: the tables of a network whose parts have a symbol; one of another table is a box with its name
-_DRAWN = {
-    "converters", "lines", "transformers", "loads", "constant_power", "machines", "capacitors"
-}  # fmt: skip
 
 
 @dataclass
@@ -39,7 +34,7 @@ class _Bar:
 
     column: int = 0
     converters: list[str] = field(default_factory=list)
-    right: list[tuple[_Side, str, bool]] = field(default_factory=list)  # kind, text, closed
+    right: list[tuple[str, str, bool]] = field(default_factory=list)  # symbol, text, closed
     rows: list[int] = field(default_factory=list)
 
 
@@ -74,24 +69,18 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
             _inductor(axes, _LINE + 0.2, -_ROW * row)
             behind = not converter and plants[converter].lcl is not None
             spots[converter] = -_ROW * row, _LINE + 1.1 if behind else _TERMINAL, x
-        for row, (kind, text, closed) in zip(bar.rows, bar.right, strict=False):
-            _hang(axes, x, -_ROW * row, kind, text, closed)
+        for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
+            _hang(axes, x, -_ROW * row, symbol, text, closed)
         ys = [-_ROW * row for row in bar.rows]
         ys += [-_ROW * row for row, start, end, *_ in lines.values() if name in (start, end)]
         axes.plot(
             [x, x], [max(ys) + 0.35, min(ys) - 0.35], color=_INK, lw=3.5, solid_capstyle="butt"
         )
         axes.text(x, max(ys) + 0.45, name, ha="center", fontsize=8.5, color=_INK)
-    for name, (row, start, end, text, closed) in lines.items():
+    for name, (row, start, end, symbol, text, closed) in lines.items():
         (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
         _wire(axes, (left, y), (right, y))
-        network = scenario.network
-        if network is not None and name in network.transformers:
-            _windings(axes, (left + right) / 2, y)
-        elif network is not None and name in network.lines:
-            _inductor(axes, (left + right) / 2 - 0.4, y)
-        else:
-            _box(axes, (left + right) / 2 - 0.35, y)
+        _IN_LINE.get(symbol, _box)(axes, (left + right) / 2, y)
         _breaker(axes, left + 0.5, y, closed)
         axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
         spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
@@ -116,7 +105,7 @@ def _converters(
     return {name: s.plant for name, s in each.items()}, laws, nodes
 
 
-_Lines = dict[str, tuple[int, str, str, str, bool]]  #: row, start, end, text, closed
+_Lines = dict[str, tuple[int, str, str, str, str, bool]]  #: row, start, end, symbol, text, closed
 
 
 def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar], _Lines]:
@@ -133,47 +122,22 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
             bars[next(iter(bars))].right.append(("load", text, True))
     else:
         at_grid = network.grid
-        for name, line in network.lines.items():
-            text = f"L {line.L:.3g}, R {line.R:.3g} p.u."
-            lines[name] = 0, line.start, line.end, text, line.closed
-        for name, one in network.transformers.items():
-            text = f"S {one.S:g}, X {one.X:.3g}, R {one.R:.2g}"
-            text += "" if one.X_m is None else f", $X_m$ {one.X_m:g}"
-            lines[name] = 0, one.start, one.end, text, one.closed
-        others = {
-            name: (f"{name}\n{kind}", one)
-            for kind, parts in network
-            if kind not in _DRAWN and isinstance(parts, dict)
-            for name, one in parts.items()
-        }
-        for name, (text, other) in others.items():
-            if hasattr(other, "start") and hasattr(other, "end"):
-                kind = text.partition("\n")[2]  # its name is written above
-                lines[name] = 0, other.start, other.end, kind, getattr(other, "closed", True)
+        each = [(name, one, getattr(one, "closed", True)) for _, name, one in network.components()]
+        for name, one, closed in each:
+            if hasattr(one, "start") and hasattr(one, "end"):
+                lines[name] = 0, one.start, one.end, one.symbol, one.label(), closed
         for _, start, end, *_ in lines.values():
             for node in (start, end):
                 bars.setdefault(node, _Bar())
-        for name, load in network.loads.items():
-            text = f"{name}\nP {load.P:g}, Q {load.Q:g} p.u."
-            bars.setdefault(load.node, _Bar()).right.append(("load", text, load.closed))
-        for name, power in network.constant_power.items():
-            text = f"{name}\nconstant P {power.P:g}, Q {power.Q:g} p.u."
-            bars.setdefault(power.node, _Bar()).right.append(("load", text, power.closed))
-        for name, machine in network.machines.items():
-            text = f"{name}\nS {machine.S:g}, H {machine.H:g} s, X {machine.X:g}"
-            bars.setdefault(machine.node, _Bar()).right.append(("machine", text, True))
-        for name, bank in network.capacitors.items():
-            text = f"{name}\nQ {bank.Q:g} p.u."
-            bars.setdefault(bank.node, _Bar()).right.append(("bank", text, True))
-        for text, other in others.values():
-            if hasattr(other, "node"):
-                closed = getattr(other, "closed", True)
-                bars.setdefault(other.node, _Bar()).right.append(("box", text, closed))
+        for name, one, closed in sorted(each, key=lambda item: item[1].symbol == "capacitor"):
+            if hasattr(one, "node"):  # banks below the others
+                hanging = one.symbol, f"{name}\n{one.label()}", closed
+                bars.setdefault(one.node, _Bar()).right.append(hanging)
     if at_grid is not None:
         kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
         f_g = grid.omega_g * nominal_frequency(scenario)
         text = f"grid, {kind}\n$V_g$ {grid.V_g:g} p.u., {f_g:g} Hz"
-        bars.setdefault(at_grid, _Bar()).right.insert(0, ("grid", text, True))
+        bars.setdefault(at_grid, _Bar()).right.insert(0, ("~", text, True))
     _give_columns(bars, lines, at_grid)
     return bars, lines
 
@@ -199,9 +163,9 @@ def _give_rows(bars: Mapping[str, _Bar], lines: _Lines) -> int:
     """
     row, done = 0, set[str]()
     for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
-        for line, (_, start, end, text, closed) in lines.items():
+        for line, (_, start, end, symbol, text, closed) in lines.items():
             if {start, end} & done and name in (start, end):
-                lines[line] = row, start, end, text, closed
+                lines[line] = row, start, end, symbol, text, closed
                 row += 1
         count = max(1, len(bar.converters), len(bar.right))
         bar.rows = [*range(row, row + count)]
@@ -246,7 +210,13 @@ def _capacitor(axes: Axes, x: float, y: float) -> None:
 
 def _box(axes: Axes, x: float, y: float) -> None:
     """A part without a symbol, 0.7 wide, in place of the wire below it."""
-    axes.add_patch(Rectangle((x, y - 0.25), 0.7, 0.5, fc="white", ec=_INK, lw=1.2, zorder=3))
+    axes.add_patch(Rectangle((x - 0.35, y - 0.25), 0.7, 0.5, fc="white", ec=_INK, lw=1.2, zorder=3))
+
+
+def _arrow(axes: Axes, x: float, y: float) -> None:
+    """Of a load, down from the end of a wire."""
+    style = {"arrowstyle": "-|>", "color": _INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (x, y - 0.55), (x, y), arrowprops=style)
 
 
 def _breaker(axes: Axes, x: float, y: float, closed: bool) -> None:
@@ -292,24 +262,29 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
         axes.text(x, y - below, text, ha="center", va="top", **_SMALL)
 
 
-def _hang(axes: Axes, x: float, y: float, kind: _Side, text: str, closed: bool) -> None:
-    """What hangs on the right of a bar: a load, a bank of capacitors, a machine, the grid, or what
-    has no symbol."""
+#: symbols of what lies between two nodes, in the middle of the wire
+_IN_LINE: dict[str, Callable[[Axes, float, float], None]] = {
+    "inductor": lambda axes, x, y: _inductor(axes, x - 0.4, y), "windings": _windings,
+}  # fmt: skip
+#: of what ends at one, at the end of the wire; any other text is that of a source in its circle
+_AT_END: dict[str, Callable[[Axes, float, float], None]] = {
+    "load": _arrow, "capacitor": _capacitor, "box": lambda axes, x, y: _box(axes, x + 0.35, y),
+}  # fmt: skip
+
+
+def _hang(axes: Axes, x: float, y: float, symbol: str, text: str, closed: bool) -> None:
+    """What hangs on the right of a bar, with its breaker; a bank of capacitors has none."""
     _wire(axes, (x, y), (x + 1.2, y))
-    if kind == "bank":
-        _capacitor(axes, x + 1.2, y)
-    else:
+    if symbol != "capacitor":
         _breaker(axes, x + 0.5, y, closed)
-    if kind == "load":
-        style = {"arrowstyle": "-|>", "color": _INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
-        axes.annotate("", (x + 1.2, y - 0.55), (x + 1.2, y), arrowprops=style)
-    if kind == "box":
-        _box(axes, x + 1.2, y)
-    if kind in ("grid", "machine"):
+    if symbol in _AT_END:
+        _AT_END[symbol](axes, x + 1.2, y)
+    else:
         axes.add_patch(Circle((x + 1.5, y), 0.3, fc="white", ec=_INK, lw=1.2))
-        sign, size = ("~", 13) if kind == "grid" else ("SM", 8)
-        axes.text(x + 1.5, y - 0.02, sign, ha="center", va="center", fontsize=size, color=_INK)
-    axes.text(x + (1.5 if kind in ("load", "bank") else 1.95), y, text, va="center", **_SMALL)
+        size = 13 if symbol == "~" else 8
+        axes.text(x + 1.5, y - 0.02, symbol, ha="center", va="center", fontsize=size, color=_INK)
+    place = 1.5 if symbol in ("load", "capacitor") else 1.95
+    axes.text(x + place, y, text, va="center", **_SMALL)
 
 
 def _fault(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import Run, read_scenario
 from gfm_hil.run.run_folder import Report, recover, save
@@ -154,8 +154,7 @@ def save_network(
         UserError: the folder holds something already, or cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another folder")
+    check_empty(folder)
     for name, one in run.items():
         save(one, folder / name, report)
     try:

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import Unfinished, UserError
-from gfm_hil.core.files import read_json, sync_folder, unfinished, write_text
+from gfm_hil.core.files import check_empty, read_json, sync_folder, unfinished, write_text
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.setup import make_bench
@@ -271,8 +271,7 @@ def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
         UserError: the folder holds something already, or cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise UserError(f"{folder}: is not empty; choose another folder")
+    check_empty(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if run.folder is not None:

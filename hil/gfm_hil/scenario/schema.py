@@ -18,7 +18,6 @@ from gfm_hil.scenario.events.grid_profile import LARGEST_FILE
 from gfm_hil.scenario.events.reference import check_reference, reference_field
 from gfm_hil.scenario.expectation import check_expectation
 from gfm_plant import NetworkParts, Plant, load_converter
-from gfm_plant.records import SIZES
 from gfm_runtime import LawError, law_file
 from gfm_runtime.errors import meant
 from gfm_runtime.inner_file import named_inner
@@ -145,9 +144,7 @@ class NetworkConverter(StrictSchema):
 class NetworkSettings(NetworkParts):
     """Several converters and what connects them."""
 
-    converters: dict[str, NetworkConverter] = Field(
-        min_length=1, max_length=max(SIZES), description="by name"
-    )
+    converters: dict[str, NetworkConverter] = Field(min_length=1, description="by name")
 
 
 class Scenario(StrictSchema):

@@ -7,15 +7,14 @@ import functools
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from rich.table import Table
 
-from gfm_design.norms.performance import Channel
+from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.api.tuned_law import channels_as_json as channels_as_json
 from gfm_hil.api.tuned_law import problem_name
 from gfm_hil.cli.common import OPTIONS
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.results.report import cell
+from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
@@ -148,15 +147,15 @@ _W = {1: "P_ref", 2: "ω_g"}
 _Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
 
 
-def print_channels(name: str, channels: Sequence[Channel]) -> None:
+def print_channels(name: str, channels: Sequence[WeightedChannel]) -> None:
     """gamma and its channels as a table."""
-    table = Table("channel", "‖W T‖∞", "at \\[rad/s]", box=None, pad_edge=False, title=None)
-    for c in channels:
-        at = "∞" if np.isinf(c.omega) else cell(c.omega)
-        table.add_row(f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", at)
+    rows = [
+        [f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", "∞" if np.isinf(c.omega) else c.omega]
+        for c in channels
+    ]
     console = terminal(highlight=False)
     console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}")
-    console.print(table)
+    console.print(Table(("channel", "‖W T‖∞", "at [rad/s]"), rows, text=None))
     for c in channels:
         if np.isinf(c.omega):
             console.print(

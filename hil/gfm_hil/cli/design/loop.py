@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
-from gfm_design.margins.all_margins import UnstableLoop
+from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import numbers, terminal
-from gfm_hil.results.report import cell
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.table import Table
 from gfm_hil.studies.linear_loop import network_loop, scenario_loop
 from gfm_runtime.signals import Y_NAMES
 
@@ -128,7 +127,7 @@ def _draw_at(draw: Callable[..., object]) -> Callable[[ClosedLoop, argparse.Name
 
 
 def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
-    found = loop.margins()
+    found = loop_margins(loop)
     channels = {c.name: c for c in (*found.u, *found.y)}
     wanted = _at(options) or [c.name for c in found.u]
     if unknown := [name for name in wanted if name not in channels]:
@@ -139,17 +138,18 @@ def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
 
 def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
     modes = loop.modes()
-    table = numbers("σ \\[1/s]", "frequency \\[Hz]", "damping ratio")
-    if isinstance(loop, NetworkLoop):
-        table.add_column("taking part")
+    heads = ["σ [1/s]", "frequency [Hz]", "damping ratio"]
+    heads += ["taking part"] if isinstance(loop, NetworkLoop) else []
+    rows = []
     for mode in modes:
         cells = [f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}"]
         if isinstance(mode, NetworkMode):
             shares = [f"{part} {100 * x:.0f} %" for part, x in mode.participation.items()
                       if x >= _LEAST]  # fmt: skip
             cells.append(", ".join(shares))
-        table.add_row(*cells)
-    return {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}, table
+        rows.append(cells)
+    content = {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}
+    return content, Table(heads, rows)
 
 
 def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
@@ -158,8 +158,7 @@ def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report
         t, found = loop.step_response(of, options.seconds)
     except ValueError as problem:
         raise UserError(f"--of: {problem}") from None
-    heads = "peak \\[p.u.]", "at \\[s]", "at the end \\[p.u.]"
-    table = numbers(f"after {of}", *heads)
+    rows: list[list[Any]] = []
     each = found if isinstance(found, dict) else {"": found}
     content: dict[str, Any] = {}
     for converter, y in each.items():
@@ -169,6 +168,7 @@ def _step(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report
             row = {"peak": float(column[k]), "peak_s": float(t[k]), "end": float(column[-1])}
             own[name] = row
             label = f"{converter}.{name}" if converter else name
-            table.add_row(label, *(cell(value) for value in row.values()))
+            rows.append([label, *row.values()])
         content |= {converter: own} if converter else own
-    return {"of": of, "seconds": options.seconds, "y": content}, table
+    heads = f"after {of}", "peak [p.u.]", "at [s]", "at the end [p.u.]"
+    return {"of": of, "seconds": options.seconds, "y": content}, Table(heads, rows)

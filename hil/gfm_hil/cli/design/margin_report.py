@@ -10,14 +10,14 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from gfm_design.margins.all_margins import ChannelMargins, LoopMargins, Margins, UnstableLoop
 from gfm_design.margins.disk import DiskMargin
 from gfm_design.margins.tolerance import End, GridStrength, Range
 from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.core.terminal import numbers, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
+from gfm_hil.results.table import Table
 from gfm_hil.run.loop_delay import LoopDelay
 
 
@@ -148,11 +148,11 @@ def print_margins(
 
 def loops_table(channels: Iterable[ChannelMargins]) -> Table:
     """Gain, phase, delay and disk margin, one row a channel."""
-    heads = "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"
-    table = numbers("loop at", *heads)
+    heads = "loop at", "gain ↓ @ Hz", "gain ↑ @ Hz", "phase @ Hz", "delay µs @ Hz", "disk α"
+    rows = []
     for c in channels:
         g = c.gain_phase
-        table.add_row(
+        row = (
             c.name + ("" if c.confirmed else " (not confirmed)"),
             _at(g.gain_low, g.gain_low_hz, "×") if g.gain_low else "—",
             _at(g.gain_high, g.gain_high_hz, "×"),
@@ -160,7 +160,8 @@ def loops_table(channels: Iterable[ChannelMargins]) -> Table:
             _delay(1e6 * c.delay.seconds, c.delay.frequency_hz),
             f"{g.disk:.3g}",
         )
-    return table
+        rows.append(row)
+    return Table(heads, rows)
 
 
 def _at(value: float, hz: float, before: str = "", after: str = "") -> str:
@@ -172,12 +173,12 @@ def _delay(us: float, hz: float) -> str:
 
 
 def _elements_table(m: Margins) -> Table:
-    table = numbers("element", "down to", "up to")
+    rows = []
     for name, r in m.elements.items():
         ends = (r.low, r.high) if r else ()
         cells = [f"{100 * (e.factor - 1):+.4g} %{_why(e)}" for e in ends] or ["is 0", "is 0"]
-        table.add_row(name, *cells)
-    return table
+        rows.append([name, *cells])
+    return Table(("element", "down to", "up to"), rows)
 
 
 def _why(end: End) -> str:

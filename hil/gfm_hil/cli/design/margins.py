@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gfm_design.margins.all_margins import UnstableLoop, margins
+from gfm_design.margins.all_margins import UnstableLoop, loop_margins, margins
 from gfm_design.margins.tolerance import POINTS, Region, stable_region
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.cli.common import watching
@@ -54,7 +54,7 @@ def call(options: argparse.Namespace) -> int:
     console = terminal(highlight=False)
     try:
         ranges = margins(loop) if scenario.network is None else None
-        found = loop.margins() if ranges is None else ranges.loop
+        found = loop_margins(loop) if ranges is None else ranges.loop
     except UnstableLoop as problem:
         none = "--figures: there is none to draw" if options.figures else ""
         return no_margins(label, scenario.title, problem, options.json, none)

@@ -4,8 +4,8 @@ Every frame that carries values begins with two bytes of end-to-end protection, 
 int16, little-endian. A value travels in counts of its ``scale``; -32768 stands for NaN.
 CAN FD sends a vector in one frame, classic CAN in as many as it needs. A run with an inner stage
 uses frames of its own, which carry that stage's signals after those of the vector. The lower
-identifier wins the bus: states first, then commands, then measurements, then segments of handshake
-messages.
+identifier wins the bus: states first, then commands, then measurements, then the handshake, whose
+frames are those of ISO-TP and have no signals.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ VECTORS: dict[Vector, str] = {"y": "Measurements", "u": "Commands"}
 #: the same in a run with an inner stage
 INNER: dict[Vector, str] = {name: f"{title}Inner" for name, title in VECTORS.items()}
 STATUS: dict[Role, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
-SEGMENT: dict[Role, str] = {"plant": "PlantSegment", "controller": "ControllerSegment"}
+TRANSPORT: dict[Role, str] = {"plant": "PlantTransport", "controller": "ControllerTransport"}
 CRC, COUNTER = "Crc", "Counter"
 
 _HEADER = 2  # bytes of end-to-end protection
 _IDS = {"PlantStatus": 0x100, "ControllerStatus": 0x101, "Commands": 0x110, "CommandsInner": 0x118,
-        "Measurements": 0x120, "MeasurementsInner": 0x128, "PlantSegment": 0x700,
-        "ControllerSegment": 0x701}  # fmt: skip
+        "Measurements": 0x120, "MeasurementsInner": 0x128, "PlantTransport": 0x700,
+        "ControllerTransport": 0x701}  # fmt: skip
 PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes of a frame; the index is the DLC
 _NODES = {"plant": "Plant", "controller": "Controller"}
 
@@ -108,24 +108,12 @@ def _status() -> list[Signal]:
     ]
 
 
-def _segment(fd: bool) -> list[Signal]:
-    length = 64 if fd else 8
-    return [
-        _number("Message", 0, 1, "number of the message that this is a part of"),
-        _number("Index", 1, 1, "of this segment, from 0"),
-        _number("Segments", 2, 1, "that the message has"),
-        _number("Used", 3, 1, "bytes of data in this segment"),
-        *(_number(f"Data_{k}", 4 + 4 * k, 4, None) for k in range((length - 4) // 4)),
-    ]
-
-
 def write_dbc(fd: bool) -> str:
     """The text of the DBC file for CAN FD, or for classic CAN."""
     frames: list[tuple[str, int, int, list[Signal], Role]] = []
     for role in ("plant", "controller"):
         frames.append((STATUS[role], _IDS[STATUS[role]], 8, _status(), role))
-        signals = _segment(fd)
-        frames.append((SEGMENT[role], _IDS[SEGMENT[role]], 64 if fd else 8, signals, role))
+        frames.append((TRANSPORT[role], _IDS[TRANSPORT[role]], 64 if fd else 8, [], role))
     for name, role in SENDERS.items():
         for inner in (False, True):
             frames += [(*frame, role) for frame in _vector(name, inner, fd)]

@@ -23,8 +23,8 @@ from gfm_hil.links.can.dbc import (
     INNER,
     INT16,
     INVALID,
-    SEGMENT,
     STATUS,
+    TRANSPORT,
     VECTORS,
     read_dbc,
     write_dbc,
@@ -67,7 +67,8 @@ class Plan:
 
     Attributes:
         vectors: the frames of each vector, in the order of their identifiers.
-        status, segment: the frame of each sender.
+        status: the frame of each sender.
+        transport: the identifier of each sender's ISO-TP frames.
         digest: hash of all definitions, in a run without an inner stage less the frames of such a
             stage; both sides compare it.
         fd: CAN FD rather than classic.
@@ -76,7 +77,7 @@ class Plan:
 
     vectors: dict[Vector, list[Layout]]
     status: dict[Role, Layout]
-    segment: dict[Role, Layout]
+    transport: dict[Role, int]
     digest: int
     fd: bool
     inner: bool = False
@@ -147,7 +148,7 @@ def plan_of(database: Database, inner: bool = False) -> Plan:
         ValueError: a frame or a signal is missing or misplaced.
     """
     messages = {m.name: m for m in database.messages}
-    missing = sorted({*STATUS.values(), *SEGMENT.values()} - set(messages))
+    missing = sorted({*STATUS.values(), *TRANSPORT.values()} - set(messages))
     if missing:
         raise ValueError(f"frames {missing} are missing")
     vectors: dict[Vector, list[Layout]] = {}
@@ -163,7 +164,7 @@ def plan_of(database: Database, inner: bool = False) -> Plan:
     plan = Plan(
         vectors,
         {role: _layout(messages[STATUS[role]]) for role in ROLES},
-        {role: _layout(messages[SEGMENT[role]]) for role in ROLES},
+        {role: messages[TRANSPORT[role]].frame_id for role in ROLES},
         _digest("".join(sorted(defined)), 4),
         any(m.is_fd for m in database.messages),
         inner,

@@ -1,4 +1,4 @@
-"""The CAN link: one side's node on a python-can bus, or on the socket that python-can opened."""
+"""The CAN link: one side's node on a socket, and the handshake over ISO-TP (ISO 15765-2)."""
 
 from __future__ import annotations
 
@@ -8,46 +8,56 @@ import logging
 import os
 import select
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
 import can
+import isotp
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.can import LOOPBACK, CanOptions
-from gfm_hil.links.can.emulation import busy, has_room
+from gfm_hil.links.can.bridge import Bridge
+from gfm_hil.links.can.emulation import busy
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
 from gfm_hil.links.can.node import (
-    ANOTHER_DBC,
     LOST,
     NOTHING,
+    TRANSPORT,
     WENT_BUS_OFF,
     Node,
-    account,
-    bring,
     can_port,
-    compose,
     fetch,
+    process,
     put,
     receive,
-    room_to_send,
+    send,
 )
-from gfm_hil.links.can.segments import LONGEST, SegmentSender
-from gfm_hil.links.can.sockets import FULL, SOCKETCAN, set_socket
-from gfm_hil.links.can.wire import BRS, FD, frame_dtype, pack, unpack
+from gfm_hil.links.can.sockets import SOCKETCAN, set_socket
+from gfm_hil.links.can.wire import BRS, FD, MOST, frame_dtype
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
 from gfm_runtime.signals import Vector, carried
 
-# python-can also raises what it logs, and we print that in one line: silence its log
-logging.getLogger("can").addHandler(logging.NullHandler())
+# both also raise or report what they log, and we print that in one line: silence their logs
+for _name in ("can", "isotp"):
+    logging.getLogger(_name).addHandler(logging.NullHandler())
 
-_ROOM_S = 0.2  # how long a segment waits for room: the kernel's queue holds ten frames
+_PATIENCE_S = 0.2  # for a peer that takes a message of the handshake, and for room in the kernel
 _LOOK_S = 20e-6  # poll interval while a frame is on the emulated bus
+_DIGEST_BYTES = 4  # before each message of the handshake
+#: what else can-isotp reports happens where one side is not there yet, or begins anew
+_DAMAGE = (
+    isotp.InvalidCanDataError,
+    isotp.WrongSequenceNumberError,
+    isotp.ChangingInvalidRXDLError,
+    isotp.MissingEscapeSequenceError,
+    isotp.FrameTooLongError,
+)
 
 
 class CanLink:
@@ -59,13 +69,11 @@ class CanLink:
         options: checked.
 
     Attributes:
-        port: set if the bus is a socket, unless the options leave the frames to python-can.
+        every: ticks to an exchange of y and u.
 
     Raises:
         UserError: the bus or the DBC cannot be used.
     """
-
-    port: Port | None = None
 
     def __init__(self, role: Role, endpoint: str, options: CanOptions) -> None:
         try:
@@ -75,22 +83,37 @@ class CanLink:
         self._other, self._digest = ROLES[1 - ROLES.index(role)], plan.digest
         self._flags, self._where = options.fd * (FD | BRS), endpoint.partition("://")[2]
         self._node = Node(plan, role, options)
-        self._cut = SegmentSender(plan, role)
-        self._message, self._frame = np.zeros(LONGEST, np.uint8), np.zeros(1, frame_dtype)
+        self._message, self._frame = np.zeros(MOST, np.uint8), np.zeros(1, frame_dtype)
+        self._early: deque[bytes] = deque()  # frames of the loops that came with the handshake's
+        self._damaged, self.every = 0, options.every
+        self._transport = self._make_transport(plan, role, options.fd)
         warm_up(plan)
         self._bus = _open_bus(role, endpoint, options)
-        if not options.portable:
-            self._reach(self._bus, options)
-
-    def _reach(self, bus: Any, options: CanOptions) -> None:
-        """Let the node use the bus directly, if it is a socket."""
-        if isinstance(bus, LoopbackBus):
-            self._node.sockets[:] = bus.record
-        elif options.interface == "socketcan":
-            set_socket(self._node.sockets, SOCKETCAN, bus.fileno())
+        direct = isinstance(self._bus, LoopbackBus) or options.interface == "socketcan"
+        if options.portable or not direct:
+            self._bus = Bridge(self._bus)
+        if isinstance(self._bus, LoopbackBus):
+            self._node.sockets[:] = self._bus.record
         else:
-            return
-        self.port = can_port(self._node)
+            set_socket(self._node.sockets, SOCKETCAN, self._bus.fileno())
+        self.port: Port = can_port(self._node)
+
+    def _make_transport(self, plan: Plan, role: Role, fd: bool) -> isotp.TransportLayerLogic:
+        mine, theirs = plan.transport[role], plan.transport[self._other]
+        return isotp.TransportLayerLogic(
+            rxfn=self._next_of_transport,
+            txfn=self._put_of_transport,
+            address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=mine, rxid=theirs),
+            error_handler=self._count,
+            params={
+                "tx_data_length": 64 if fd else 8,
+                "can_fd": fd,
+                "bitrate_switch": fd,
+                "blocksize": 0,
+                "max_frame_size": _DIGEST_BYTES + LONGEST,
+                "rx_flowcontrol_timeout": round(2000 * _PATIENCE_S),  # ``send`` gives up before
+            },
+        )
 
     @property
     def counters(self) -> dict[str, int]:
@@ -99,54 +122,67 @@ class CanLink:
         counted = {
             "foreign": n.state["foreign"],
             "incomplete": n.receiver["incomplete"],
-            "damaged_messages": n.joiner["damaged"],
             "error_frames": n.state["error_frames"],
             "dropped": n.state["dropped"],
             "saturated": n.sender["saturated"],
         }
-        return {name: int(count[0]) for name, count in counted.items()}
+        counts = {name: int(count[0]) for name, count in counted.items()}
+        counts["dropped"] += getattr(self._bus, "dropped", 0)
+        return {**counts, "damaged_messages": self._damaged}
 
     def send(self, message: bytes) -> bool:
-        """Send a message; False if the bus has no room for all of it.
+        """Send a message; False if the bus has no room for all of it, or if it is one of the
+        handshake that the peer did not take.
 
         Raises:
             PeerLost: the bus is down.
         """
-        count = compose(self._node.handle, np.frombuffer(message, np.uint8))
-        if count != NOTHING:
-            return all([self._put(self._node.out[k : k + 1]) for k in range(count)])
-        until = time.monotonic() + _ROOM_S
-        for segment in self._cut.frames(message):
-            while not self._put_segment(*segment):
-                if time.monotonic() >= until:
-                    return False
-                time.sleep(0.001)
-        return True
+        if len(message) > LONGEST:
+            return False
+        sent = send(self._node.handle, np.frombuffer(bytearray(message), np.uint8))
+        if self._node.state["lost"][0]:
+            raise self._gone()
+        return self._send_by_transport(message) if sent == NOTHING else bool(sent)
 
-    def _put_segment(self, number: int, payload: bytes) -> bool:
-        frame = self._frame[0]
-        frame["id"], frame["flags"], frame["length"] = number, self._flags, len(payload)
-        frame["data"][: len(payload)] = np.frombuffer(payload, np.uint8)
-        return self._put(self._frame)
+    def _send_by_transport(self, message: bytes) -> bool:
+        layer, until = self._transport, time.monotonic() + _PATIENCE_S
+        layer.send(self._digest.to_bytes(_DIGEST_BYTES, "little") + message)
+        while True:
+            layer.process()
+            if not layer.transmitting():
+                return True
+            if time.monotonic() >= until:
+                layer.stop_sending()
+                return False
+            self.wait(1e-3)
 
-    def _put(self, frame: NDArray[Any]) -> bool:
-        node = self._node
-        if self.port is not None:
-            sent = bool(put(node.handle, frame))
-            if node.state["lost"][0]:
+    def _put_of_transport(self, message: isotp.CanMessage) -> None:
+        frame, until = self._frame[0], time.monotonic() + _PATIENCE_S
+        frame["id"], frame["flags"] = message.arbitration_id, self._flags
+        frame["length"] = len(message.data)
+        frame["data"][: len(message.data)] = np.frombuffer(message.data, np.uint8)
+        while not put(self._node.handle, self._frame) and time.monotonic() < until:
+            if self._node.state["lost"][0]:
                 raise self._gone()
-            return sent
-        if not room_to_send(node.handle):
-            return False
-        try:
-            self._bus.send(unpack(frame.tobytes()))
-        except can.CanOperationError as problem:
-            if problem.error_code not in (*FULL, None):  # no number: a full buffer, too
-                raise self._gone(str(problem)) from None
-            node.state["dropped"] += 1
-            return False
-        account(node.handle, frame)
-        return True
+            time.sleep(1e-3)  # the kernel's queue holds ten frames
+
+    def _next_of_transport(self, timeout: float = 0.0) -> isotp.CanMessage | None:
+        """The next frame of the handshake; none after a message that is to be taken first."""
+        while not self._early and not self._transport.available():
+            size = receive(self._node.handle, self._message)
+            if size == LOST:
+                raise self._gone()
+            if size == NOTHING:
+                return None
+            if size == TRANSPORT:
+                frame = self._node.into[0]
+                data = frame["data"][: frame["length"]].tobytes()
+                return isotp.CanMessage(int(frame["id"]), data=data)
+            self._early.append(self._message[:size].tobytes())
+        return None
+
+    def _count(self, problem: Exception) -> None:
+        self._damaged += isinstance(problem, _DAMAGE)
 
     def receive(self) -> bytes | None:
         """The next message, or None.
@@ -154,57 +190,38 @@ class CanLink:
         Raises:
             PeerLost: the bus is down, or the other side uses another DBC.
         """
-        if self.port is None:
-            while has_room(self._node.bus) and self._bring(0.0):
-                pass
-        size = receive(self._node.handle, self._message)
-        if size == LOST:
-            raise self._gone()
-        return None if size == NOTHING else self._message[:size].tobytes()
-
-    def _bring(self, timeout: float) -> bool:
-        """Pass one frame from python-can to the node; False on timeout."""
-        try:
-            message = self._bus.recv(timeout)
-        except can.CanOperationError as problem:
-            raise self._gone(str(problem)) from None
+        self._transport.process()
+        message = self._transport.recv()
         if message is None:
-            return False
-        datagram = np.frombuffer(pack(message), np.uint8)
-        self._frame.view(np.uint8)[: len(datagram)] = datagram
-        bring(self._node.handle, self._frame)
-        return True
+            return self._early.popleft() if self._early else None
+        theirs = int.from_bytes(message[:_DIGEST_BYTES], "little")
+        if theirs != self._digest:
+            self._send_by_transport(b"")  # so that the peer also detects the mismatch
+            raise PeerLost(
+                f"the {self._other} uses another DBC, or one side alone has an inner stage "
+                f"({theirs:08x}, ours is {self._digest:08x})"
+            )
+        return bytes(message[_DIGEST_BYTES:])
 
-    def _gone(self, said: str = "") -> PeerLost:
+    def _gone(self) -> PeerLost:
         """The error that says why the bus is lost."""
         lost, self._node.state["lost"] = int(self._node.state["lost"][0]), 0
         if lost == WENT_BUS_OFF:
             return PeerLost(f"the CAN controller of {self._where} went bus off")
-        if lost == ANOTHER_DBC:
-            for segment in self._cut.frames(b""):  # so that the peer also detects the mismatch
-                self._put_segment(*segment)
-            theirs = int(self._node.joiner["theirs"][0])
-            return PeerLost(
-                f"the {self._other} uses another DBC, or one side alone has an inner stage "
-                f"({theirs:08x}, ours is {self._digest:08x})"
-            )
-        return PeerLost(f"the CAN bus {self._where} is gone: {said or os.strerror(lost)}")
+        why = getattr(self._bus, "problem", "") or os.strerror(lost)
+        return PeerLost(f"the CAN bus {self._where} is gone: {why}")
 
     def wait(self, seconds: float) -> bool:
         """Sleep until any frame has arrived, ours or foreign, at most ``seconds``."""
         node = self._node
         until = time.monotonic() + seconds
-        while not fetch(node.handle):
+        while not (self._early or fetch(node.handle)):
             if node.state["lost"][0]:
                 raise self._gone()
             left = until - time.monotonic()
             if left <= 0:
                 return False
-            pause = min(left, _LOOK_S) if busy(node.bus) else left
-            if self.port is None:
-                self._bring(pause)
-            else:
-                select.select([self._bus], [], [], pause)
+            select.select([self._bus], [], [], min(left, _LOOK_S) if busy(node.bus) else left)
         return True
 
     def close(self) -> None:
@@ -217,22 +234,22 @@ class CanLink:
 def warm_up(plan: Plan) -> None:
     """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
     ends = {role: Node(plan, role, CanOptions(fd=plan.fd)) for role in ROLES}
-    message = np.zeros(LONGEST, np.uint8)
+    message = np.zeros(MOST, np.uint8)
     groups: tuple[tuple[Role, Vector], ...] = (("plant", "y"), ("controller", "u"))
     for role, group in groups:
-        mine, theirs = ends[role].handle, ends[ROLES[1 - ROLES.index(role)]].handle
+        mine, theirs = ends[role], ends[ROLES[1 - ROLES.index(role)]]
+        mine.sockets["fd"] = mine.sockets["others"] = -1  # no socket: nothing is sent or received
         values = np.zeros(len(carried(group, plan.inner)))
         words = FrameWriter(group, plan.inner).pack(0, 0, 0, values)
-        for k in range(compose(mine, np.frombuffer(words, np.uint8))):
-            account(mine, ends[role].out[k : k + 1])
-            bring(theirs, ends[role].out[k : k + 1])
-        fetch(theirs)
-        receive(theirs, message)
-        room_to_send(mine)
-        can_port(ends[role])
+        send(mine.handle, np.frombuffer(bytearray(words), np.uint8))
+        put(mine.handle, mine.out[:1])
+        process(theirs.handle, mine.out[0], message)
+        fetch(mine.handle)
+        receive(mine.handle, message)
+        can_port(mine)
 
 
-def _open_bus(role: Role, endpoint: str, options: CanOptions) -> can.BusABC:
+def _open_bus(role: Role, endpoint: str, options: CanOptions) -> Any:
     scheme, _, channel = endpoint.partition("://")
     try:
         if scheme == LOOPBACK:

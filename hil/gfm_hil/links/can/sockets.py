@@ -1,7 +1,7 @@
 """Frames to and from a socket, compiled: libc's ``send`` and ``recv`` without Python.
 
-SocketCAN transfers whole structures; on the loopback bus (see ``loopback``) a frame goes to each
-of the other places as a datagram.
+SocketCAN, and a ``Bridge`` in its place, transfer whole structures; on the loopback bus (see
+``loopback``) a frame goes to each of the other places as a datagram.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import cached
 
-PORTABLE, SOCKETCAN, LOOPBACK = range(3)
+SOCKETCAN, LOOPBACK = range(2)
 _OTHERS = 3  # places of a loopback bus besides our own
 _RECHECK_NS = 50_000_000  # how long to skip a place that was empty
 
 socket_dtype = np.dtype(
     [
-        ("kind", "i8"),  # of the bus; PORTABLE: compiled code does not access it
+        ("kind", "i8"),  # of the bus
         ("fd", "i8"),
         ("others", "i8", (_OTHERS,)),  # sockets connected to the other places
         ("empty_until", "i8", (_OTHERS,)),  # ns
@@ -89,6 +89,8 @@ def read_frame(sockets, frame):
     if got < 0:
         why = _errno()
         return 0 if why in _NONE_NOW else -why
+    if got == 0 and sockets[0].kind == SOCKETCAN:  # the bridge has left
+        return -errno.ENOTCONN
     f = frame[0]
     f.length = max(0, min(np.int64(f.length), got - HEAD))
     return 1

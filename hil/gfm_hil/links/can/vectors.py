@@ -35,7 +35,7 @@ _SEQUENCES = 64  # range of the counter's six bits
 _LAG, _MARK = 0x40, 0x80  # its other bits
 _BEHIND = 4  # how many of these sequences count as older vectors
 _LOW = 0xFFFF_FFFF
-_SAID = ("State", "Reason", "Tick")  # signals of a status frame, in this order
+_STATUS = ("State", "Reason", "Tick")  # signals of a status frame, in this order
 
 #: a vector's frames by the DBC; part k holds the values first[k] to first[k + 1]
 _TABLE = [
@@ -52,8 +52,8 @@ _TABLE = [
     ("status_number", "i8"),
     ("status_length", "i8"),
     ("status_data_id", "i8"),
-    ("status_at", "i8", (len(_SAID),)),
-    ("status_width", "i8", (len(_SAID),)),
+    ("status_at", "i8", (len(_STATUS),)),
+    ("status_width", "i8", (len(_STATUS),)),
     ("size", "i8"),  # of the bench's frames
     ("head", "i8"),
 ]
@@ -63,7 +63,7 @@ sender_dtype = np.dtype(
         *_TABLE,
         ("heartbeat", "i8"),
         ("since", "i8"),  # vectors since the last status
-        ("told", "i8", (3,)),  # state, reason and lag sent last
+        ("last", "i8", (3,)),  # state, reason and lag sent last
         ("tick", "i8"),  # sent last
         ("ticks", "i8"),  # number of ticks that still send a status with the values
         ("saturated", "i8"),  # values that lay outside 16 bits
@@ -75,8 +75,8 @@ receiver_dtype = np.dtype(
         *_TABLE,
         ("sequence", "i8"),  # of the newest frame
         ("lag", "i8"),
-        ("said", "i8"),  # sequence of the newest status
-        ("told", "i8", (2,)),  # its state and reason
+        ("status_sequence", "i8"),  # sequence of the newest status
+        ("last", "i8", (2,)),  # its state and reason
         ("counter", "i8"),  # of the vector being assembled
         ("have", "i8"),  # its received parts, a bit mask
         ("incomplete", "i8"),  # vectors without one of their parts or their status
@@ -89,13 +89,13 @@ def set_sender(sender: np.ndarray, plan: Plan, group: Vector, heartbeat: int) ->
     """Initialise one record of ``sender_dtype``; it repeats the status every ``heartbeat``
     vectors."""
     _set_table(sender, plan, group)
-    sender["heartbeat"], sender["told"], sender["tick"] = heartbeat, NOTHING, NOTHING
+    sender["heartbeat"], sender["last"], sender["tick"] = heartbeat, NOTHING, NOTHING
 
 
 def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
     """Initialise one record of ``receiver_dtype``."""
     _set_table(receiver, plan, group)
-    receiver["sequence"] = receiver["said"] = receiver["counter"] = NOTHING
+    receiver["sequence"] = receiver["status_sequence"] = receiver["counter"] = NOTHING
 
 
 def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
@@ -113,8 +113,8 @@ def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r["status_data_id"] = status.data_id
     fields = status.dtype.fields
     assert fields is not None
-    r["status_at"] = [fields[name][1] for name in _SAID]
-    r["status_width"] = [fields[name][0].itemsize for name in _SAID]
+    r["status_at"] = [fields[name][1] for name in _STATUS]
+    r["status_width"] = [fields[name][0].itemsize for name in _STATUS]
 
 
 @cached
@@ -141,8 +141,8 @@ def encode(sender, message, frames):
         if tick != s.tick and s.ticks > 0:
             s.ticks -= 1
         s.tick = tick
-        if state != s.told[0] or reason != s.told[1] or lag != s.told[2]:
-            s.told[0], s.told[1], s.told[2] = state, reason, lag
+        if state != s.last[0] or reason != s.last[1] or lag != s.last[2]:
+            s.last[0], s.last[1], s.last[2] = state, reason, lag
             s.ticks = 2
     counter = sequence % _SEQUENCES | (lag & 1) * _LAG | (s.ticks > 0) * _MARK
     count = 0
@@ -178,7 +178,7 @@ def _head(frame, number, length, flags):
 
 
 @cached
-def knows(receiver, number):
+def belongs(receiver, number):
     """Whether an identifier belongs to this vector or to its sender's status."""
     r = receiver[0]
     for k in range(r.parts):
@@ -189,7 +189,7 @@ def knows(receiver, number):
 
 @cached
 def decode(receiver, frame, message):
-    """Take a CAN frame of this vector (see ``knows``).
+    """Take a CAN frame of this vector (see ``belongs``).
 
     Args:
         receiver: one record of ``receiver_dtype``.
@@ -209,32 +209,32 @@ def decode(receiver, frame, message):
         message[: r.size] = 0  # a CRC of 0 is wrong for it
         return r.size
     if part < 0:
-        _learn(r, data)
+        _take_status(r, data)
         return NOTHING
-    return _put(r, part, data, message)
+    return _take_values(r, part, data, message)
 
 
 @cached
-def _learn(r, data):
-    sequence = _count_on(r, np.int64(data[1]))
+def _take_status(r, data):
+    sequence = _extend(r, np.int64(data[1]))
     if sequence < r.sequence:
         return
     tick = r.sequence - r.lag
-    said = wire.number(data, r.status_at[2], r.status_width[2])
-    tick += (said - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
-    r.lag, r.said = sequence - tick, sequence
+    low = wire.number(data, r.status_at[2], r.status_width[2])
+    tick += (low - tick + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+    r.lag, r.status_sequence = sequence - tick, sequence
     for k in range(2):
-        r.told[k] = wire.number(data, r.status_at[k], r.status_width[k])
+        r.last[k] = wire.number(data, r.status_at[k], r.status_width[k])
 
 
 @cached
-def _count_on(r, counter):
+def _extend(r, counter):
     """The full sequence from its received low bits."""
     return r.sequence + (counter - r.sequence + _BEHIND) % _SEQUENCES - _BEHIND
 
 
 @cached
-def _put(r, part, data, message):
+def _take_values(r, part, data, message):
     counter = np.int64(data[1])
     if counter != r.counter:
         r.incomplete += r.have != 0
@@ -247,14 +247,14 @@ def _put(r, part, data, message):
     if r.have != (1 << r.parts) - 1:
         return NOTHING
     r.have = 0
-    sequence = _count_on(r, counter)
-    unsaid = counter & _MARK != 0 and sequence != r.said
-    if unsaid or (counter & _LAG != 0) != (r.lag & 1 != 0):  # the tick is unknown
+    sequence = _extend(r, counter)
+    unknown = counter & _MARK != 0 and sequence != r.status_sequence
+    if unknown or (counter & _LAG != 0) != (r.lag & 1 != 0):  # the tick is unknown
         r.incomplete += 1
         return NOTHING
     r.sequence = max(r.sequence, sequence)
     wire.put_number(message, 0, wire.STATE, r.head)
-    message[wire.STATE], message[wire.REASON] = r.told[0], r.told[1]
+    message[wire.STATE], message[wire.REASON] = r.last[0], r.last[1]
     wire.put_number(message, wire.SPARE, wire.SEQUENCE - wire.SPARE, 0)
     wire.put_number(message, wire.SEQUENCE, 4, sequence & _LOW)
     wire.put_number(message, wire.TICK, 8, sequence - r.lag)  # negative: reads as ≥ 2**63, refused

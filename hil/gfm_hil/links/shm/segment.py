@@ -1,9 +1,9 @@
-"""The shared memory: the controller creates and removes it, the plant joins it.
+"""The file of a shared-memory link: the controller creates and removes it, the plant joins it.
 
+It is in the private folder of the user, so that no other user can make, open, replace or lock it.
 The header says which process made it. A process is identified by its number and start time, which
-distinguishes the segment of a killed run from one in use. A process locks the file while it makes,
-joins or removes a segment; no process holds the lock during a run. Only files of our own user are
-used, locked or removed: another user may put any file under the same name.
+distinguishes the segment of a killed run from one in use. A process locks the folder while it
+makes, joins or removes a segment; no process holds the lock during a run.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import contextlib
 import fcntl
 import mmap
 import os
-import stat
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,8 +20,7 @@ from pathlib import Path
 from gfm_hil.core import temporary as scratch
 from gfm_hil.links.ring import RING
 
-FOLDER = Path("/dev/shm")  # of shm_open(3) on Linux
-PREFIX = "gfmhil-link-"
+PREFIX = "link-"
 
 MAGIC = b"GFMHILSM"
 VERSION = 1  # of everything below and of links/ring.py
@@ -78,59 +76,51 @@ def create(name: str) -> Segment:
     Raises:
         Refused: a living process uses it, the file is not a segment of ours, or there is no room.
     """
-    path = FOLDER / (PREFIX + name)
-    for other in FOLDER.glob(PREFIX + "*"):
-        with contextlib.suppress(Refused, OSError), _locked(other, patience_s=0.0) as handle:
-            if handle is not None and _owner(other, handle) is None:
-                other.unlink()
-    while True:
-        with _locked(path, os.O_CREAT) as handle:
-            assert handle is not None
-            found = os.fstat(handle)
-            if found.st_size == 0 and scratch.is_private(found):  # no process has it in use
-                return _made(path, handle)
-            if owner := _owner(path, handle):
-                raise Refused(f"occupied by another run (process {owner[0]})")
+    with _locked() as folder:
+        path = folder / (PREFIX + name)
+        for other in folder.glob(PREFIX + "*"):
+            with contextlib.suppress(Refused, OSError):
+                if _owner(other) is None:
+                    other.unlink()
+        if path.exists() and (owner := _owner(path)):
+            raise Refused(f"occupied by another run (process {owner[0]})")
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            os.posix_fallocate(handle, 0, SIZE)  # else a full file system shows up as SIGBUS
+            segment = Segment(path, mmap.mmap(handle, SIZE))
+        except OSError as problem:
             path.unlink()
-
-
-def _made(path: Path, handle: int) -> Segment:
-    """Turn an empty file into a segment of this process."""
-    try:
-        os.posix_fallocate(handle, 0, SIZE)  # else a full file system shows up only as SIGBUS
-    except OSError as problem:
-        path.unlink()
-        raise Refused(problem.strerror) from None
-    segment = Segment(path, mmap.mmap(handle, SIZE))
-    _OWNER.pack_into(segment.memory, 0, MAGIC, VERSION, *myself())
-    return segment
+            raise Refused(problem.strerror) from None
+        finally:
+            os.close(handle)
+        _OWNER.pack_into(segment.memory, 0, MAGIC, VERSION, *myself())
+        return segment
 
 
 def join(name: str) -> Segment | None:
     """Join the segment of that name as the plant; None if no living controller has made it yet.
 
     Raises:
-        Refused: it has another layout, is not a segment of ours, is open to other users, or
-            another living plant has joined it.
+        Refused: it has another layout, is not a segment of ours, or another living plant has
+            joined it.
     """
-    path = FOLDER / (PREFIX + name)
-    with _locked(path) as handle:
-        if handle is None or _owner(path, handle) is None:
+    path = _folder() / (PREFIX + name)
+    if not path.exists():  # a plant that waits locks nothing
+        return None
+    with _locked():
+        if not path.exists() or _owner(path) is None:
             return None
-        version = _OWNER.unpack(os.pread(handle, _OWNER.size, 0))[1]
-        if version != VERSION:
-            raise Refused(f"made by another version (layout {version}, ours is {VERSION})")
-        found = os.fstat(handle)
-        if not scratch.is_private(found):
-            mode = stat.S_IMODE(found.st_mode)
-            raise Refused(f"other users may open {path} (mode {mode:04o}, must be 0600)")
-        if found.st_size < SIZE:
-            raise Refused(f"{path} is there and is no link of ours")
-        segment = Segment(path, mmap.mmap(handle, SIZE))
+        with path.open("r+b") as file:
+            version = _OWNER.unpack(file.read(_OWNER.size))[1]
+            if version != VERSION:
+                raise Refused(f"made by another version (layout {version}, ours is {VERSION})")
+            if path.stat().st_size < SIZE:
+                raise Refused(f"{path} is there and is no link of ours")
+            segment = Segment(path, mmap.mmap(file.fileno(), SIZE))
         if _lives(segment.plant):
             raise Refused(f"another plant has joined it (process {segment.plant[0]})")
         _PLANT.pack_into(segment.memory, _PLANT_AT, *myself())
-    return segment
+        return segment
 
 
 def leave(segment: Segment) -> None:
@@ -151,73 +141,47 @@ def has_plant(segment: Segment) -> bool:
 
 def _remove_if(segment: Segment, owner: Identity | None) -> None:
     """Unmap a segment; remove its file if its living owner is ``owner`` (None: no living one)."""
-    with contextlib.suppress(Refused, OSError), _locked(segment.path) as handle:
-        if handle is not None and _owner(segment.path, handle) == owner:
+    with contextlib.suppress(Refused, OSError), _locked():
+        if _owner(segment.path) == owner:
             segment.path.unlink()
     segment.memory.close()
 
 
 @contextlib.contextmanager
-def _locked(
-    path: Path, flags: int = 0, patience_s: float = scratch.PATIENCE_S
-) -> Iterator[int | None]:
-    """The file at a path, opened and locked, or None if there is none.
-
-    Args:
-        path: of a segment.
-        flags: ``os.O_CREAT`` to make an empty file if there is none.
-        patience_s: how long to wait for another process's lock, s.
+def _locked() -> Iterator[Path]:
+    """The user's private folder, locked.
 
     Raises:
-        Refused: it is not a file of our user, or another process keeps it locked.
+        Refused: it is not private, or another process keeps it locked.
     """
-    while True:
-        try:
-            handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o600)
-        except FileNotFoundError:
-            yield None
-            return
-        except PermissionError:
-            raise Refused("belongs to another user") from None
-        except OSError as problem:
-            raise Refused(f"{path}: {problem.strerror}") from None
-        try:
-            _refuse_foreign(path, os.fstat(handle))
-            try:
-                scratch.lock(handle, fcntl.LOCK_EX, patience_s)
-            except TimeoutError as problem:
-                raise Refused(str(problem)) from None
-            if _is_at(path, handle):  # the file was not replaced while we waited
-                yield handle
-                return
-        finally:
-            fcntl.flock(handle, fcntl.LOCK_UN)  # a mapping of the file would keep the lock
-            os.close(handle)
-
-
-def _refuse_foreign(path: Path, found: os.stat_result) -> None:
-    if found.st_uid != os.geteuid():
-        raise Refused(f"belongs to another user (uid {found.st_uid})")
-    if not stat.S_ISREG(found.st_mode):
-        raise Refused(f"{path} is there and is no link of ours")
-
-
-def _is_at(path: Path, handle: int) -> bool:
+    folder = _folder()
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        return os.path.samestat(path.lstat(), os.fstat(handle))
-    except FileNotFoundError:
-        return False
+        scratch.lock(handle, fcntl.LOCK_EX)
+        yield folder
+    except TimeoutError as problem:
+        raise Refused(f"{folder}: {problem}") from None
+    finally:
+        os.close(handle)
 
 
-def _owner(path: Path, handle: int) -> Identity | None:
-    """The living owner of a locked segment; None if the owner is dead.
+def _folder() -> Path:
+    try:
+        return scratch.private_folder()
+    except PermissionError as problem:
+        raise Refused(str(problem)) from None
+
+
+def _owner(path: Path) -> Identity | None:
+    """The living owner of a segment; None if the owner is dead.
 
     Raises:
         Refused: the file is not a segment of ours.
     """
-    content = os.pread(handle, _OWNER.size, 0)
+    with path.open("rb") as file:
+        content = file.read(_OWNER.size)
     if not content.strip(b"\0"):
-        return None  # its creator was killed while it held the lock
+        return None  # its creator was killed before it wrote the header
     if len(content) < _OWNER.size or not content.startswith(MAGIC):
         raise Refused(f"{path} is there and is no link of ours")
     owner: Identity = _OWNER.unpack(content)[2:]

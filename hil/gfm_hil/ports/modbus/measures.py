@@ -42,7 +42,8 @@ class Measures:
         """Every model of the device with the points that determine its layout, for ``Image``."""
         b = self._bases
         power = _exponent(b.S_n * _top("p"), 16, signed=True)
-        volt, amp = _exponent(b.V_n * _top("V"), 16), _exponent(b.I_b * _top("p"), 16, signed=True)
+        volt = _exponent(b.V_n * _top("V"), 16)
+        amp = _exponent(b.base_of("I") * _top("p"), 16, signed=True)
         set_point = _exponent(b.S_n * _top("P_ref"), 32, signed=True)
         points: list[dict[str, Any]] = [{}, {}]
         return {
@@ -68,7 +69,7 @@ class Measures:
             },
             714: {
                 "ID": 714, "NPrt": 1, "DCV_SF": _exponent(b.V_dcref * _top("v_dc"), 16),
-                "DCA_SF": _exponent(b.I_dcb * _top("i_u"), 16, signed=True),
+                "DCA_SF": _exponent(b.base_of("i_dc") * _top("i_u"), 16, signed=True),
                 "DCW_SF": _exponent(b.S_n * _top("i_u") * _top("v_dc"), 16, signed=True),
                 "Prt": [{}],
             },
@@ -135,12 +136,12 @@ class Measures:
             "701.VA": s * b.S_n,
             "701.Var": q * b.S_n,
             "701.PF": p / s if s > 0 else None,
-            "701.A": s / V * b.I_b if V > 0 else None,
+            "701.A": s / V * b.base_of("I") if V > 0 else None,
             "701.LLV": V * b.V_n,
             "701.LNV": V * b.V_n / math.sqrt(3),
             "701.Hz": y["y_omega_u"] * b.omega_n / (2 * math.pi),
-            "714.DCA": i_dc * b.I_dcb,
-            "714.Prt1.DCA": i_dc * b.I_dcb,
+            "714.DCA": i_dc * b.base_of("i_dc"),
+            "714.Prt1.DCA": i_dc * b.base_of("i_dc"),
             "714.DCW": i_dc * y["y_v_dc"] * b.S_n,
             "714.Prt1.DCW": i_dc * y["y_v_dc"] * b.S_n,
             "714.Prt1.DCV": y["y_v_dc"] * b.V_dcref,

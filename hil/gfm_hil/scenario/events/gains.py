@@ -6,25 +6,23 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from numpy.typing import NDArray
 from pydantic import Field
 
+import gfm_runtime  # lazy: an operator's command loads no kernel, and so no compiler
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
 from gfm_hil.scenario.events.law import LawChange
 from gfm_hil.scenario.events.reset import Reset
-from gfm_runtime import law_file, load_law
 from gfm_runtime.errors import LawError
-from gfm_runtime.kernel import pack_law
-from gfm_runtime.lawfile import tied
-from gfm_runtime.tustin import DiscreteLaw, discretise
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from gfm_hil.scenario.schema import Scenario
     from gfm_runtime.assembly import Controller
 
-Retuned = tuple[DiscreteLaw, NDArray[Any]]  #: a law, and the record that the kernel takes
+    Retuned = tuple[gfm_runtime.DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
 
 class GainChange(Event):
@@ -68,12 +66,13 @@ def retuned(
         ValueError: a scheduled law, a name that its file does not have, or no such law.
     """
     try:
-        file = law_file(name)
+        file = gfm_runtime.law_file(name)
         if file.schedule is not None:
             raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
-        (law,) = load_law(name, inner, **tied(file, dict(gains))).laws
-        discrete = discretise(law, T_s)
-        return discrete, pack_law(discrete, omega_b=omega_b)
+        changed = gfm_runtime.tied(file, dict(gains))
+        (law,) = gfm_runtime.load_law(name, inner, **changed).laws
+        discrete = gfm_runtime.discretise(law, T_s)
+        return discrete, gfm_runtime.pack_law(discrete, omega_b=omega_b)
     except LawError as problem:
         raise ValueError(str(problem)) from None
 
@@ -97,7 +96,8 @@ def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
     Raises:
         UserError: a change that is not possible.
     """
-    found, name, gains = list[Retuned](), scenario.law, dict[str, float]()
+    found: list[Retuned] = []
+    name, gains = scenario.law, dict[str, float]()
     for event in scenario.sorted_events():
         if isinstance(event, LawChange):
             name, gains = event.law, {}

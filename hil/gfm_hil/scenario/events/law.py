@@ -6,9 +6,9 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+import gfm_runtime
 from gfm_hil.core.roles import Role
 from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
-from gfm_runtime import law_titles
 from gfm_runtime.errors import meant
 
 
@@ -22,7 +22,8 @@ class LawChange(Event):
     converter: str | None = WHOSE
 
     def label(self) -> str:
-        return f"law {law_titles([self.law])[self.law]}"
+        # lazy: an operator's command loads no law, and so no compiler
+        return f"law {gfm_runtime.law_titles([self.law])[self.law]}"
 
     def label_in(self, target: EventTarget) -> str:
         return f"law {target.controller.titles[self.law]}"

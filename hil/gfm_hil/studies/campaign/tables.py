@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
-from rich.table import Table
 
-from gfm_hil.core.terminal import fitting, numbers, terminal
-from gfm_hil.results.report import EVENT_COLUMNS, cell
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.report import EVENT_COLUMNS
+from gfm_hil.results.table import Cell, Table
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.campaign.axes import Axis
 from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult
 from gfm_hil.studies.campaign.worker import Record
 
-_COLOURS = {"stable": "green", "oscillating": "yellow"}
+_STYLES = {"stable": "good", "oscillating": "warn"}
 
 
 def print_campaign(found: CampaignResult) -> None:
@@ -31,7 +29,7 @@ def print_campaign(found: CampaignResult) -> None:
         + (f"{w} workers" if isinstance(w := found.workers, int) else escape(w)),
         highlight=False,
     )
-    for table in fitting(console, list(result["laws"]), partial(_counts, result["laws"])):
+    for table in _counts(result["laws"]).fitting(console):
         console.print(table)
     for law, one in result["laws"].items():
         console.print(_worst(law, one["worst"], [a for a in found.axes if a]))
@@ -40,26 +38,24 @@ def print_campaign(found: CampaignResult) -> None:
         console.print(escape(where), soft_wrap=True)
 
 
-def _counts(all_laws: dict[str, Any], names: Sequence[str]) -> Table:
-    laws = {name: all_laws[name] for name in names}
-    table = numbers("", *map(escape, laws))
+def _counts(laws: dict[str, Any]) -> Table:
+    rows: list[list[Any]] = []
     for name in VERDICTS:
         counts = [found["counts"][name] for found in laws.values()]
         if any(counts):
-            table.add_row(name.replace("-", " "), *[str(n) for n in counts])
+            rows.append([name.replace("-", " "), *counts])
     events = max((found["events"] for found in laws.values()), key=len)
     for k, event in enumerate(events):
-        table.add_row(
-            f"[bold]event {k}, {event['type']}[/]", *["[dim]p5 / p50 / p95[/]"] * len(laws)
-        )
+        quantiles = [Cell("p5 / p50 / p95", "dim")] * len(laws)
+        rows.append([Cell(f"event {k}, {event['type']}", "head"), *quantiles])
         for name, title in EVENT_COLUMNS:
             marks = [
                 found["events"][k]["metrics"].get(name) if k < len(found["events"]) else None
                 for found in laws.values()
             ]
             if any(marks):
-                table.add_row("  " + escape(title), *[_marks(m) if m else "–" for m in marks])
-    return table
+                rows.append(["  " + title, *[m and _marks(m) for m in marks]])
+    return Table(["", *laws], rows)
 
 
 def _marks(marks: dict[str, float]) -> str:
@@ -71,19 +67,17 @@ def _marks(marks: dict[str, float]) -> str:
 
 
 def _worst(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table:
-    table = Table(box=None, pad_edge=False, title=f"\nworst of {escape(law)}", title_justify="left")
-    for name in ("run", "at \\[s]", *(escape(axis.label) for axis in axes)):
-        table.add_column(name, justify="right")
-    table.add_column("")
+    rows = []
     for entry in runs:
         what = entry["verdict"]
-        why = escape(reason_name(entry["reason"])) if what in ("tripped", "safe") else ""
+        why = reason_name(entry["reason"]) if what in ("tripped", "safe") else ""
         if what == "oscillating":
             why = f"{entry['ripple_pu']:.3g} p.u."
-        words = f"[{_COLOURS.get(what, 'red')}]{what.replace('-', ' ')}[/] {why}"
+        words = Cell(f"{what.replace('-', ' ')} {why}".rstrip(), _STYLES.get(what, "bad"))
         drawn = [axis.shown(entry["drawn"]) for axis in axes]
-        table.add_row(str(entry["run"]), cell(entry["end_s"]), *drawn, words)
-    return table
+        rows.append([str(entry["run"]), words, entry["end_s"], *drawn])
+    heads = "run", "", "at [s]", *(axis.label for axis in axes)
+    return Table(heads, rows, f"\nworst of {law}", text=2)
 
 
 def print_record(record: Record, folder: Path) -> None:

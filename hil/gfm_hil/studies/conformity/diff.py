@@ -7,7 +7,6 @@ called, so that a changed law may have another name or path.
 
 from __future__ import annotations
 
-import html
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
-from gfm_hil.results.report import cell
-from gfm_hil.studies.conformity.result import document, status, table
+from gfm_hil.results.page import render
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
 from gfm_runtime.errors import printable
 
@@ -168,21 +167,9 @@ class ReportDiff:
 
     def page(self, old: str, new: str) -> str:
         """As an HTML page; the arguments are the reports' names."""
-        title = "Conformity: what changed"
-        body = [f"<h1>{title}</h1><p>{html.escape(old)} → {html.escape(new)}: {self.words}.</p>"]
-        body += [f"<p>{html.escape(note)}</p>" for note in self.notes]
-        rows = [
-            [
-                row.change,
-                *map(html.escape, (row.law, row.test, row.part, row.clause.clause)),
-                " → ".join(status(x.verdict) if x else "–" for x in (row.old, row.new)),
-                *map(html.escape, (row.value, row.clause.text)),
-            ]
-            for row in self.rows
-        ]
-        heads = ("change", "law", "test", "part", "clause", "verdict", "measured", "what was found")
-        body.append(table(heads, rows) if rows else "<p>Nothing.</p>")
-        return document(title, "\n".join(body))
+        return render(
+            "conformity_diff.html", title="Conformity: what changed", old=old, new=new, diff=self
+        )
 
 
 def read_results(path: str | Path) -> Results:
@@ -291,4 +278,4 @@ def _notes(old: Results, new: Results) -> Iterator[str]:
 
 
 def _value(of: ClauseResult | None) -> str:
-    return "–" if of is None or of.value is None else f"{cell(of.value)} {of.unit}".rstrip()
+    return "–" if of is None or of.value is None else f"{shown(of.value)} {of.unit}".rstrip()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -17,7 +15,9 @@ from xml.etree import ElementTree
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.recording.columns import printed
-from gfm_hil.results.report import STYLE, cell, figure, finite
+from gfm_hil.results.page import render
+from gfm_hil.results.report import finite
+from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.execute import PartResult, slug
 from gfm_hil.studies.conformity.model import KNOWN
 from gfm_hil.studies.conformity.sets import Case
@@ -35,20 +35,6 @@ from gfm_hil.studies.conformity.verdict import (
 
 #: characters that XML cannot hold, not even escaped
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_STYLE = """
-.pass{background:#00734f} .fail{background:#b34500} .cannot{background:#777}
-.informative{background:#36648b}
-td .status{padding:0 .4rem;white-space:nowrap}
-.scroll.text :is(th,td):not(:first-child){text-align:left;white-space:normal}
-.scroll .matrix :is(td,th){padding:.1rem;text-align:center;border:0} .matrix a{color:inherit;
-text-decoration:none} .matrix .status{padding:0;width:1.5rem}
-.scroll .matrix th:first-child{position:sticky;left:0;background:var(--paper);text-align:left;
-white-space:normal;min-width:9rem;padding-right:.6rem}
-.matrix th.tall{writing-mode:vertical-rl;transform:rotate(180deg);text-align:left!important}
-@media (max-width:45rem){.text :is(table,tbody,tr,td){display:block} .text th{display:none}
-.text tr{padding:.4rem 0;border-bottom:1px solid var(--line)} .text td{padding:0;border:0}
-.text td:not(:has(.status))::before{content:attr(data-head) ": ";opacity:.6}}
-"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -162,14 +148,15 @@ class Conformity:
             write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
             write_text(folder / "junit.xml", self._junit())
             if len(self.laws) == 1:
-                write_text(folder / "report.html", self._page(self.laws[0]))
+                write_text(folder / "report.html", self._law_page(self.laws[0]))
                 return
             from gfm_hil.studies.conformity.figure import draw_matrix
 
             draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
             for law in self.laws:
-                write_text(folder / f"report-{slug(law)}.html", self._page(law))
-            write_text(folder / "report.html", self._overview())
+                write_text(folder / f"report-{slug(law)}.html", self._law_page(law))
+            page = self._page("conformity_matrix.html", "Conformity of laws")
+            write_text(folder / "report.html", page)
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
@@ -198,75 +185,15 @@ class Conformity:
         text = ElementTree.tostring(top, encoding="unicode", xml_declaration=True)
         return _NOT_XML.sub("\ufffd", text) + "\n"
 
-    def _page(self, law: str) -> str:
-        body = [self._head(f"{law}: conformity")]
-        rows = [
-            [status(self.matrix[law, c.id]), _link(c), html.escape(c.test.source.words())]
-            for c in self.cases
-        ]
-        body.append(table(["verdict", "test", "source"], rows))
-        body += [self._section(law, case) for case in self.cases]
-        return document(f"{law}: conformity", "\n".join(body))
+    def _law_page(self, law: str) -> str:
+        return self._page("conformity.html", f"{law}: conformity", law=law)
 
-    def _overview(self) -> str:
-        pages = {law: f"report-{slug(law)}.html" for law in self.laws}
-        heads = "".join(
-            f'<th class="tall"><a href="{page}">{html.escape(law)}</a></th>'
-            for law, page in pages.items()
-        )
-        rows = ""
-        for c in self.cases:
-            cells = "".join(
-                f'<td><a href="{page}#{slug(c.id)}">'
-                f"{status(self.matrix[law, c.id], short=True)}</a></td>"
-                for law, page in pages.items()
-            )
-            rows += (
-                f'<tr><th title="{html.escape(c.test.title)}">{html.escape(c.id)}</th>{cells}</tr>'
-            )
-        matrix = f'<div class="scroll"><table class="matrix"><tr><th></th>{heads}</tr>{rows}'
-        sources = table(
-            ["test", "source", "known"],
-            [
-                [html.escape(c.id), html.escape(c.test.source.words()),
-                 html.escape(KNOWN[c.test.source.known])]
-                for c in self.cases
-            ],
+    def _page(self, template: str, title: str, **more: Any) -> str:
+        """A page about all of it, or of one law."""
+        return render(
+            template, title=title, found=self, slug=slug, known=KNOWN, signs=SIGNS, row=_row,
+            version=version("gfmhil"), date=datetime.now(UTC).date(), **more,
         )  # fmt: skip
-        body = f"{self._head('Conformity of laws')}{matrix}</table></div><h2>Sources</h2>{sources}"
-        return document("Conformity of laws", body)
-
-    def _head(self, title: str) -> str:
-        under = self.under
-        stage = "each law's own" if self.inner is None else self.inner
-        return (
-            f"<h1>{html.escape(title)}</h1><p>Inner stage: {html.escape(stage)}. Converter: "
-            f"{html.escape(under.plant.converter)}, declared droop {100 * under.droop:g} %, power "
-            f"{under.P_min:g} to {under.P_max:g} p.u. gfmhil {version('gfmhil')}, "
-            f"{datetime.now(UTC).date()}. These verdicts are about this model, not about a "
-            "product; check each limit against the source before you rely on it.</p>"
-        )
-
-    def _section(self, law: str, case: Case) -> str:
-        test = case.test
-        text = [
-            f'<h2 id="{slug(case.id)}">{status(self.matrix[law, case.id])} '
-            f"{html.escape(f'{case.id}: {test.title}')}</h2>",
-            f"<p>{html.escape(test.description)}</p>",
-            f"<p>Source: {html.escape(test.source.words())}, {KNOWN[test.source.known]}.</p>",
-        ]
-        for f in self.of(law, case.id):
-            if f.part:
-                text.append(f"<h3>{status(f.verdict)} {html.escape(f.part)}</h3>")
-            if f.verdicts:
-                text.append(table(_HEADS, [_row(v) for v in f.verdicts]))
-            else:
-                text.append(f"<p>{html.escape(f.reason)}</p>")
-            if f.figure is not None:
-                text.append(figure(f"{f.test} {f.part}".rstrip(), f.figure.panels))
-            if f.again:
-                text.append(f"<p><code>{html.escape(f.again)}</code> repeats the run.</p>")
-        return "\n".join(text)
 
     def __repr__(self) -> str:
         count = list(self.matrix.values())
@@ -274,44 +201,11 @@ class Conformity:
         return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
 
 
-_HEADS = ("verdict", "clause", "signal", "window [s]", "measured", "limit", "what was found")
-
-
 def _row(v: Verdict) -> list[str]:
-    measured = "–" if v.value is None else f"{cell(v.value)} {v.unit}".rstrip()
+    """What a page says of a clause, after its verdict."""
+    measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    plain = (v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text)
-    return [status(v.verdict), *map(html.escape, plain)]
-
-
-def status(verdict: str, short: bool = False) -> str:
-    """A verdict in its colour, as a word or its sign."""
-    look = verdict.split()[0]
-    return f'<span class="status {look}">{SIGNS[verdict] if short else verdict}</span>'
-
-
-def _link(case: Case) -> str:
-    name = html.escape(f"{case.id}: {case.test.title}")
-    return f'<a href="#{slug(case.id)}">{name}</a>'
-
-
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose cells are HTML already."""
-    top = "".join(f"<th>{head}</th>" for head in heads)
-    body = ""
-    for row in rows:  # each cell with its head, for where there is no room for columns
-        cells = (f'<td data-head="{h}">{c}</td>' for h, c in zip(heads, row, strict=True))
-        body += f"<tr>{''.join(cells)}</tr>"
-    return f'<div class="scroll text"><table><tr>{top}</tr>{body}</table></div>'
-
-
-def document(title: str, body: str) -> str:
-    """A whole page of HTML."""
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{STYLE}{_STYLE}</style>\n{body}</html>\n"
-    )
+    return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text]
 
 
 def _case(suite: Any, law: str, f: PartResult, name: str, verdict: str, text: str) -> None:

@@ -43,3 +43,6 @@ class Damped(Windowed):
         else:
             text = f"The swing of p at {mode.hz:.3g} Hz has a damping ratio of {mode.damping:.3g}."
         return m.says(found is None, value, "", f"at least {self.ratio:g}", text, "p")
+
+
+CRITERION = Damped

@@ -30,3 +30,6 @@ class Energy(Windowed):
             f"{H:.3g} s would; at least {self.least_s:g} s are asked."
         )
         return m.says(self.least_s <= H, H, "s", f"at least {self.least_s:g} s", text, "p")
+
+
+CRITERION = Energy

@@ -114,3 +114,6 @@ def _expected(m: Moment, unit: Unit, t: Vector, P_0: float) -> Envelope | None:
         case GridImpedance(scr=float(after)):
             return scr_jump(unit, t, scr, after, P_0)
     return None
+
+
+CRITERION = InEnvelope

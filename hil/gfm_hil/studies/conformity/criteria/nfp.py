@@ -144,3 +144,6 @@ class Nfp(Clause):
                 for limit in limits:
                     span = [band.from_hz, band.to_hz]
                     axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
+
+
+CRITERION = Nfp

@@ -31,3 +31,6 @@ class NoOscillation(Clause):
             text = ripple.words()[0].upper() + ripple.words()[1:] + "."
         limit = f"at most {ripple.limit:g} p.u."
         return m.says(not ripple.oscillates, ripple.pu[name], "p.u.", limit, text, name)
+
+
+CRITERION = NoOscillation

@@ -37,3 +37,6 @@ class NoTrip(Clause):
         else:
             text = f"The run should last {whole:g} s, but {m.end()}."
         return m.says(ok, end, "s", f"at least {whole:g} s", text)
+
+
+CRITERION = NoTrip

@@ -31,3 +31,6 @@ class PeakDelta(Windowed):
         low, high = (edge, None) if sign > 0 else (None, edge)
         limit = f"at least {self.least:g} p.u."
         return m.says(way >= self.least, way, "p.u.", limit, text, "p", low, high, m.span)
+
+
+CRITERION = PeakDelta

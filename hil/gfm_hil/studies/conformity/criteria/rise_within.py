@@ -36,3 +36,6 @@ class Rise(Windowed):
         )
         limit = f"within {1e3 * self.within:g} ms"
         return m.says(took <= self.within + 1e-9, 1e3 * took, "ms", limit, text, "p")
+
+
+CRITERION = Rise

@@ -59,3 +59,6 @@ class Settles(Windowed):
         if to != asked:
             why += f", which asks for {asked:.3g} p.u., limited to the declared power"
         return to, why
+
+
+CRITERION = Settles

@@ -29,3 +29,6 @@ class InStep(Windowed):
             else f"The converter falls out of step: its angle to the grid moves by {far:.4g}°."
         )
         return m.says(far < 180, far, "°", "less than 180°", text, "delta")
+
+
+CRITERION = InStep

@@ -65,3 +65,6 @@ class StaysWithin(Windowed):
         return m.says(
             found is None, value, unit_of(self.signal), band, text, self.signal, low, high, m.span
         )
+
+
+CRITERION = StaysWithin

@@ -1,34 +1,45 @@
-"""Other packages for the same purpose, from PyPI; measured if installed."""
+"""iceoryx2, a package from PyPI for shared memory, beside the link ``shm`` if it is installed."""
 
 from __future__ import annotations
 
 import ctypes
+import secrets
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
+from gfm_hil.bench.contenders import shm
+from gfm_hil.bench.contenders.base import Contender
+from gfm_hil.bench.pingpong import LONGEST, Messages, PingPong, over_link
 from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
 
 _ROOM = 64  # messages, as in the links
 
 
-def has_iceoryx2() -> bool:
-    """Whether its Python binding can be imported; it does not install flatbuffers by itself."""
-    return find_spec("iceoryx2") is not None and find_spec("flatbuffers") is not None
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    """Its Python binding, which does not install flatbuffers by itself."""
+    if "shm" in links and find_spec("iceoryx2") and find_spec("flatbuffers"):
+        name = f"gfmhil-{secrets.token_hex(8)}"
+        yield Contender("iceoryx2", "iceoryx2", name, _open, "iceoryx2", limit=shm.LIMIT)
 
 
-class Iceoryx2Link:
-    """One end of a link over iceoryx2's publish-subscribe: shared memory, driven from Python.
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(Iceoryx2(role, c.endpoint), own)
+
+
+class Iceoryx2:
+    """One end over its publish-subscribe, driven from Python.
 
     Args:
         role: of the bench.
         name: of the two services, unique on this machine.
-        longest: bytes of a message.
     """
 
     port: Port | None = None
 
-    def __init__(self, role: Role, name: str, longest: int) -> None:
+    def __init__(self, role: Role, name: str) -> None:
         import iceoryx2 as iox2
 
         iox2.set_log_level(iox2.LogLevel.Fatal)
@@ -44,7 +55,7 @@ class Iceoryx2Link:
 
         ways = ("u", "y") if role == "controller" else ("y", "u")
         out, into = (service(way) for way in ways)
-        self._publisher = out.publisher_builder().initial_max_slice_len(longest).create()
+        self._publisher = out.publisher_builder().initial_max_slice_len(LONGEST).create()
         self._subscriber = into.subscriber_builder().create()
         self._keep: list[Any] = [node, out, into]
 

@@ -1,0 +1,84 @@
+"""The components of a network, one a file, and their registry, `NetworkParts`.
+
+A new component is a file here and a field there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, get_args
+
+from pydantic import Field
+
+from gfm_plant.components.capacitor_bank import CapacitorBank
+from gfm_plant.components.constant_power import ConstantPowerLoad
+from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.line import Line
+from gfm_plant.components.load import Load
+from gfm_plant.components.machine import Machine
+from gfm_plant.components.part import Component, Dynamic, Fed
+from gfm_plant.components.transformer import Transformer
+from gfm_plant.parameters import Options
+from gfm_runtime.compiled import inlined_as
+
+
+class NetworkParts(Options):
+    """What connects several converters, by its names."""
+
+    grid: str | None = Field(
+        None, min_length=1, description="node of the grid of plant.grid; an island if none"
+    )
+    lines: dict[str, Line] = Field({}, description="between nodes, by name")
+    transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
+    loads: dict[str, Load] = Field({}, description="by name")
+    constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
+    capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
+    machines: dict[str, Machine] = Field({}, description="by name")
+
+    def components(self) -> Iterator[tuple[str, str, Component]]:
+        """Table, name and options of each, in the order of the fields above."""
+        for table in COMPONENTS:
+            for name, one in getattr(self, table).items():
+                yield table, name, one
+
+
+COMPONENTS: dict[str, type[Component]] = {
+    table: get_args(field.annotation)[1]
+    for table, field in NetworkParts.model_fields.items()
+    if table != "grid"
+}
+"""The components by their tables."""
+
+_FED = [kind for kind in COMPONENTS.values() if issubclass(kind, Fed)]
+DYNAMIC: tuple[type[Dynamic], ...] = (
+    FiniteGrid, *sorted(_FED, key=lambda kind: not kind.is_voltage)
+)  # fmt: skip
+"""The components with records, in the order of these: voltages before currents."""
+
+
+def _every(hook: str) -> Any:
+    """A compiled function (plant, c, part) that calls a hook of all components, in turn."""
+
+    def last(plant: Any, c: int, part: int) -> None:
+        return
+
+    chain = inlined_as(f"every_{hook}", last)
+    for k, kind in reversed([*enumerate(DYNAMIC)]):
+        if hook in kind.hooks:
+            chain = _link(hook, kind.hooks[hook], k, chain)
+    return chain
+
+
+def _link(hook: str, call: Callable[..., None], k: int, others: Callable[..., None]) -> Any:
+    def link(plant: Any, c: int, part: int) -> None:
+        those = plant.parts[k]
+        for j in range(len(those)):
+            call(plant.net[0], plant.now[0], those[j], c, part)
+        others(plant, c, part)
+
+    return inlined_as(f"every_{hook}_{k}", link)
+
+
+every_at_rest, every_keep, every_go_back = _every("at_rest"), _every("keep"), _every("go_back")
+every_begin, every_drive = _every("begin"), _every("drive")
+every_middle, every_end, every_tick = _every("middle"), _every("end"), _every("tick")

@@ -1,0 +1,199 @@
+"""A load of constant power: the current that its control draws, along a piece of time.
+
+The load measures the voltage v of its node as v_f, a space vector in the common frame, with a lag:
+
+    tau dv_f/dt = v - v_f,    i = conj(S) v_f / max(|v_f|^2, V_least^2)
+
+so that i = conj(S / v_f) while |v_f| is above V_least, and below it the load is an impedance, as
+the constant-power loads of transmission programs are below 0.7 p.u. For the linear circuit the
+current is a source. In each half of a piece it is held at its value in the middle of that half,
+extrapolated from the beginning of the piece: the error falls with the square of the length of a
+piece. v_f itself follows the parabola through v at the beginning, the middle and the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gfm_plant.circuit import CurrentSource
+from gfm_plant.components.part import Fed, LinearPart, Matrix
+from gfm_plant.layout import field
+from gfm_plant.parameters import Positive
+from gfm_plant.solution import draw, state
+from gfm_runtime.compiled import compiled
+
+_LAG = 5.0  # shortest lag of the measurement, in sampling periods
+
+
+@compiled
+def drawn(S: complex, least_v2: float, f: complex, slope: complex) -> tuple[complex, complex]:
+    """Return the current at a measured voltage f, and its d/dt when that has this slope."""
+    size = f.real * f.real + f.imag * f.imag
+    grow = 2.0 * (f.real * slope.real + f.imag * slope.imag)
+    if size < least_v2:
+        size, grow = least_v2, 0.0
+    by_S, slope_by_S = S.conjugate() * f, S.conjugate() * slope
+    i = complex(by_S.real / size, by_S.imag / size)
+    return i, complex(
+        slope_by_S.real / size - i.real * grow / size, slope_by_S.imag / size - i.imag * grow / size
+    )
+
+
+@compiled
+def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Add the current to the forcing of every mode."""
+    h, v, f = field(n, "half_h")[part], field(now, "w")[one.sees], one.v_f
+    one.v_begin = v
+    slope = complex((v.real - f.real) / one.tau, (v.imag - f.imag) / one.tau)
+    i, di = drawn(one.S, one.least_v2, f, slope)
+    draw(
+        n, now, c, part, one.source,
+        complex(i.real + 0.5 * h * di.real, i.imag + 0.5 * h * di.imag),
+        complex(i.real + 1.5 * h * di.real, i.imag + 1.5 * h * di.imag),
+    )  # fmt: skip
+
+
+@compiled
+def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    one.v_middle = state(n, now, c, one.sees)
+
+
+@compiled
+def _end(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Take the measured voltage on by a piece, at whose end w is."""
+    a = field(n, "lag_weights")[part, one.lag]
+    v, f, v_0, v_1 = field(now, "w")[one.sees], one.v_f, one.v_begin, one.v_middle
+    one.v_f = complex(
+        a[0] * f.real + a[1] * v_0.real + a[2] * v_1.real + a[3] * v.real,
+        a[0] * f.imag + a[1] * v_0.imag + a[2] * v_1.imag + a[3] * v.imag,
+    )
+
+
+@compiled
+def _keep(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    one.v_f_before = one.v_f
+
+
+@compiled
+def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    one.v_f = one.v_f_before
+
+
+class ConstantPowerLoad(Fed):
+    """A load whose control holds P and Q, such as a drive or a charger: it draws the current
+    conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
+    as the filter of such a load is."""
+
+    title: ClassVar = "Load of constant power"
+    symbol: ClassVar = "load"
+    example: ClassVar = {
+        "constant_power": {"x": {"node": "bus", "P": 0.1}},
+        "capacitors": {"c": {"node": "bus", "Q": 0.1}},
+    }
+    more_states: ClassVar = (("v_f", "p.u., a space vector", "the voltage that it has measured"),)
+    is_voltage: ClassVar = False
+    record: ClassVar = np.dtype(
+        [
+            ("source", "i8"), ("sees", "i8"), ("lag", "i8"),
+            ("S", "c16"),  # P + jQ, p.u. of the network
+            ("tau", "f8"),  # s
+            ("least_v2", "f8"),  # the square of V_least
+            ("v_f", "c16"), ("v_f_before", "c16"),  # now, and at the last tick
+            ("v_begin", "c16"), ("v_middle", "c16"),  # the true voltage along a piece
+        ],
+        align=True,
+    )  # fmt: skip
+    hooks: ClassVar = {
+        "keep": _keep, "drive": _draw, "middle": _middle, "end": _end, "go_back": _go_back
+    }  # fmt: skip
+
+    node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
+    P: float = Field(description="active power, p.u. of the first converter; negative: it feeds in")
+    Q: float = Field(0.0, description="reactive power, p.u.")
+    tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
+    V_least: Positive = Field(
+        0.7, description="below this voltage it is an impedance that draws P and Q there, p.u."
+    )
+    closed: bool = Field(True, description="its breaker at the start")
+
+    @property
+    def S(self) -> complex:
+        """P + jQ, p.u."""
+        return complex(self.P, self.Q)
+
+    def elements(self, name: str) -> tuple[CurrentSource]:
+        return (CurrentSource(name, self.node),)
+
+    def label(self) -> str:
+        return f"constant P {self.P:g}, Q {self.Q:g} p.u."
+
+    def lag(self) -> float:
+        return self.tau_s
+
+    def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
+        if self.tau_s < _LAG * T_s:
+            raise ValueError(
+                f"{where}: tau_s = {self.tau_s:g}: must be >= {_LAG * T_s:g} s at this T_s"
+            )
+        record["S"], record["tau"], record["least_v2"] = self.S, self.tau_s, self.V_least**2
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+        if self.node not in banks:
+            raise ValueError(
+                f"node {self.node}: {name} draws constant power, so the node needs a bank of"
+                " network.capacitors"
+            )
+        return banks[self.node]
+
+    def current(self, v: complex, slip: float) -> tuple[complex, complex]:
+        """The measured voltage and the current that it draws at rest, at a voltage v that turns
+        with ``slip``, rad/s, in the common frame."""
+        f = v / complex(1.0, slip * self.tau_s)
+        return f, self.S.conjugate() * f / max(abs(f) ** 2, self.V_least**2)
+
+    def steady(
+        self, v: complex, omega: float, omega_b: float, z: Matrix
+    ) -> tuple[complex, list[float]]:
+        return -self.current(v, omega_b * (omega - 1.0))[1], []
+
+    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+        record["v_f"], i = self.current(v, omega_b * (omega - 1.0))
+        return i
+
+    def admittance(self, V: float, s: Any) -> NDArray[np.complex128]:
+        """The small-signal admittance at a resting voltage that turns at nominal speed: the exact
+        derivative of the equations above.
+
+        Its d axis lies on the voltage. Above V_least the load has the negative conductance -P/V^2
+        there at low frequencies, which ends at 1/tau.
+
+        Args:
+            V: magnitude of the voltage, p.u., > 0.
+            s: Laplace variable, 1/s; any shape.
+
+        Returns:
+            (i_d, i_q) per (v_d, v_q), shape (*s.shape, 2, 2).
+        """
+        if self.V_least < V:
+            J = np.array([[-self.P, self.Q], [self.Q, self.P]]) / V**2
+        else:
+            J = np.array([[self.P, self.Q], [-self.Q, self.P]]) / self.V_least**2
+        return np.multiply.outer(1.0 / (1.0 + np.asarray(s) * self.tau_s), J)
+
+    def linear(
+        self, record: Any, seen: complex, source: complex, slip: float, omega_b: float
+    ) -> LinearPart:
+        f, own = complex(record["v_f"]), complex(-1.0 / self.tau_s, -slip)
+        d = f / abs(f) if f else 1.0 + 0j  # its d axis
+        turn = np.array([[d.real, -d.imag], [d.imag, d.real]])
+        return LinearPart(
+            np.array([[own.real, -own.imag], [own.imag, own.real]]),
+            np.eye(2) / self.tau_s,
+            turn @ self.admittance(abs(f), 0.0).real @ turn.T,
+            np.array([-f.imag, f.real]),
+        )

@@ -1,0 +1,157 @@
+"""What a component of a network declares: the rest of the plant, the linear model, the diagram and
+the documentation read it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_plant.circuit import Element
+from gfm_plant.parameters import Options
+
+Matrix = NDArray[np.float64]
+
+
+class Component(Options):
+    """Base of all components; the options of one are its fields, in p.u. of the first converter."""
+
+    #: of its part of the documentation
+    title: ClassVar[str]
+    #: of the diagram, see ``gfm_hil.results.diagram``
+    symbol: ClassVar[str] = "box"
+    #: tables of a network in which it is named x, for the documentation
+    example: ClassVar[Mapping[str, Any]] = {}
+    #: states beside those of the circuit: name, unit, meaning
+    more_states: ClassVar[Sequence[tuple[str, str, str]]] = ()
+    #: of the recording, besides those that every run has of its converters
+    columns: ClassVar[Sequence[str]] = ()
+    #: how many there can be, besides what is said of the circuit
+    how_many: ClassVar[str] = "any number"
+
+    def elements(self, name: str) -> Sequence[Element]:
+        """What it puts into the circuit; the first one has its name."""
+        return ()
+
+    def label(self) -> str:
+        """Its parameters, for the diagram."""
+        return ""
+
+
+@dataclass(frozen=True)
+class LinearPart:
+    """Small deviations of a component with a source, around its rest.
+
+    It has m states. Currents and voltages are two numbers each, the real and the imaginary part of
+    a space vector in the frame that turns with the component's island.
+
+    Attributes:
+        A: the states by themselves, (m, m), 1/s.
+        by_seen: the states by the current or voltage that it sees, (m, 2), 1/s.
+        source: its source by the states, (2, m).
+        turn: what a turn of all space vectors by 1 rad does to the states, (m,).
+    """
+
+    A: Matrix
+    by_seen: Matrix
+    source: Matrix
+    turn: Matrix
+
+
+class Dynamic(Component):
+    """A component with a record in the compiled plant, which its hooks move on.
+
+    A hook is a compiled function (n, now, one, c, part) of the elements of ``net`` and ``now``, its
+    record, the circuit in force, and which cut of the period a piece belongs to.
+    """
+
+    record: ClassVar[np.dtype[np.void]]
+    #: at_rest, once at the start; keep, before a tick, and go_back, after one that diverged;
+    #: begin of a piece; drive, where sources add to the forcing of the modes; middle and end of the
+    #: piece; tick, after each tick
+    hooks: ClassVar[Mapping[str, Callable[..., None]]]
+
+    def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
+        """Write the parameters to an element of the record.
+
+        Args:
+            where: its table, for messages.
+            T_s: s.
+            omega_b: rad/s.
+
+        Raises:
+            ValueError: it is too fast for T_s.
+        """
+
+    def lag(self) -> float | None:
+        """The time constant of a first-order lag, s, whose weights are ``lag_weights`` at the place
+        ``lag`` of the record; None if it has none."""
+        return None
+
+
+class Fed(Dynamic):
+    """A component with a source of its own: a voltage or a current.
+
+    Its record has ``source``, the place of that among the sources, and ``sees``, the place in w of
+    the state that it sees; that of a voltage has ``E``, its constant size, p.u. A record with
+    ``omega`` and ``leads`` may set the frequency of a network without a grid.
+    """
+
+    #: a voltage behind a branch, whose node is ``emf(name)``, or a current from its node to ground
+    is_voltage: ClassVar[bool]
+    #: of its steady state, besides currents and voltages of the circuit
+    unknowns: ClassVar[int] = 0
+
+    node: str
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+        """The state of w that it sees.
+
+        Args:
+            name: its own.
+            banks: by node the name of a capacitor's voltage there.
+
+        Raises:
+            ValueError: its node has none, and it needs one.
+        """
+        raise NotImplementedError
+
+    def steady(
+        self, v: complex, omega: float, omega_b: float, z: Matrix
+    ) -> tuple[complex, list[float]]:
+        """At rest, the current that it brings to its node, and what must vanish besides.
+
+        Args:
+            v: voltage of its node, p.u.
+            omega: speed of its island, p.u.
+            omega_b: rad/s.
+            z: its unknowns, (unknowns,).
+        """
+        raise NotImplementedError
+
+    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+        """Write the state at rest to its record; returns its source, in the common frame.
+
+        Args:
+            v, omega, omega_b, z: as for ``steady``.
+        """
+        raise NotImplementedError
+
+    def linear(
+        self, record: Any, seen: complex, source: complex, slip: float, omega_b: float
+    ) -> LinearPart:
+        """Small deviations around the rest that its record has.
+
+        Args:
+            seen, source: the current or voltage that it sees, and its source, in the common frame.
+            slip: of its island against the common frame, rad/s.
+        """
+        raise NotImplementedError
+
+
+def emf(name: str) -> str:
+    """The node, and the source, of the voltage of a component."""
+    return f"{name}.emf"

@@ -1,0 +1,207 @@
+"""The memory of a network's circuits: two records, each as long as the scenario needs.
+
+A record begins with scalars, the same for all plants, and goes on with arrays. Compiled functions
+know the scalars alone and reach an array by its name with `field`, so that they are compiled once
+for plants of any size, and a call passes no more than a pointer. Python sees the whole record, with
+every array under its name. Currents and voltages are complex: space vectors in the common frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import from_dtype, types
+from numba.core import cgutils
+from numba.extending import intrinsic as _intrinsic
+from numpy.typing import NDArray
+
+intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
+
+Record = NDArray[np.void]
+_Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
+
+_NET: _Arrays = {
+    "to_grid": (float, ("n_w",)),  # what each state of w brings to the grid, as a current
+    "emf": (float, ("n_s",)),  # p.u.; the constant voltage of a component, at its source's place
+    # one sampling period in stretches, between the instants at which a command begins to act; each
+    # is cut into pieces for Simpson's rule, and each piece in halves. Another cut of each, n_parts
+    # places further on, lets a peak-current limit look at the current
+    "stretch": (float, ("n_parts",)),  # s
+    "pieces": (int, ("n_cuts",)),
+    "half_h": (float, ("n_cuts",)),  # s
+    "age": (int, ("n_parts", "n_converters")),  # place in `u` of the command that acts
+    # of first-order lags over a piece, the sensors of each converter first: weights of the last
+    # value, and of the parabola through the input
+    "lag_weights": (float, ("n_cuts", "n_lags", 4)),
+    # the modes of each circuit
+    "n_modes": (int, ("n_c",)),
+    "rate": (complex, ("n_c", "n_z")),  # 1/s
+    "decay": (complex, ("n_c", "n_cuts", "n_z")),  # in half a piece of each cut
+    "drive": (complex, ("n_c", "n_z", "n_s")),
+    "states": (complex, ("n_c", "n_w", "n_z")),
+    "modes": (complex, ("n_c", "n_z", "n_w")),
+    "unbalanced": (int, ("n_c",)),
+    "mirror": (complex, ("n_c", "n_z")),  # see `circuit.Modes`
+    # of a synchro-check: the voltages of its two sides by w and by the sources
+    "check_w": (float, ("n_c", 2, "n_w")),
+    "check_s": (float, ("n_c", 2, "n_s")),
+}
+_NOW: _Arrays = {
+    # modes, what drives them in the first and in the second half of the present piece, and states
+    "z": (complex, ("n_z",)),
+    "forced": (complex, ("n_z", 2)),
+    # for each cut, each source's gain on the modes at the speed that it had last (inf: not known
+    # yet), and its turn in half a piece
+    "gain": (complex, ("n_cuts", "n_phasors", "n_z")),
+    "gain_omega": (float, ("n_cuts", "n_phasors")),
+    "turn": (complex, ("n_cuts", "n_phasors")),
+    "w": (complex, ("n_w",)),
+    "unit": (complex, ("n_phasors",)),  # the sources' unit phasors, then those of their mirrors
+    "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
+    "w_before": (complex, ("n_w",)),  # at the last tick
+    "unit_before": (complex, ("n_s",)),
+}
+
+
+def _header(scalars: list[tuple[Any, ...]], arrays: _Arrays) -> np.dtype[np.void]:
+    """Scalars, and then the lengths of the arrays and the bytes at which they begin."""
+    lengths = {name for _, shape in arrays.values() for name in shape if isinstance(name, str)}
+    lengths -= {name for name, *_ in scalars}
+    counts = [(name, "i8") for name in (*sorted(lengths), *(f"{name}_at" for name in arrays))]
+    return np.dtype([*scalars, *counts], align=True)
+
+
+net_dtype = _header(
+    [
+        ("omega_b", "f8"),  # rad/s
+        ("T_s", "f8"),
+        ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
+        ("n_converters", "i8"),
+        ("n_states", "i8"),  # of w, without those at its end that the plant does not have
+        # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;
+        # for how long, s
+        ("check_limits", "f8", (3,)),
+        ("check_lasting", "f8"),
+    ],
+    _NET,
+)
+"""Of the parameters of a network.
+
+Circuits come in pairs of one row each without and with the fault: row 0 as the converters are, and
+row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the positive
+and the negative sequence of the grid, then the voltages and the currents of components; in an
+unbalanced circuit their mirror images follow in the same order. Such a circuit has up to two modes
+a state.
+"""
+
+now_dtype = _header(
+    [
+        ("row", "i8"),  # of the circuits, without the fault
+        # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
+        ("closed", "i8"),
+        ("omega_g", "f8"),
+        ("omega_g_slope", "f8"),  # 1/s
+        ("omega_g_to", "f8"),
+        ("omega_g_rate", "f8"),
+        ("V_g", "f8"),
+        ("V_g_to", "f8"),
+        ("V_g_rate", "f8"),
+        ("sag_left", "f8"),  # s until a sag recovers (0: no sag)
+        ("V_g_after", "f8"),  # voltage it recovers to
+        # positive and negative sequence over V_g, and s until they are 1 and 0 again
+        ("sequence", "c16", (2,)),
+        ("unbalance_left", "f8"),
+        ("faulted", "i8"),
+        ("fault_left", "f8"),  # s until the fault is cleared
+        # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
+        # `check_limits`, for how long they have been within, and the time that is left, s; ticks in
+        # a row in which both sides were alive
+        ("check", "i8"),
+        ("check_looks", "i8"),
+        ("check_seen", "f8", (3,)),
+        ("check_lasted", "f8"),
+        ("check_left", "f8"),
+    ],
+    _NOW,
+)
+"""Of the state of a network, values in p.u. and s."""
+
+
+def make_net_and_now(
+    converters: int, states: int, sources: int, parts: int, lags: int
+) -> tuple[Record, Record]:
+    """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
+
+    Args:
+        converters: how many.
+        states: of the circuit, at most.
+        sources: the bridges, two of the grid, and those of components.
+        parts: stretches of the sampling period.
+        lags: first-order lags, one of each converter's sensors included.
+    """
+    lengths = {
+        "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
+        "n_phasors": 2 * sources, "n_c": 2 * (converters + 1), "n_parts": parts,
+        "n_cuts": 2 * parts, "n_lags": lags,
+    }  # fmt: skip
+    return _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
+
+
+def _allocate(header: np.dtype[np.void], arrays: _Arrays, lengths: dict[str, int]) -> Record:
+    fields = dict(header.fields or {})
+    formats, offsets = [f[0] for f in fields.values()], [f[1] for f in fields.values()]
+    places, end = dict[str, int](), header.itemsize
+    for name, (kind, shape) in arrays.items():
+        places[f"{name}_at"] = end = -(-end // 16) * 16
+        formats.append(np.dtype((kind, tuple(lengths.get(str(n), n) for n in shape))))
+        offsets.append(end)
+        end += formats[-1].itemsize
+    whole: Any = {
+        "names": [*fields, *arrays], "formats": formats, "offsets": offsets, "itemsize": end
+    }  # fmt: skip
+    record: Record = np.zeros(1, np.dtype(whole))
+    for name, value in (lengths | places).items():
+        if name in fields:
+            record[name] = value
+    return record
+
+
+def head(record: Record) -> Record:
+    """The same memory as compiled functions see it, shape (1,): its scalars."""
+    header = now_dtype if "w" in (record.dtype.names or ()) else net_dtype
+    return np.ndarray(1, header, record.view(np.uint8))
+
+
+@intrinsic
+def field(typingctx: Any, record: Any, name: Any) -> Any:
+    """Return the array of this name of ``net`` or ``now``, inside compiled functions."""
+    if not isinstance(name, types.StringLiteral):  # numba tries the type without the value too
+        return None
+    kind, dims = {**_NET, **_NOW}[name.literal_value]
+    array = types.Array(from_dtype(np.dtype(kind)), len(dims), "C")
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        base = builder.bitcast(arguments[0], ir.IntType(8).as_pointer())
+        word = ir.IntType(64)
+
+        def scalar(of: str) -> Any:
+            at = builder.gep(base, [word(record.offset(of))])
+            return builder.load(builder.bitcast(at, word.as_pointer()))
+
+        shape = [scalar(n) if isinstance(n, str) else word(n) for n in dims]
+        strides = [word(np.dtype(kind).itemsize)]
+        for length in reversed(shape):
+            strides.insert(0, builder.mul(strides[0], length))
+        size = strides.pop(0)  # bytes of the whole
+        made = context.make_array(array)(context, builder)
+        data = builder.gep(base, [scalar(f"{name.literal_value}_at")])
+        made.data = builder.bitcast(data, made.data.type)
+        made.shape, made.strides = (cgutils.pack_array(builder, v) for v in (shape, strides))
+        made.itemsize = word(np.dtype(kind).itemsize)
+        made.nitems = builder.udiv(size, strides[-1])
+        return made._getvalue()
+
+    return array(record, name), make
