@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Protocol
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import address
-from gfm_hil.links.zeromq.options import beyond_loopback
 from gfm_hil.ports.xcp.slave import MOST, Slave
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ _LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes that a CAN FD frame 
 _HIGHEST_ID = 0x7FF
 
 
-class Line(Protocol):
+class Transport(Protocol):
     """Where a slave listens.
 
     Attributes:
@@ -58,22 +57,11 @@ class Udp:
 
     Args:
         host, port: where to listen; port 0 is any.
-        plain: whether others may reach it.
-
-    Raises:
-        UserError: the address cannot be, is in use, or others reach it though nobody said so.
     """
 
     most = MOST
 
-    def __init__(self, host: str, port: int, plain: bool = False) -> None:
-        if not 0 <= port <= 65535:
-            raise UserError(f"--port {port}: must be 0 (any) to 65535")
-        if not plain and beyond_loopback(f"tcp://{host}:0"):
-            raise UserError(
-                f"--host {host}: goes beyond this machine, and XCP neither encrypts nor asks who "
-                "calls; --plain if it shall"
-            )
+    def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
         self._socket: socket.socket | None = None
 
@@ -91,11 +79,11 @@ class Udp:
         return self._socket
 
     def words(self) -> str:
-        """As ``Line.words``."""
+        """As ``Transport.words``."""
         return f"UDP {address(self._open().getsockname())}"
 
     def if_data(self) -> list[str]:
-        """As ``Line.if_data``."""
+        """As ``Transport.if_data``."""
         return [
             "  /begin XCP_ON_UDP_IP",
             f'    0x0100 {self._port} ADDRESS "{self._host}"',
@@ -103,7 +91,7 @@ class Udp:
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
-        """As ``Line.answer``."""
+        """As ``Transport.answer``."""
         line, until = self._open(), time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and select.select([line], [], [], left)[0]:
             datagram, peer = line.recvfrom(_LARGEST)
@@ -113,7 +101,7 @@ class Udp:
                     line.sendto(said, peer)
 
     def close(self) -> None:
-        """As ``Line.close``."""
+        """As ``Transport.close``."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -156,12 +144,12 @@ class CanFd:
         return self._bus
 
     def words(self) -> str:
-        """As ``Line.words``."""
+        """As ``Transport.words``."""
         self._open()
         return f"CAN FD {self._channel}, {self._theirs:#x} and {self._mine:#x}"
 
     def if_data(self) -> list[str]:
-        """As ``Line.if_data``."""
+        """As ``Transport.if_data``."""
         return [
             "  /begin XCP_ON_CAN",
             "    0x0100",
@@ -176,7 +164,7 @@ class CanFd:
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
-        """As ``Line.answer``."""
+        """As ``Transport.answer``."""
         import can
 
         bus, until = self._open(), time.monotonic() + seconds
@@ -200,13 +188,13 @@ class CanFd:
         )  # fmt: skip
 
     def close(self) -> None:
-        """As ``Line.close``."""
+        """As ``Transport.close``."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
 
 
-def packed(line: Line, timeout_ms: int, commands: Sequence[str]) -> list[str]:
+def packed(line: Transport, timeout_ms: int, commands: Sequence[str]) -> list[str]:
     """The whole section of the A2L file on XCP.
 
     Args:
