@@ -202,8 +202,8 @@ def test_the_client_s_heartbeat_and_ours(device, run):
 
 def test_a_trip_and_the_reset(device, run):
     operator = Operator(run)
-    operator.tell({"type": "grid-phase-jump", "degrees": 170.0})
-    operator.tell({"type": "grid-voltage", "V_g": 0.0})
+    operator.command({"type": "grid-phase-jump", "degrees": 170.0})
+    operator.command({"type": "grid-voltage", "V_g": 0.0})
     wait_for(lambda: read(device, 701, "InvSt") == 6)
     assert read(device, 701, "Alrm") != 0 and read(device, 701, "St") == 0
     assert read(device, VENDOR, "Why") and read(device, 715, "OpCtl") == 0
@@ -371,9 +371,9 @@ def test_a_certificate_is_asked_of_every_client(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--host", "0.0.0.0"], "--host 0.0.0.0: others can reach it"),
-        (["--host", "bench"], "--host 'bench': must be an IP address"),
-        (["--port", "70000"], "--port 70000: must lie in"),
+        (["--host", "0.0.0.0"], "--host 0.0.0.0: goes beyond this machine"),
+        (["--host", "bench"], "--host bench: goes beyond this machine"),
+        (["--port", "70000"], "--port 70000: must be 0 (any) to 65535"),
         (["--heartbeat", "-1"], "--heartbeat -1: must be >= 0"),
         (["--tls", "no", "no", "no"], "--tls no no no: "),
         (["--host", "192.0.2.1", "--anyone-may-command"], "cannot listen there"),

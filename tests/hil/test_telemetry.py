@@ -21,8 +21,8 @@ from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams import BlockReader
 from gfm_hil.ports.streams.blocks import block_dtype, messages
-from gfm_hil.ports.streams.follow import Follower, Rows
-from gfm_hil.ports.streams.publish import Ports, Publisher
+from gfm_hil.ports.streams.follow import Follower, NewRows
+from gfm_hil.ports.streams.publish import Publisher
 from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
 from gfm_hil.recording.parts import RolePart
@@ -182,14 +182,14 @@ def test_samples_of_a_run_in_real_time_tell_misses_and_slack(start, listen, tmp_
         assert told.get(round(tick * 1e-4, 9), np.inf) == pytest.approx(least, abs=1e-3)
 
 
-def rows(first: int, count: int, **columns: np.ndarray) -> Rows:
-    """Rows of a plant in real time without misses, with the given changes."""
+def rows(first: int, count: int, **columns: np.ndarray) -> NewRows:
+    """NewRows of a plant in real time without misses, with the given changes."""
     times = np.zeros((count, len(PLANT_TIMES)), np.int64)
     times[:, 0] = 1_000_000_000 + (first + np.arange(count)) * 100_000
     times[:, 3] = times[:, 0] + 40_000
     for name, values in columns.items():
         times[:, PLANT_TIMES.index(name)] = values
-    return Rows("plant", first, np.ones((count, len(PLANT_COLUMNS))), times)
+    return NewRows("plant", first, np.ones((count, len(PLANT_COLUMNS))), times)
 
 
 def parsed(found: list[list[bytes]]) -> list[dict]:
@@ -289,11 +289,11 @@ def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
 
 
 def test_a_port_that_is_taken_is_named():
-    with Publisher(Ports("127.0.0.1", 0, 0)) as first:
+    with Publisher("127.0.0.1", 0, 0) as first:
         port = int(first.samples.rpartition(":")[2])
         taken = f"--port {port}: tcp://127.0.0.1:{port}: Address already in use"
         with pytest.raises(UserError, match=taken):
-            Publisher(Ports("127.0.0.1", port, 0))
+            Publisher("127.0.0.1", port, 0)
 
 
 @pytest.mark.attack(
@@ -323,7 +323,7 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
         return find(folder, role)
 
     monkeypatch.setattr(RolePart, "open", sometimes)
-    with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
+    with Publisher("127.0.0.1", 0, 0) as publisher:
         sent = publisher.follow(follower, 500.0, stopped)
     assert sent == ticks
     assert "Too many open files" in caplog.text and "a mistake of ours" in caplog.text

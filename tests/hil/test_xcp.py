@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.ports.xcp.lines import CanFd, packed
 from gfm_hil.ports.xcp.memory import Memory
+from gfm_hil.ports.xcp.transports import CanFd, packed
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.recording.log import read_log
 from gfm_runtime import law_file
@@ -343,7 +343,7 @@ def test_it_waits_for_the_command_server_not_for_the_recording_alone(
     def stop(_: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gfm_hil.cli.xcp.time.sleep", stop)
+    monkeypatch.setattr("gfm_hil.ports.port.time.sleep", stop)
     assert main(["xcp", str(tmp_path), "--wait", "--port", "0"]) == 130
 
 
