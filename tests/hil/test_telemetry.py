@@ -235,12 +235,10 @@ def test_large_blocks_are_cut():
     [
         (["nowhere"], "nowhere: no run is going on there; --wait waits for one"),
         (["over"], "over: the run is over, see gfmhil export"),
-        (["x", "--port", "70000"], "--port 70000: must be 0 (any) to 65535"),
         (["x", "--port", "65535"], "--port 65535: has no next one, give --blocks"),
         (["x", "--blocks", "-1"], "--blocks -1: must be 0"),
         (["x", "--rate", "0"], "--rate 0: must lie in [0.1, 1e6] Hz"),
         (["x", "--rate", "nan"], "--rate nan: must lie in"),
-        (["x", "--host", "0.0.0.0"], "--host 0.0.0.0: goes beyond this machine, unencrypted"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, said):
@@ -251,26 +249,6 @@ def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, wo
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
-
-
-@pytest.mark.timeout(300)
-def test_a_run_streams_itself(start, listen, tmp_path):
-    file = tmp_path / "sent.toml"
-    file.write_text(SCENARIO.format(mode="lockstep"), encoding="utf-8")
-    with zmq.Context() as context, context.socket(zmq.REP) as socket:
-        taken = socket.bind_to_random_port("tcp://127.0.0.1")
-        words = ["run", str(file), "--out", "run", "--quiet", "--no-figures", "--stream"]
-        refused = start(*words, str(taken))
-        _, error = refused.communicate(timeout=PATIENCE_S)
-    assert error == f"gfmhil: --stream {taken}: Address already in use\n"
-    assert (refused.returncode, (tmp_path / "run").exists()) == (2, False)
-    run = start(*words, "0")
-    juggler = listen(run.stderr.readline().split()[1].rpartition(":")[2])
-    juggler.receive_until(lambda: juggler.series)
-    run.terminate()
-    _, said = run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 130
-    assert said.endswith(" ticks sent on\n")
 
 
 def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):

@@ -238,8 +238,7 @@ def test_several_packets_of_a_datagram_and_what_is_no_packet(run: MadeUpRun) -> 
 def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> None:
     line = CanFd("virtual", "xcp", [0x123, 0x124])
     one = slave(run, most=line.most)
-    with can.Bus(interface="virtual", channel="xcp", fd=True) as bus:
-        line.words()
+    with can.Bus(interface="virtual", channel="xcp", fd=True) as bus, line:
 
         def ask(packet: bytes, arbitration_id: int = 0x123) -> bytes:
             size = next(n for n in (8, 12, 16, 64) if n >= len(packet))
@@ -262,7 +261,6 @@ def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> Non
         assert ask(short_download(REFERENCES + 8, 0.8))[:1] == b"\xff"
         assert run.told == [{"type": "reference", "P_ref": 0.8}]
         assert ask(b"\xfd", arbitration_id=0x200) == b""  # of others on the bus
-    line.close()
     file = tmp_path / "can.a2l"
     memory = Memory(run, LAWS, False, lambda: 100)
     file.write_text(memory.a2l("bench", packed(line, 1000, ["UPLOAD"])))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import socket
 from pathlib import Path
 from typing import Any
@@ -75,14 +74,17 @@ class XcpPort(Port):
         memory = Memory(
             operator, first["laws"], "limited" in first, lambda: recorded.done("controller")
         )
-        with contextlib.closing(self.line):
-            where = "" if options.a2l else self.line.words()  # opens it, and so knows its port
-            a2l = memory.a2l("bench", packed(self.line, _TIMEOUT_MS, _COMMANDS))
-            if options.a2l is not None:
-                write_text(options.a2l, a2l)
-                return 0
-            slave = Slave(memory, "gfmhil", a2l, options.write, say, most=self.line.most)
-            say(f"XCP on {where}, {'read and write' if options.write else 'read only'}")
+
+        def a2l() -> str:
+            return memory.a2l("bench", packed(self.line, _TIMEOUT_MS, _COMMANDS))
+
+        if options.a2l is not None:
+            write_text(options.a2l, a2l())
+            return 0
+        with self.line:
+            slave = Slave(memory, "gfmhil", a2l(), options.write, say, most=self.line.most)
+            kind = "read and write" if options.write else "read only"
+            say(f"XCP on {self.line.words()}, {kind}")
             while not run.over():
                 self.line.answer(slave, _ANSWER_S)
         return 0
