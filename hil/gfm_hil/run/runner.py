@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.controllers import ExternalController, PilController
+from gfm_hil.controllers import ControllerProtocol, PilController
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
@@ -180,7 +180,7 @@ def run_side(
     endpoints: Mapping[str, str],
     notice: Notice = lambda text: None,
     report: Report | None = None,
-    external: ExternalController | PilController | None = None,
+    external: ControllerProtocol | PilController | None = None,
 ) -> Run | NetworkRun:
     """Run one side alone, whose peer another process or machine runs, and leave a run folder of
     what it recorded, or one for each converter of a network.
@@ -212,7 +212,7 @@ def run_part(
     scenario: Scenario,
     folder: Path,
     endpoints: Mapping[str, str],
-    external: ExternalController | PilController | None,
+    external: ControllerProtocol | PilController | None,
 ) -> None:
     """Run one side in the folder of a run that another process has started and completes."""
     with ExitStack() as stack:

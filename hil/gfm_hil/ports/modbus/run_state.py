@@ -31,7 +31,7 @@ class Slack:
 
 
 @dataclass(frozen=True)
-class View:
+class RunState:
     """The state of a run at one tick.
 
     Attributes:
@@ -73,7 +73,7 @@ class Watcher:
         self._code: tuple[float, ...] = ()
         self._asked = -math.inf
 
-    def look(self) -> View | None:
+    def look(self) -> RunState | None:
         """The newest tick of both sides, or None before there is one."""
         plant, controller = self._run.done("plant"), self._run.done("controller")
         if not (plant and controller):
@@ -87,7 +87,7 @@ class Watcher:
             self._code, self._asked = code, now
         if "active" not in self._said:  # the controller's command server is not open yet
             return None
-        return View(
+        return RunState(
             row=row,
             tick=plant - 1,
             misses=self._run.misses,

@@ -1,4 +1,4 @@
-"""gfmhil tell: set-points, laws and grid events for a run that is going on."""
+"""gfmhil command: set-points, laws and grid events for a run that is going on."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     events = _events(options)
-    operator = Operator(options.folder, through="tell")
+    operator = Operator(options.folder, through="command")
     try:
         for event in events:
-            done = operator.tell(event)
+            done = operator.command(event)
             print(f"{done['label']} at tick {done['tick']}")
         if options.stop:
             operator.stop()

@@ -6,22 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pymodbus.constants import ExcCodes
-
 from gfm_hil.ports.modbus.image import Value
-from gfm_hil.ports.modbus.view import View
-
-
-class Refused(Exception):
-    """A refused request, which changes nothing, with its Modbus exception code."""
-
-    def __init__(self, code: ExcCodes, why: str) -> None:
-        super().__init__(why)
-        self.code = code
+from gfm_hil.ports.modbus.run_state import RunState
 
 
 @dataclass(frozen=True)
-class Plan:
+class Effect:
     """Commands for the run, in order. The device calls ``keep`` once all of them were carried out,
     or ``fail`` if one was refused."""
 
@@ -30,7 +20,7 @@ class Plan:
     fail: Callable[[], None] = lambda: None
 
 
-class Function(Protocol):
+class PointGroup(Protocol):
     """A group of points that clients write together and that have a common meaning.
 
     ``plan`` computes the effect of a write without applying it; it raises ValueError for invalid
@@ -41,12 +31,12 @@ class Function(Protocol):
     def writable(self) -> tuple[str, ...]:
         """Paths of the points that clients may write."""
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         """The effect of writing these values at the device's time ``now``, s."""
 
     def forget(self) -> None:
         """Clear the state, if any: the run was reset, or another operator commands it."""
         return
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
         """The values of its points."""

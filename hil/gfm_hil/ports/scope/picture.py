@@ -38,7 +38,7 @@ _NOW_S = 0.02
 ChannelName = Annotated[str, Field(max_length=40)]
 
 
-class Look(BaseModel):
+class PictureRequest(BaseModel):
     """A page's request for pictures."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -54,34 +54,34 @@ class Look(BaseModel):
     trigger: Trigger | None = None
 
 
-class View:
+class Picture:
     """A page's look at a recording.
 
     Args:
         pyramid: of the recording.
-        look: the request.
+        request: of the page.
         head: ticks done at the request.
 
     Raises:
         ValueError: a channel does not exist, or the trigger is missing.
     """
 
-    def __init__(self, pyramid: Pyramid, look: Look, head: int) -> None:
+    def __init__(self, pyramid: Pyramid, request: PictureRequest, head: int) -> None:
         for name in [
-            *look.channels,
-            *look.watched,
-            *([look.trigger.channel] if look.trigger else []),
+            *request.channels,
+            *request.watched,
+            *([request.trigger.channel] if request.trigger else []),
         ]:
             if name not in pyramid:
                 raise ValueError(f"channel = {name!r}: unknown")
-        self._pyramid, self._look = pyramid, look
-        self._span = max(2, round(look.span / pyramid.record.T_s))
+        self._pyramid, self._request = pyramid, request
+        self._span = max(2, round(request.span / pyramid.record.T_s))
         self._acquisition = None
-        if look.mode == "trigger":
-            if look.trigger is None:
+        if request.mode == "trigger":
+            if request.trigger is None:
                 raise ValueError("trigger: missing")
-            self._acquisition = Acquisition(pyramid, look.trigger, self._span, head)
-        self._width = pyramid.width(self._span, look.bins)
+            self._acquisition = Acquisition(pyramid, request.trigger, self._span, head)
+        self._width = pyramid.width(self._span, request.bins)
         self._now = max(1, round(_NOW_S / pyramid.record.T_s))
         self._sent: tuple[float, ...] = ()
 
@@ -97,9 +97,9 @@ class View:
         if same and self._sent[4:] == (head, doing, live):
             return None
         self._sent = (*what, head, doing, live)
-        names = self._look.channels
+        names = self._request.channels
         numbers = [
-            self._look.id, first * self._width, self._width, 0 if same else bins, len(names),
+            self._request.id, first * self._width, self._width, 0 if same else bins, len(names),
             start, stop, head, edge, doing, self._last("state", head), self._last("law", head),
             self._pyramid.misses(head), self._last("true_trip", head), same, live,
         ]  # fmt: skip
@@ -107,15 +107,15 @@ class View:
         if bins and not same:
             for name in names:
                 parts += self._pyramid.bins(name, first, last, self._width)
-        now = [self._mean(name, head) for name in (*names, *self._look.watched)]
+        now = [self._mean(name, head) for name in (*names, *self._request.watched)]
         return b"".join([*(p.tobytes() for p in parts), np.asarray(now, "<f4").tobytes()])
 
     def _window(self, head: int) -> tuple[float, float, int, int]:
         if self._acquisition is not None:
             start, stop = self._acquisition.window(head)
             return start, stop, self._acquisition.doing, self._acquisition.shown
-        if self._look.mode == "held":
-            at = self._look.start / self._pyramid.record.T_s
+        if self._request.mode == "held":
+            at = self._request.start / self._pyramid.record.T_s
             return at, at + self._span, HELD, -1
         return max(0, head - self._span), max(head, self._span), IDLE, -1
 

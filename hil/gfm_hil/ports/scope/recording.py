@@ -22,7 +22,7 @@ _BEHIND = 2000  # ticks: wait for the side that is behind, up to this lag
 
 
 @dataclass
-class Record:
+class Recording:
     """Rows of a run as columns by name, and what is known about the run.
 
     Attributes:
@@ -109,7 +109,7 @@ def begun(folder: Path) -> bool:
     return (folder / "signals.npz").is_file() or recording(folder)
 
 
-def open_record(folder: Path) -> Record:
+def open_recording(folder: Path) -> Recording:
     """The recording in a run folder.
 
     Raises:
@@ -118,12 +118,13 @@ def open_record(folder: Path) -> Record:
     scenario = read_scenario(folder)
     if (folder / "summary.json").is_file():
         run = Run.load(folder)
-        record = Record(folder, scenario, run.recorded, [_law(label) for label in run.laws], False)
+        laws = [_law(label) for label in run.laws]
+        record = Recording(folder, scenario, run.recorded, laws, live=False)
         record._done = record.capacity = run.ticks
         return record
     if not begun(folder):
         raise UserError(f"{folder}: nothing has been recorded there")
-    return Record(folder, scenario, laws=_laws(scenario))
+    return Recording(folder, scenario, laws=_laws(scenario))
 
 
 def _laws(scenario: Scenario) -> list[Law]:

@@ -1,11 +1,22 @@
-"""The page about streams and files: formats, columns and metrics, from the code."""
+"""The page about ports and files: the registry, formats, columns and metrics, from the code."""
 
 from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
+from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.streams.metrics import METRICS
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.results.export import FORMATS
+
+
+def ports() -> str:
+    """A row a port."""
+    rows = []
+    for name, entry in PORTS.items():
+        made = make_port(name)
+        needs = f"`pip install 'gfmhil[{made.needs[3]}]'`" if made.needs else "–"
+        rows.append((f"`{name}`", entry.text, str(entry.number), f"`{made.opens[0]}`", needs))
+    return markdown(("port", "", "number", "to open it unencrypted", "needs"), rows)
 
 
 def export_formats() -> str:

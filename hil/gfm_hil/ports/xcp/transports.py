@@ -6,16 +6,15 @@ import contextlib
 import select
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Self
+
+import can
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import address
-from gfm_hil.links.zeromq.options import beyond_loopback
 from gfm_hil.ports.xcp.slave import MOST, Slave
-
-if TYPE_CHECKING:
-    import can
 
 CAN_IDS = (0x7F0, 0x7F1)
 """Of the master's frames and of the slave's: the lowest priorities, so that a loop's frames on the
@@ -23,12 +22,11 @@ same bus go first."""
 MOST_CAN = 64
 """Bytes of a frame, and so of a packet; 8 would not hold a command with a number."""
 _LARGEST = 2048  # bytes of a datagram
-_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes that a CAN FD frame can have
 _HIGHEST_ID = 0x7FF
 
 
-class Line(Protocol):
-    """Where a slave listens.
+class Transport(ABC):
+    """Where a slave listens, once it is entered as a context.
 
     Attributes:
         most: bytes of a packet.
@@ -36,66 +34,57 @@ class Line(Protocol):
 
     most: int
 
+    @abstractmethod
+    def __enter__(self) -> Self:
+        """Listen; raises UserError if it cannot be opened."""
+
+    @abstractmethod
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+
+    @abstractmethod
     def words(self) -> str:
         """What it is, for people."""
 
+    @abstractmethod
     def if_data(self) -> list[str]:
         """The lines of the A2L file that tell a tool where to find it."""
 
+    @abstractmethod
     def answer(self, slave: Slave, seconds: float) -> None:
-        """Let the slave answer what comes in that time.
-
-        Raises:
-            UserError: it is gone.
-        """
-
-    def close(self) -> None:
-        """End it."""
+        """Let the slave answer what comes in that time; raises UserError if the bus is gone."""
 
 
-class Udp:
+class Udp(Transport):
     """A UDP port.
 
     Args:
         host, port: where to listen; port 0 is any.
-        plain: whether others may reach it.
-
-    Raises:
-        UserError: the address cannot be, is in use, or others reach it though nobody said so.
     """
 
     most = MOST
 
-    def __init__(self, host: str, port: int, plain: bool = False) -> None:
-        if not 0 <= port <= 65535:
-            raise UserError(f"--port {port}: must be 0 (any) to 65535")
-        if not plain and beyond_loopback(f"tcp://{host}:0"):
-            raise UserError(
-                f"--host {host}: goes beyond this machine, and XCP neither encrypts nor asks who "
-                "calls; --plain if it shall"
-            )
+    def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
-        self._socket: socket.socket | None = None
 
-    def _open(self) -> socket.socket:
-        if self._socket is None:
-            try:
-                found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
-                self._socket = socket.socket(*found[:3])
-                self._socket.bind(found[4])
-            except OSError as problem:
-                self.close()
-                where = f"--host {self._host} --port {self._port}"
-                raise UserError(f"{where}: {problem.strerror}") from None
-            self._port = self._socket.getsockname()[1]
-        return self._socket
+    def __enter__(self) -> Self:
+        try:
+            found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(*found[:3])
+            self._socket.bind(found[4])
+        except OSError as problem:
+            where = f"--host {self._host} --port {self._port}"
+            raise UserError(f"{where}: {problem.strerror}") from None
+        self._port = self._socket.getsockname()[1]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
 
     def words(self) -> str:
-        """As ``Line.words``."""
-        return f"UDP {address(self._open().getsockname())}"
+        return f"UDP {address(self._socket.getsockname())}"
 
     def if_data(self) -> list[str]:
-        """As ``Line.if_data``."""
         return [
             "  /begin XCP_ON_UDP_IP",
             f'    0x0100 {self._port} ADDRESS "{self._host}"',
@@ -103,8 +92,7 @@ class Udp:
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
-        """As ``Line.answer``."""
-        line, until = self._open(), time.monotonic() + seconds
+        line, until = self._socket, time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and select.select([line], [], [], left)[0]:
             datagram, peer = line.recvfrom(_LARGEST)
             said = slave.take(datagram, peer)
@@ -112,14 +100,8 @@ class Udp:
                 with contextlib.suppress(OSError):  # the master is gone
                     line.sendto(said, peer)
 
-    def close(self) -> None:
-        """As ``Line.close``."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
-
-class CanFd:
+class CanFd(Transport):
     """A CAN FD bus of python-can: a frame is a packet, with zeros behind it up to the next length
     that a frame can have.
 
@@ -139,29 +121,25 @@ class CanFd:
             raise UserError(f"--ids {told}: must be two different ones of 0 to {_HIGHEST_ID:#x}")
         self._interface, self._channel = interface, channel
         self._theirs, self._mine = ids
-        self._bus: can.BusABC | None = None
 
-    def _open(self) -> can.BusABC:
-        if self._bus is None:
-            import can
+    def __enter__(self) -> Self:
+        only = [{"can_id": self._theirs, "can_mask": _HIGHEST_ID, "extended": False}]
+        try:
+            self._bus = can.Bus(
+                interface=self._interface, channel=self._channel, fd=True, can_filters=only
+            )
+        except (can.CanError, OSError, ValueError, ImportError, TypeError) as problem:
+            where = f"--can {self._channel} --interface {self._interface}"
+            raise UserError(f"{where}: cannot be opened: {problem}") from None
+        return self
 
-            only = [{"can_id": self._theirs, "can_mask": _HIGHEST_ID, "extended": False}]
-            try:
-                self._bus = can.Bus(
-                    interface=self._interface, channel=self._channel, fd=True, can_filters=only
-                )
-            except (can.CanError, OSError, ValueError, ImportError, TypeError) as problem:
-                where = f"--can {self._channel} --interface {self._interface}"
-                raise UserError(f"{where}: cannot be opened: {problem}") from None
-        return self._bus
+    def __exit__(self, *_: object) -> None:
+        self._bus.shutdown()
 
     def words(self) -> str:
-        """As ``Line.words``."""
-        self._open()
         return f"CAN FD {self._channel}, {self._theirs:#x} and {self._mine:#x}"
 
     def if_data(self) -> list[str]:
-        """As ``Line.if_data``."""
         return [
             "  /begin XCP_ON_CAN",
             "    0x0100",
@@ -176,10 +154,7 @@ class CanFd:
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
-        """As ``Line.answer``."""
-        import can
-
-        bus, until = self._open(), time.monotonic() + seconds
+        bus, until = self._bus, time.monotonic() + seconds
         try:
             while (left := until - time.monotonic()) > 0 and (heard := bus.recv(left)) is not None:
                 if heard.arbitration_id != self._theirs or heard.is_error_frame:
@@ -191,22 +166,14 @@ class CanFd:
             raise UserError(f"--can {self._channel}: the bus is gone: {problem}") from None
 
     def _frame(self, packet: bytes) -> can.Message:
-        import can
-
-        size = next(n for n in _LENGTHS if n >= len(packet))
+        size = can.util.dlc2len(can.util.len2dlc(len(packet)))
         return can.Message(
             arbitration_id=self._mine, is_extended_id=False, is_fd=True, bitrate_switch=True,
             data=packet.ljust(size, b"\0"),
         )  # fmt: skip
 
-    def close(self) -> None:
-        """As ``Line.close``."""
-        if self._bus is not None:
-            self._bus.shutdown()
-            self._bus = None
 
-
-def packed(line: Line, timeout_ms: int, commands: Sequence[str]) -> list[str]:
+def packed(line: Transport, timeout_ms: int, commands: Sequence[str]) -> list[str]:
     """The whole section of the A2L file on XCP.
 
     Args:

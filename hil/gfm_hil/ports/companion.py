@@ -1,4 +1,4 @@
-"""A companion of a run: another gfmhil command, such as the scope, as a process of its own."""
+"""Ports beside a run that this process is about to start: each is a gfmhil command of its own."""
 
 from __future__ import annotations
 
@@ -11,46 +11,56 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.ports import make_port
+from gfm_hil.ports.port import Port
 from gfm_runtime.children import guarded
 
 _GRACE_S = 5.0
+OWN_NUMBER = -1  # the port serves at its own number
 
 
 @contextlib.contextmanager
 def companion(
-    command: str, folder: Path, port: int | None, ready: int = 0, ends_itself: bool = True
-) -> Iterator[subprocess.Popen[str]]:
-    """Start ``gfmhil COMMAND`` for a run folder that does not exist yet.
+    name: str, folder: Path, number: int, in_process: bool
+) -> Iterator[subprocess.Popen[str] | None]:
+    """Start ``gfmhil NAME`` for a run folder that does not exist yet.
 
     Its output goes to stderr, as stdout may carry JSON. It ends with this process, however that
     ends.
 
     Args:
-        command: one that takes a folder, ``--wait`` and ``--port``.
+        name: of the port.
         folder: where the run will be recorded.
-        port: to serve at; the command's own choice if None.
-        ready: how many lines it prints once it serves, which this function waits for; 0 if it
-            prints them only when there is a run.
-        ends_itself: it ends soon after the run; otherwise this function ends it.
+        number: to listen at, or ``OWN_NUMBER``.
+        in_process: the run takes no commands.
+
+    Yields:
+        The process if it stays when the run is over, else None.
 
     Raises:
-        UserError: the port is taken, or the command ended; it has printed why on stderr.
+        UserError: the port is in use, does without a run, or the command ended; it has printed why.
     """
-    if port:
-        _check_free(command, port)
-    argv = [sys.executable, "-P", "-m", "gfm_hil", command, str(folder.absolute()), "--wait"]
-    argv += [] if port is None else ["--port", str(port)]
+    port = make_port(name)
+    port.check_needs()
+    if in_process and port.commands:
+        raise UserError(f"--{name}: a run in process takes no commands; choose --link")
+    if number == OWN_NUMBER and not port.or_any:
+        number = port.number
+    argv = [sys.executable, "-P", "-m", "gfm_hil", name, str(folder.absolute()), "--wait"]
+    if number != OWN_NUMBER:
+        _check_free(port, number)
+        argv += ["--port", str(number)]
     # own session: the first Ctrl-C is for the run
     process = subprocess.Popen(
         guarded(argv), stdout=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        for _ in range(ready):
+        for _ in range(port.early):
             if not _pass_on_line(process):
-                raise UserError(f"--{command}: it ended before the run began")
+                raise UserError(f"--{name}: it ended before the run began")
         threading.Thread(target=_pass_on, args=(process,), daemon=True).start()
-        yield process
-        if ends_itself:
+        yield process if port.stays else None
+        if not port.stays:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(_GRACE_S)
     finally:
@@ -74,11 +84,11 @@ def _pass_on_line(process: subprocess.Popen[str]) -> str:
     return line
 
 
-def _check_free(command: str, port: int) -> None:
-    with socket.socket() as probe:
+def _check_free(port: Port, number: int) -> None:
+    with socket.socket(socket.AF_INET, port.socket) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("127.0.0.1", port))
+            probe.bind(("127.0.0.1", number))
         except (OSError, OverflowError) as problem:
             why = getattr(problem, "strerror", None) or problem
-            raise UserError(f"--{command} {port}: {why}") from None
+            raise UserError(f"--{port.name} {number}: {why}") from None
