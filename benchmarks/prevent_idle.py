@@ -12,6 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from gfm_hil.bench.rounds import in_turn
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario
 
@@ -37,11 +38,10 @@ def measure(links: list[str], seconds: float, rounds: int) -> list[dict[str, obj
     jobs = [(link, way) for link in links for way in WAYS]
     found: dict[tuple[str, str], list[int]] = {job: [] for job in jobs}
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
-        for round_ in range(rounds):
-            for link, way in jobs[:: -1 if round_ % 2 else 1]:
-                print(f"round {round_ + 1} of {rounds}: {link}, {way}", file=sys.stderr)
-                folder = Path(place) / f"{round_}-{link}-{way}"
-                found[link, way].append(misses(link, way, seconds, folder))
+        for number, _, (link, way) in in_turn(jobs, rounds):
+            print(f"round {number + 1} of {rounds}: {link}, {way}", file=sys.stderr)
+            folder = Path(place) / f"{number}-{link}-{way}"
+            found[link, way].append(misses(link, way, seconds, folder))
     ticks = round(seconds * 1e4)
     return [
         {

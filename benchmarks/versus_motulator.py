@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.inproc_loop import Loop
-from gfm_hil.bench.rounds import Spread, ratio, seconds, take_turns
+from gfm_hil.bench.inproc_loop import InprocLoop
+from gfm_hil.bench.rounds import ratios, seconds, spread, spread_text, take_turns
 from gfm_hil.realtime.environment import environment
 
 try:
@@ -92,21 +92,20 @@ def main() -> None:
     duration, rounds = (0.01, 1) if args.quick else (args.duration, args.rounds)
     theirs = Example(duration)
     with tempfile.TemporaryDirectory() as place:
-        loop = Loop("pref_step", args.law, round(duration / T_S), Path(place))
+        loop = InprocLoop("pref_step", args.law, round(duration / T_S), Path(place))
         found = take_turns(
             {"gfmhil": lambda: loop.T_s * 1e9 / loop.whole(), "motulator": theirs.run}, rounds
         )
-    rates = {name: Spread.of(values) for name, values in found.items()}
-    faster = ratio(found["gfmhil"], found["motulator"])
+    faster = ratios(found["gfmhil"], found["motulator"])
     if args.json:
-        result = {name: spread.plain() for name, spread in {**rates, "ratio": faster}.items()}
+        result = {name: spread(each) for name, each in {**found, "ratio": faster}.items()}
         about = {"motulator_p_pu": theirs.p, "remarks": REMARKS, "environment": environment()}
         print(json.dumps(result | about, indent=2))
         return
     print(f"simulated seconds per second: median (min-max) of {rounds} rounds")
-    print(f"  gfmhil, {args.law}: {rates['gfmhil'].text(1)}")
-    print(f"  motulator, its grid-forming example: {rates['motulator'].text(3)}")
-    print(f"{faster.text(0)} times as fast (target {TARGET:g})")
+    print(f"  gfmhil, {args.law}: {spread_text(found['gfmhil'], 1)}")
+    print(f"  motulator, its grid-forming example: {spread_text(found['motulator'], 3)}")
+    print(f"{spread_text(faster, 0)} times as fast (target {TARGET:g})")
     print(*(f"- {remark}" for remark in REMARKS), sep="\n")
 
 

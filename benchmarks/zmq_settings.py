@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import zmq
 
-from gfm_hil.bench.contenders import FRAME, Contender, free_port, memory_folder
+from gfm_hil.bench.contenders import FRAME, free_port, memory_folder, messages
 from gfm_hil.bench.pair import Policy, pair
-from gfm_hil.bench.pingpong import LinkEnd
-from gfm_hil.bench.rounds import Spread, ratio
+from gfm_hil.bench.pingpong import PingPong, over_link
+from gfm_hil.bench.rounds import in_turn, ratios, spread, spread_text
 from gfm_hil.core.roles import Role
 from gfm_hil.core.terminal import markdown
 from gfm_hil.links.zeromq.curve import Curve, write_keys
@@ -58,9 +58,9 @@ class Setting:
     sleeps: bool = False
     keys: Path | None = None
 
-    def open(self, role: Role, payload: int) -> LinkEnd:
+    def open(self, role: Role, payload: int) -> PingPong:
         """One end; the controller's first."""
-        return LinkEnd(_End(self, role), Contender.messages(role, payload))
+        return over_link(_End(self, role), messages(role, payload))
 
 
 class _End:
@@ -134,16 +134,16 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args()
     medians, silent = measure(args.policy, args.rounds, args.seconds)
-    ratios = {name: ratio(found, medians[OWN]) for name, found in medians.items() if found}
+    by_own = {name: ratios(found, medians[OWN]) for name, found in medians.items() if found}
     if args.json:
         plain = {
-            name: {"p50_us": Spread.of(medians[name]).plain(), "ratio": spread.plain()}
-            for name, spread in ratios.items()
+            name: {"p50_us": spread(medians[name]), "ratio": spread(each)}
+            for name, each in by_own.items()
         }
         about = {"policy": args.policy, "silent": silent, "environment": environment()}
         print(json.dumps({"settings": plain, **about}, indent=2))
         return
-    rows = [(n, Spread.of(medians[n]).text(1), spread.text(2)) for n, spread in ratios.items()]
+    rows = [(n, spread_text(medians[n], 1), spread_text(x, 2)) for n, x in by_own.items()]
     print(markdown(("setting", "p50, µs", "ratio"), rows))
     print(*(f"{name}: a side fell silent" for name in silent), sep="\n")
 
@@ -161,13 +161,12 @@ def measure(
             two.round(setting, 0, seconds)  # to compile and to warm up
         medians: dict[str, list[float]] = {setting.name: [] for setting in found}
         silent = set()
-        for round_ in range(rounds):
-            for setting in found[:: -1 if round_ % 2 else 1]:
-                times = two.round(setting, 0, seconds)
-                if len(times):
-                    medians[setting.name].append(float(np.median(times)) * 1e-3)
-                else:
-                    silent.add(setting.name)
+        for _, _, setting in in_turn(found, rounds):
+            times = two.round(setting, 0, seconds)
+            if len(times):
+                medians[setting.name].append(float(np.median(times)) * 1e-3)
+            else:
+                silent.add(setting.name)
     return {n: m for n, m in medians.items() if n not in silent}, sorted(silent)
 
 

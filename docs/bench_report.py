@@ -10,35 +10,21 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from _figures.common import FIGURES, TABLES
 
-from gfm_hil.bench import tables
-from gfm_hil.bench.plots import figures
+from gfm_hil.bench.page import all_tables, badge, figures
 from gfm_hil.bench.result import read_result
+from gfm_hil.results.table import Table
 
 _DRAWN = ("latency", "misses", "jitter", "lockstep")  # the kernel's says no more than its table
-_BADGE = {
-    "cpu": "CPU", "cpus": "CPUs", "kernel": "kernel", "preemption": "preemption",
-    "virtual_machine": "virtual machine", "steal_pct": "% stolen by its host",
-    "sched_fifo": "SCHED_FIFO", "isolated_cpus": "isolated CPUs", "load_average": "load average",
-    "python": "Python", "numba": "numba", "libzmq": "libzmq",
-}  # fmt: skip
 
 
-def markdown(table: tables.Table) -> str:
+def markdown(table: Table) -> str:
     """A table with its heading."""
-    rule = ["---", *["--:"] * (len(table.columns) - 1)]
-    lines = [table.columns, rule, *table.rows]
-    return f"**{table.heading}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def text_of(value: Any) -> str:
-    """A value of the badge as people write it."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    rule = ["---", *["--:"] * (len(table.heads) - 1)]
+    lines = [table.heads, rule, *table.rows]
+    return f"**{table.title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main(folder: Path) -> None:
@@ -47,11 +33,10 @@ def main(folder: Path) -> None:
     if content["bench"] != "all":
         raise SystemExit(f"{folder}: of `gfmhil bench {content['bench']}`, not of `all`")
     parts: dict[str, str] = {}
-    for section, table in tables.tables(content):
+    for section, table in all_tables(content):
         parts[section] = "\n\n".join(filter(None, (parts.get(section), markdown(table))))
     parts["realtime"] = parts.pop("misses")
-    badge = content["environment"]
-    chips = (f"{label} {text_of(badge[key])}" for key, label in _BADGE.items())
+    chips = (f"{label} {text}" for label, text, _ in badge(content["environment"]))
     parts["badge"] = f"{'; '.join(chips)}. Measured in {content['seconds']:g} s."
     parts["caveats"] = "\n".join(f"- {x}" for x in (*content["caveats"], *content["remarks"]))
     for name, text in parts.items():

@@ -18,8 +18,8 @@ from _ext import (
     law_pages,
     modbus_pages,
     outputs,
+    port_pages,
     scenario_pages,
-    stream_pages,
     testing_pages,
 )
 
@@ -55,9 +55,10 @@ MAKERS: dict[str, Callable[..., str]] = {
     "signals": connect_pages.signals,
     "scope-head": testing_pages.scope_head,
     "testing-calls": testing_pages.calls,
-    "export-formats": stream_pages.export_formats,
-    "columns": stream_pages.columns,
-    "metrics": stream_pages.metrics,
+    "export-formats": port_pages.export_formats,
+    "columns": port_pages.columns,
+    "metrics": port_pages.metrics,
+    "ports": port_pages.ports,
 }
 
 

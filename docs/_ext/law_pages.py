@@ -179,7 +179,7 @@ def _law(name: str) -> list[str]:
     file, laws = law_file(name), load_law(name)
     law, home = laws.laws[0], laws.laws[0].home_grid
     ideal, rig = worst_mode(name, False), worst_mode(name, True)
-    lines = [f"(law-{name})=", f"### {name}: {law.title}", "", " ".join(law.source.split()), ""]
+    lines = [f"(law-{name})=", f"#### {name}: {law.title}", "", " ".join(law.source.split()), ""]
     lines += ["$$", matrix(file, "phi"), "$$", ""]
     if file.psi:
         lines += ["On the feedback only:", "", "$$", matrix(file, "psi"), "$$", ""]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.ports.modbus.device import Device
-from gfm_hil.ports.modbus.droops import Gains
-from gfm_hil.ports.modbus.image import Point, definition
-from gfm_hil.ports.modbus.view import Slack, View
+from gfm_hil.ports.modbus.droops import LawDroops
+from gfm_hil.ports.modbus.image import SunSpecPoint, definition
+from gfm_hil.ports.modbus.run_state import RunState, Slack
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario import load_scenario
 from gfm_runtime import law_names
@@ -34,7 +34,7 @@ def registers() -> str:
 
 def droops() -> str:
     """Which laws have the droops that models 711 and 705 speak of."""
-    gains = Gains(law_names())
+    gains = LawDroops(law_names())
     rows = []
     for law in law_names():
         found = gains.droops(law, {})
@@ -48,7 +48,7 @@ _HEAD = ("address", "registers", "point", "type", "unit", "access", "")
 
 def _device() -> Device:
     row = dict.fromkeys((*PLANT_COLUMNS, *CONTROLLER_COLUMNS), 0.0) | _START
-    view = View(row | {"state": float(RUNNING)}, 0, 0, RUNNING, _LAWS[0], {}, "in a word")
+    view = RunState(row | {"state": float(RUNNING)}, 0, 0, RUNNING, _LAWS[0], {}, "in a word")
     device = Device(
         load_scenario("pref_step"), _LAWS, lambda: view, lambda event: None, 5000, lambda: 0.0
     )
@@ -57,13 +57,13 @@ def _device() -> Device:
     return device
 
 
-def _is_there(device: Device, point: Point) -> bool:
+def _is_there(device: Device, point: SunSpecPoint) -> bool:
     """Implemented; some that are have no value before something has happened."""
     later = ("HbLate", "Refd", "MnAlrmInfo")
     return point.name in later or point.type == "pad" or device.image.get(point.path) is not None
 
 
-def _row(device: Device, point: Point) -> tuple[str, ...]:
+def _row(device: Device, point: SunSpecPoint) -> tuple[str, ...]:
     unit = str(point.definition.get("units", "")).replace("%", "% ")
     if point.exponent:
         unit = f"{unit} · 10^{point.exponent}^".strip()

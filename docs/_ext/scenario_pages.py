@@ -18,7 +18,7 @@ from gfm_hil.scenario.events.breaker import SynchroCheck
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
 from gfm_plant.components import COMPONENTS, FiniteGrid
-from gfm_runtime import inner_file, lawfile
+from gfm_runtime import inner, law, lawfile
 
 
 def _table_of(key: str) -> type[BaseModel]:
@@ -52,18 +52,18 @@ OVERLOAD = ("[[plant.protection.overload]]", options.Overload)
 TRIP = ("one protection, e.g. [plant.protection.over_current]", options.Trip)
 LAW_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("top level", lawfile.LawFile),
-    ("[error_map]", lawfile.ErrorMapSpec),
+    ("[error_map]", lawfile.ErrorMap),
     ("[u_0]", lawfile.SetPoints),
-    ("[parameters.NAME]", lawfile.ParameterSpec),
+    ("[parameters.NAME]", law.Parameter),
     ("an element of [phi] or [psi]", lawfile.ElementSpec),
-    ("[limits]", lawfile.LimitsSpec),
-    ("[home_grid]", lawfile.GridSpec),
+    ("[limits]", law.Limits),
+    ("[home_grid]", law.HomeGrid),
     ("[schedule]", lawfile.Schedule),
-    ("one of schedule.stages", lawfile.Stage),
+    ("one of schedule.stages", lawfile.SchedulePoint),
 )
 INNER_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
-    *((f'type = "{kind}"', model) for kind, model in inner_file.MODELS.items()),
-    ("[inner.power]", inner_file.PowerLimiter),
+    *((f'type = "{kind}"', model) for kind, model in inner.STAGES.items()),
+    ("[inner.power]", inner.PowerLimiter),
 )
 
 _BOUNDS = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"))
@@ -91,8 +91,8 @@ def _bounds(field: FieldInfo) -> str:
     metadata = list(field.metadata)
     for argument in get_args(field.annotation) or ():
         metadata += get_args(argument)[1:] if get_origin(argument) is Annotated else ()
-    for inner in list(metadata):
-        metadata += list(getattr(inner, "metadata", []))
+    for one in list(metadata):
+        metadata += list(getattr(one, "metadata", []))
     found = [
         f"{sign} {getattr(m, name):g}"
         for name, sign in _BOUNDS

@@ -6,7 +6,7 @@ import inspect
 import re
 
 from gfm_hil.core.terminal import markdown
-from gfm_hil.ports.scope.view import HEAD
+from gfm_hil.ports.scope.picture import HEAD
 from gfm_hil.testing import Experiment
 from gfm_hil.testing.steps import Steps
 

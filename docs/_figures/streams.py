@@ -1,4 +1,4 @@
-"""The figure of streams.md: a run drawn from its MF4 file alone."""
+"""The figure of ports.md: a run drawn from its MF4 file alone."""
 
 from __future__ import annotations
 

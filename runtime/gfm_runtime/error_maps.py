@@ -31,6 +31,8 @@ ERROR_MAPS = {
     "dvoc": DVOC,
     "hybrid-angle": HYBRID_ANGLE,
 }
+#: maps across a line, which need its R and X
+WITH_IMPEDANCE = ("hybrid-angle",)
 
 V_MIN = 1e-3  # p.u.; a dead bus must not divide by zero
 R_MIN = 2.0**-60  # p.u.^4; shorter vectors have no direction; its square is normal in float32

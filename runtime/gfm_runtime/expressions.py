@@ -6,9 +6,16 @@ import ast
 import math
 import operator
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import ValidationError
 
 from gfm_runtime.errors import LawError, allowed
+from gfm_runtime.mistakes import lines
+from gfm_runtime.toml_file import Table
+
+T = TypeVar("T", bound=Table)
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -23,8 +30,10 @@ _UNARY: dict[type[ast.unaryop], Callable[[float], float]] = {
 }
 
 
-def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) -> float:
+def evaluate(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
     """A number, or an expression of + - * / ** ( ) over ``parameters``.
+
+    Of parameters that are arrays the result is one, and may hold values that are not finite.
 
     Raises:
         LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
@@ -35,14 +44,28 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, float]) ->
         raise LawError(where, "the expression is nested too deeply") from None
     except ArithmeticError as problem:
         raise LawError(where, f"{value!r}: {problem}") from None
-    if isinstance(result, complex) or not math.isfinite(result):
+    if np.ndim(result) == 0 and (isinstance(result, complex) or not math.isfinite(result)):
         raise LawError(where, f"{value!r} gives {result}, not a finite number")
     return result
 
 
-def evaluate_each(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
-    """As ``evaluate`` for parameters that are arrays; the result may hold values not finite."""
-    return _walk(where, _parse(where, value), parameters)
+def evaluated(where: str, table: T, parameters: Mapping[str, float]) -> T:
+    """The table with a number in place of each expression, checked again.
+
+    Raises:
+        LawError: naming ``where`` and the key: as ``evaluate``, and a number that is not allowed.
+    """
+    values = {name: getattr(table, name) for name in table.model_fields_set}
+    for name, value in values.items():
+        if isinstance(value, Table):
+            values[name] = evaluated(f"{where}.{name}", value, parameters)
+        elif type(table).model_fields[name].annotation == float | str:
+            values[name] = evaluate(f"{where}.{name}", value, parameters)
+    try:
+        return type(table)(**values)
+    except ValidationError as problem:
+        texts = lines(problem, type(table))
+        raise LawError(where, *texts, lines=[f"{where}.{text}" for text in texts]) from None
 
 
 def _parse(where: str, value: float | str) -> ast.expr:
@@ -54,7 +77,7 @@ def _parse(where: str, value: float | str) -> ast.expr:
         raise LawError(where, f"{value!r} is no arithmetic expression") from None
 
 
-def _walk(where: str, node: ast.expr, parameters: Mapping[str, float]) -> float:
+def _walk(where: str, node: ast.expr, parameters: Mapping[str, Any]) -> Any:
     match node:
         case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
             return float(number)

@@ -19,12 +19,12 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.inner import (
     INNER_NUMBERS,
     NONE,
-    Inner,
     faded,
     inner_fields,
     inner_state_fields,
     limited,
     measure_frequency,
+    pack_inner,
     shape,
     take_measurements,
 )
@@ -91,9 +91,6 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
     )
 
 
-_NO_INNER = Inner("none")
-
-
 @np.errstate(over="ignore")  # what overflows is refused below
 def pack_law(
     discrete: DiscreteLaw, real: DTypeLike = np.float64, omega_b: float = 100 * math.pi
@@ -121,7 +118,7 @@ def pack_law(
     rec["loop"] = 1.0 / (1.0 - discrete.D_y[1, 2])
     rec["low"], rec["high"] = law.limits.low, law.limits.high
     rec["row"][:n] = discrete.rows
-    (law.inner or _NO_INNER).pack(rec, discrete.T_s, omega_b)
+    pack_inner(law.inner, rec, discrete.T_s, omega_b)
     rec["decay"] = np.exp(-discrete.T_s / law.limits.T_off)
     rec["follow"] = -np.expm1(-discrete.T_s / TREND_TIME)
     for name in ("A", "B_r", "B_y", "C", "D_r", "D_y", "u_0", "W", "E_r", "E_y", "F", "G"):

@@ -12,11 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from pydantic import AfterValidator, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element
 from gfm_runtime.errors import LawError, Mistakes, meant
-from gfm_runtime.inner import Inner
+from gfm_runtime.inner import InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
+from gfm_runtime.toml_file import Table
 
 Cell = tuple[int, int]  # (i, j), zero-based row of u and column of y
 
@@ -26,51 +31,58 @@ def cell_name(matrix: str, cell: Cell) -> str:
     return f"{matrix}_{cell[0] + 1}{cell[1] + 1}"
 
 
-@dataclass(frozen=True)
-class Limits:
-    """The clamps of u and the anti-windup.
-
-    Attributes:
-        low, high: shape (3,), p.u., for (i_u, omega_u, E_u).
-        T_t: tracking time constant of the anti-windup, s: while a row is clamped its slowest
-            state follows the clamped output with this time constant (back-calculation).
-        T_off: time constant with which the offset left by a bumpless change decays, s.
-    """
-
-    low: tuple[float, float, float] = (-5.0, 0.9, 0.0)
-    high: tuple[float, float, float] = (5.0, 1.1, 1.5)
-    T_t: float = 0.02
-    T_off: float = 0.2
-
-    def __post_init__(self) -> None:
-        mistakes = Mistakes()
-        for name, low, high in zip(U_NAMES, self.low, self.high, strict=True):
-            with mistakes.noting():
-                if not low < high:
-                    raise LawError(f"limits.{name}", f"[{low:g}, {high:g}] must be ascending")
-        for name in ("T_t", "T_off"):
-            with mistakes.noting():
-                if not getattr(self, name) > 0.0:
-                    raise LawError(f"limits.{name}", f"{getattr(self, name):g} s must be > 0")
-        mistakes.check()
+def _ascending(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise PydanticCustomError("ascending", "must be [low, high], ascending")
+    return value
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A named number of a law: value, unit and source."""
-
-    value: float
-    unit: str
-    source: str
+Range = Annotated[tuple[float, float], Field(strict=False)]  # [low, high]
+Limit = Annotated[Range, AfterValidator(_ascending), Field(description="[low, high], p.u.")]
 
 
-@dataclass(frozen=True)
-class HomeGrid:
-    """The grid a law's defaults are meant for, as factors on the converter's L_g and R_g."""
+class Limits(Table):
+    """The clamps of u, p.u., and the anti-windup."""
 
-    L_g: float = 1.0
-    R_g: float = 1.0
-    note: str = "the paper's grid"
+    i_u: Limit = (-5.0, 5.0)
+    omega_u: Limit = (0.9, 1.1)
+    E_u: Limit = (0.0, 1.5)
+    # while a row is clamped its slowest state follows the clamped output (back-calculation)
+    T_t: float = Field(0.02, gt=0, description="tracking time constant of the anti-windup, s")
+    T_off: float = Field(0.2, gt=0, description="decay of the offset left by a change of law, s")
+
+    @property
+    def low(self) -> tuple[float, float, float]:
+        """Of (i_u, omega_u, E_u), p.u."""
+        return self.i_u[0], self.omega_u[0], self.E_u[0]
+
+    @property
+    def high(self) -> tuple[float, float, float]:
+        """Of (i_u, omega_u, E_u), p.u."""
+        return self.i_u[1], self.omega_u[1], self.E_u[1]
+
+
+class Parameter(Table):
+    """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
+
+    # of a file with a base, what the base says of the number may be missing here
+    model_config = ConfigDict(json_schema_extra=lambda schema: schema.pop("required"))
+
+    value: float = Field(allow_inf_nan=False, description="the number, in its unit")
+    unit: str = Field("", description="e.g. p.u. or 1/s")
+    source: str = Field("", description="where the number comes from")
+    free: Range | None = Field(None, description="[low, high] within which a synthesis may move it")
+    tied: str | None = Field(
+        None, description="expression that it follows while a synthesis moves others"
+    )
+
+
+class HomeGrid(Table):
+    """The grid the defaults are meant for, as factors on the converter's L_g and R_g."""
+
+    L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
+    R_g: float = Field(1.0, ge=0, description="factor on the converter's line resistor")
+    note: str = Field("the paper's grid", description="for people")
 
 
 @dataclass(frozen=True)
@@ -99,10 +111,10 @@ class Law:
     u_0: tuple[float | str, float | str, float | str] = (0.0, 1.0, 1.0)
     error_map: str = "linear"
     error_parameters: tuple[float, ...] = ()
-    limits: Limits = Limits()
+    limits: Limits = field(default_factory=Limits)
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    home_grid: HomeGrid = HomeGrid()
-    inner: Inner | None = None
+    home_grid: HomeGrid = field(default_factory=HomeGrid)
+    inner: InnerStage | None = None
 
     def __post_init__(self) -> None:
         mistakes = Mistakes()

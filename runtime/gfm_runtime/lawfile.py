@@ -1,7 +1,7 @@
 """Law files: a law element by element in TOML, with every number named and its source stated.
 
 The catalogue (``gfm_runtime/laws/*.toml``) and a user's own laws pass through the same loader
-and the same checks. ``docs/law-files.md`` shows one line by line.
+and the same checks. ``docs/laws.md`` shows one line by line.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 
 from gfm_runtime import elements
 from gfm_runtime.elements import Element
-from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE
+from gfm_runtime.error_maps import ERROR_MAPS, WITH_IMPEDANCE
 from gfm_runtime.errors import LawError, Mistakes, allowed, meant
-from gfm_runtime.expressions import evaluate
-from gfm_runtime.inner_file import InnerSpec, build_inner, named_inner
+from gfm_runtime.expressions import evaluate, evaluated
+from gfm_runtime.inner import Inner
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
-from gfm_runtime.signals import U_NAMES
-from gfm_runtime.toml_file import Number, Table, parse_toml, read_text, read_toml
+from gfm_runtime.toml_file import Number, NumberOrName, Table, parse_toml, read_text, read_toml
 
 
 def _listed(value: Any) -> Any:
@@ -35,13 +35,12 @@ def _stage(value: Any) -> Any:
 
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class ElementSpec(Table):
     """One factor: its type and its numbers (T, T_f in s)."""
 
-    type: Literal["P", "I", "D", "PI", "PD", "IF", "O"] = Field(description="type of element")
+    type: elements.Kind = Field(description="type of element")
     k: Number | None = Field(None, description="gain")
     k_i: Number | None = Field(None, description="integral gain, 1/s")
     T: Number | None = Field(None, description="time constant, s")
@@ -57,70 +56,35 @@ Factors = Annotated[
 ]
 
 
-class ParameterSpec(Table):
-    """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
-
-    # of a file with a base, what the base says of the number may be missing here
-    model_config = ConfigDict(json_schema_extra=lambda schema: schema.pop("required"))
-
-    value: float = Field(allow_inf_nan=False, description="the number, in its unit")
-    unit: str = Field("", description="e.g. p.u. or 1/s")
-    source: str = Field("", description="where the number comes from")
-    free: Range | None = Field(None, description="[low, high] within which a synthesis may move it")
-    tied: str | None = Field(
-        None, description="expression that it follows while a synthesis moves others"
-    )
-
-
 def _valued(value: Any) -> Any:
     bare = isinstance(value, int | float) and not isinstance(value, bool)
     return {"value": value} if bare else value
 
 
 # a number alone may stand for the table
-Named = Annotated[
-    ParameterSpec, BeforeValidator(_valued, json_schema_input_type=ParameterSpec | float)
-]
+Named = Annotated[Parameter, BeforeValidator(_valued, json_schema_input_type=Parameter | float)]
 
 
-class ErrorMapSpec(Table):
-    """The errors on which Phi(s) acts; R and X (p.u.) only for hybrid-angle."""
+class ErrorMap(Table):
+    """The errors on which Phi(s) acts; R and X (p.u.) of the line where the map needs them."""
 
-    type: str = Field("linear", description="linear, dc-energy, dvoc or hybrid-angle")
-    R: Number | None = Field(None, description="resistance of the line, p.u.; hybrid-angle only")
-    X: Number | None = Field(None, description="reactance of the line, p.u.; hybrid-angle only")
+    type: str = Field("linear", description=", ".join(ERROR_MAPS))
+    R: Number | None = Field(None, description=f"line's, p.u.; {', '.join(WITH_IMPEDANCE)} only")
+    X: Number | None = Field(None, description=f"line's, p.u.; {', '.join(WITH_IMPEDANCE)} only")
 
 
 class SetPoints(Table):
     """u_0: numbers (p.u.) or names of references."""
 
-    i_u: Number = Field(0.0, description="p.u., or the name of a reference")
-    omega_u: Number = Field(1.0, description="p.u., or the name of a reference")
-    E_u: Number = Field("V_ref", description="p.u., or the name of a reference")
+    i_u: NumberOrName = Field(0.0, description="p.u., or the name of a reference")
+    omega_u: NumberOrName = Field(1.0, description="p.u., or the name of a reference")
+    E_u: NumberOrName = Field("V_ref", description="p.u., or the name of a reference")
 
 
-class LimitsSpec(Table):
-    """Clamps of u in p.u., times in s."""
+class SchedulePoint(Table):
+    """Gains of a schedule, in force up to the reactance X (p.u.)."""
 
-    i_u: Range = Field(default_factory=lambda: [-5.0, 5.0], description="[low, high], p.u.")
-    omega_u: Range = Field(default_factory=lambda: [0.9, 1.1], description="[low, high], p.u.")
-    E_u: Range = Field(default_factory=lambda: [0.0, 1.5], description="[low, high], p.u.")
-    T_t: float = Field(0.02, description="tracking time constant of the anti-windup, s")
-    T_off: float = Field(0.2, description="decay of the offset left by a change of law, s")
-
-
-class GridSpec(Table):
-    """The grid the defaults are meant for, as factors on the converter's."""
-
-    L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
-    R_g: float = Field(1.0, ge=0, description="factor on the converter's line resistor")
-    note: str = Field("the paper's grid", description="for people")
-
-
-class Stage(Table):
-    """One stage of a gain-scheduled law, in force up to the reactance X (p.u.)."""
-
-    X: float = Field(gt=0, description="upper end of the stage, p.u.; the last one has no end")
+    X: float = Field(gt=0, description="up to which reactance, p.u.; the last one has no end")
     parameters: dict[str, float] = Field(
         default_factory=dict, description="values that differ from [parameters]"
     )
@@ -129,7 +93,7 @@ class Stage(Table):
 class Schedule(Table):
     """Gains as a function of the estimated grid reactance."""
 
-    stages: Annotated[list[Stage], Field(min_length=2, max_length=8)] = Field(
+    stages: Annotated[list[SchedulePoint], Field(min_length=2, max_length=8)] = Field(
         description="two to eight"
     )
     hysteresis: float = Field(0.15, ge=0, lt=1, description="relative, on every boundary")
@@ -163,7 +127,7 @@ class LawFile(Table):
     )
     title: str = Field(description="for people")
     source: str = Field(description="where the law and its numbers come from")
-    error_map: ErrorMapSpec = Field(ErrorMapSpec(), description="what Φ acts on")
+    error_map: ErrorMap = Field(ErrorMap(), description="what Φ acts on")
     u_0: SetPoints = Field(SetPoints(), description="set-points of u")
     parameters: dict[Name, Named] = Field(
         default_factory=dict, description="named numbers for the expressions"
@@ -175,10 +139,10 @@ class LawFile(Table):
         default_factory=dict,
         description="the terms in braces of Table II, by cell: on the feedback only",
     )
-    limits: LimitsSpec = Field(LimitsSpec(), description="clamps of u, anti-windup")
-    home_grid: GridSpec = Field(GridSpec(), description="where the defaults are meant to be used")
+    limits: Limits = Field(Limits(), description="clamps of u, anti-windup")
+    home_grid: HomeGrid = Field(HomeGrid(), description="where the defaults are meant to be used")
     inner: Annotated[
-        InnerSpec | None, BeforeValidator(_stage, json_schema_input_type=InnerSpec | str | None)
+        Inner | None, BeforeValidator(_stage, json_schema_input_type=Inner | str | None)
     ] = Field(
         None,
         description="the inner stage between the law and the bridge: a table, or the name of a "
@@ -189,45 +153,20 @@ class LawFile(Table):
     )
 
 
-_NUMBERS = {
-    "P": ({"k"}, {"k"}),
-    "I": ({"T"}, {"k_i"}),
-    "D": ({"T"}, {"T"}),
-    "PI": ({"k", "T"}, {"k", "k_i"}),
-    "PD": ({"k", "T"}, {"k", "T"}),
-    "IF": ({"k", "T"}, {"k", "T"}),
-    "O": ({"k", "T", "xi"}, {"k", "T", "xi"}),
-}
-
-
-def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, float]) -> Element:
-    """One factor with its numbers evaluated.
+def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> Element:
+    """One factor with its numbers evaluated; the parameters may be arrays.
 
     Raises:
         LawError: naming the cell, the number and what is allowed.
     """
-    given = {k: v for k, v in spec.model_dump(exclude={"type", "T_f"}).items() if v is not None}
-    if set(given) not in _NUMBERS[spec.type]:
-        forms = " or ".join(sorted({str(sorted(form)) for form in _NUMBERS[spec.type]}))
-        raise LawError(where, f"{spec.type} takes {forms}, not {sorted(given)}")
-    numbers = {k: evaluate(f"{where}.{k}", v, parameters) for k, v in given.items()}
-    if "k_i" in numbers:  # k + k_i/s, the form the paper prints its gains in
-        integral = _made(f"{where}.k_i", "P", k=numbers["k_i"]) * elements.I(1.0)
-        element = _made(where, "P", k=numbers.get("k", 0.0)) + integral
-    else:
-        element = _made(where, spec.type, **numbers)
-    if spec.T_f is not None:
-        T_f = evaluate(f"{where}.T_f", spec.T_f, parameters)
-        element = element * _made(f"{where}.T_f", "IF", k=1.0, T=T_f)
-    return element
+    numbers = element_numbers(where, spec, parameters)
+    return elements.make(where, spec.type, numbers)
 
 
-def _made(where: str, kind: str, **numbers: float) -> Element:
-    try:
-        made: Element = getattr(elements, kind)(**numbers)
-    except LawError as problem:
-        raise LawError(f"{where}, {kind}", problem.why) from None
-    return made
+def element_numbers(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of a factor by name, its expressions evaluated."""
+    given = spec.model_dump(exclude={"type"}, exclude_none=True)
+    return {name: evaluate(f"{where}.{name}", value, parameters) for name, value in given.items()}
 
 
 def _cells(
@@ -256,9 +195,9 @@ def _error_map(file: LawFile, numbers: Mapping[str, float]) -> tuple[str, tuple[
         known = f"use one of {sorted(ERROR_MAPS)}{meant(code, ERROR_MAPS)}"
         raise LawError("error_map.type", f"{code!r} is unknown; {known}")
     impedance = (file.error_map.R, file.error_map.X)
-    needs = ERROR_MAPS[code] == HYBRID_ANGLE
+    needs = code in WITH_IMPEDANCE
     if needs != (None not in impedance) or (not needs and impedance != (None, None)):
-        raise LawError("error_map", "R and X belong to hybrid-angle, which needs both")
+        raise LawError("error_map", f"R and X belong to {WITH_IMPEDANCE}, which need both")
     values = tuple(
         evaluate(f"error_map.{n}", v, numbers)
         for n, v in zip("RX", impedance, strict=True)
@@ -282,8 +221,8 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
             raise LawError(f"parameter {name}", f"unknown to {file.name}; {known}")
         numbers[name] = value
     parameters = {
-        name: Parameter(numbers[name], spec.unit, spec.source)
-        for name, spec in file.parameters.items()
+        name: one.model_copy(update={"value": numbers[name]})
+        for name, one in file.parameters.items()
     }
     mistakes = Mistakes()
     code, error_parameters = "linear", tuple[float, ...]()
@@ -293,13 +232,9 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
         _cells(name, cells, numbers, mistakes)
         for name, cells in (("phi", file.phi), ("psi", file.psi))
     )
-    limits = Limits()
-    with mistakes.noting():
-        low, high = zip(*(getattr(file.limits, name) for name in U_NAMES), strict=True)
-        limits = Limits(low, high, file.limits.T_t, file.limits.T_off)
     inner = None
     with mistakes.noting():
-        inner = None if file.inner is None else build_inner(file.inner, numbers)
+        inner = None if file.inner is None else evaluated("inner", file.inner, numbers)
     law = None
     with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
         law = Law(
@@ -311,9 +246,9 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
             u_0=(file.u_0.i_u, file.u_0.omega_u, file.u_0.E_u),
             error_map=code,
             error_parameters=error_parameters,
-            limits=limits,
+            limits=file.limits,
             parameters=parameters,
-            home_grid=HomeGrid(**file.home_grid.model_dump()),
+            home_grid=file.home_grid,
             inner=inner,
         )
     mistakes.check()

@@ -16,7 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.elements import INTEGRATOR, Polynomial, over, poly_add, poly_mul, union
+from gfm_runtime.elements import (
+    INTEGRATOR,
+    Element,
+    Polynomial,
+    over,
+    poly_add,
+    poly_mul,
+    union,
+)
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import Law, cell_name
 from gfm_runtime.signals import NU, NY, REF_NAMES
@@ -81,9 +89,9 @@ def realise(law: Law) -> LawStateSpace:
 def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
     """The state space of a law, or of several on a leading axis, from its three rows.
 
-    ``rows`` are as ``observer_form`` gives them, ``u_0`` as a ``Law`` has it.
+    ``rows`` are as ``row_of`` gives them, ``u_0`` as a ``Law`` has it.
     """
-    many = rows[0].A.shape[:-2]
+    many = np.broadcast_shapes(*(row.A.shape[:-2] for row in rows))
     of_row = [i for i, row in enumerate(rows) for _ in range(row.A.shape[-1])]
     n = len(of_row)
     A, C = np.zeros((*many, n, n)), np.zeros((*many, NU, n))
@@ -125,25 +133,38 @@ def _check_series(law: Law) -> None:
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
 def _row(law: Law, i: int) -> Row:
     """Observer form of row i."""
-    phi = [law.element("phi", (i, j)) for j in range(NY)]
-    psi = [law.element("psi", (i, j)) for j in range(NY)]
+    phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
+    row = row_of(phi, psi)
+    if not all(np.isfinite(part).all() for part in row):
+        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
+    return row
+
+
+def row_of(phi: Sequence[Element], psi: Sequence[Element], smooth: bool = False) -> Row:
+    """Observer form of a row by its elements, five each; those of N laws give N rows.
+
+    The states are scaled by powers of two, which is exact; or, if ``smooth``, so that the matrices
+    are smooth in the elements' numbers.
+    """
     den = union([e.den for e in (*phi, *psi)])
     d: Polynomial = (1.0,)
     for factor in den:
         d = poly_mul(d, [c / factor[-1] for c in factor])
-    on_r, on_y = np.zeros((NY, len(d))), np.zeros((NY, len(d)))
     lead = math.prod(f[-1] for f in den)
-    for j in range(NY):
-        on_error, feedback = over(phi[j], den), over(psi[j], den)
-        on_measured = poly_add([-c for c in on_error], [-c for c in feedback])
-        on_r[j, : len(on_error)] = np.asarray(on_error) / lead
-        on_y[j, : len(on_measured)] = np.asarray(on_measured) / lead
-    monic = np.asarray(d)
-    T: Matrix = np.exp2(np.round(np.log2(powers(monic))))  # exact powers of two; the first is 1
-    row = observer_form(monic, on_r, on_y, T)
-    if not all(np.isfinite(part).all() for part in row):
-        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
-    return row
+    errors, feedbacks = ([over(e, den) for e in elements] for elements in (phi, psi))
+    measured = [
+        poly_add([-c for c in error], [-c for c in feedback])
+        for error, feedback in zip(errors, feedbacks, strict=True)
+    ]
+    shape = np.broadcast_shapes(*(np.shape(c) for p in (d, *errors, *measured) for c in p))
+    monic = np.stack([np.broadcast_to(c, shape) for c in d], axis=-1)
+    on_r, on_y = np.zeros((2, *shape, NY, len(d)))
+    for numerators, on in ((errors, on_r), (measured, on_y)):
+        for j, numerator in enumerate(numerators):
+            for k, c in enumerate(numerator):
+                on[..., j, k] = c / lead
+    T: Matrix = powers(monic)
+    return observer_form(monic, on_r, on_y, T if smooth else np.exp2(np.round(np.log2(T))))
 
 
 def observer_form(d: Matrix, on_r: Matrix, on_y: Matrix, T: Matrix) -> Row:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, PlainValidator
 from pydantic_core import PydanticCustomError
@@ -35,8 +35,31 @@ def _number(value: Any) -> float | str:
     raise PydanticCustomError("number", "must be a number or an expression over the parameters")
 
 
-# a number or an expression over the law's parameters; one union would give two errors a mistake
-Number = Annotated[float | str, PlainValidator(_number, json_schema_input_type=float | str)]
+def _positive(value: Any) -> float | str:
+    number = _number(value)
+    if not isinstance(number, str) and not number > 0.0:
+        raise PydanticCustomError("positive", "must be > 0")
+    return number
+
+
+def _not_negative(value: Any) -> float | str:
+    number = _number(value)
+    if not isinstance(number, str) and not number >= 0.0:
+        raise PydanticCustomError("not_negative", "must be >= 0")
+    return number
+
+
+# A number or an expression over the law's parameters: a float once the expressions are
+# ``evaluated``. One validator, because a union would give two errors a mistake.
+if TYPE_CHECKING:
+    Number = float
+    NumberOrName = float | str
+    Positive = float
+    NotNegative = float
+else:
+    Number = NumberOrName = Annotated[float | str, PlainValidator(_number, float | str)]
+    Positive = Annotated[float | str, PlainValidator(_positive, float | str)]
+    NotNegative = Annotated[float | str, PlainValidator(_not_negative, float | str)]
 
 
 def read_toml(path: str | Path, links: bool = True) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +25,13 @@ from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
 from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import Inner
+from gfm_runtime.inner import (
+    Cascaded,
+    InnerStage,
+    PowerLimiter,
+    ThresholdImpedance,
+    VirtualStator,
+)
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER
@@ -39,12 +46,16 @@ SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance")
 #: every block of the stage once with and once without its states
 STAGES = {
     **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},
-    "stator with integral and PLL": Inner(k_ci=20.0, f_pll=15.0),
-    "voltage loop without integral": Inner("cascaded", k_vi=0.0, k_ci=10.0, f_pll=30.0),
+    "stator with integral and PLL": VirtualStator(k_ci=20.0, f_pll=15.0),
+    "voltage loop without integral": Cascaded(k_vi=0.0, k_ci=10.0, f_pll=30.0),
 }
 
 
-def loop_of(stage: Inner | None, law: str = "vsg-2", **plant: Any) -> ClosedLoop:
+def upto(P_max: float) -> PowerLimiter:
+    return PowerLimiter(P_max=P_max, P_min=-math.inf)
+
+
+def loop_of(stage: InnerStage | None, law: str = "vsg-2", **plant: Any) -> ClosedLoop:
     options = Plant.model_validate({**PLANT, **plant})
     return ClosedLoop.of(replace(get_law(law), inner=stage), options)
 
@@ -239,23 +250,26 @@ def test_many_loops_with_stages_are_each_of_them() -> None:
 @pytest.mark.parametrize(
     ("stage", "references", "said"),
     [
-        (Inner(I_max=0.4), {}, "inner.I_max: 0.4 p.u.: this operating point needs"),
-        (Inner(P_max=0.3), {}, "the power limiter acts: p is 0.5 p.u., not in"),
-        (Inner("threshold-impedance", I_thr=0.3), {}, "the threshold impedance acts"),
-        (Inner(m=0.9), {}, "the limit of modulation acts"),
+        (VirtualStator(I_max=0.4), {}, "inner.I_max: 0.4 p.u.: this operating point needs"),
+        (VirtualStator(power=upto(0.3)), {}, "the power limiter acts: p is 0.5 p.u., not in"),
+        (ThresholdImpedance(I_thr=0.3), {}, "the threshold impedance acts"),
+        (VirtualStator(m=0.9), {}, "the limit of modulation acts"),
     ],
 )
-def test_a_limit_that_acts_is_named(stage: Inner, references: Any, said: str) -> None:
+def test_a_limit_that_acts_is_named(stage: InnerStage, references: Any, said: str) -> None:
     with pytest.raises(NoEquilibrium, match=said):
         loop_of(stage)
 
 
 def test_a_continuous_loop_has_no_stage() -> None:
-    law = replace(get_law("vsg-2"), inner=Inner())
+    law = replace(get_law("vsg-2"), inner=VirtualStator())
     with pytest.raises(LawError, match="inner: runs from tick to tick"):
         ClosedLoop.of(law, ideal=True)
     op = loop_of(None).made_of.op
-    bare, stage = ClosedLoop.of("vsg-2", ideal=True), linearise_stage(Inner(), T_S, 314.0, op)
+    bare, stage = (
+        ClosedLoop.of("vsg-2", ideal=True),
+        linearise_stage(VirtualStator(), T_S, 314.0, op),
+    )
     with pytest.raises(ValueError, match="a continuous loop has none"):
         ClosedLoop(bare.plant, bare.law, stage=stage)
 
@@ -263,8 +277,10 @@ def test_a_continuous_loop_has_no_stage() -> None:
 def test_an_operating_point_at_the_power_limit_is_below_it() -> None:
     # the shipped stages limit p to 1 p.u., which is rated power
     point = Point(P_ref=1.0, delay=1.3)
-    law = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner(P_max=1.0)), T_S)
-    free = discretise(replace(get_law("mimo-gfm-practical"), inner=Inner()), T_S)
+    law = discretise(
+        replace(get_law("mimo-gfm-practical"), inner=VirtualStator(power=upto(1.0))), T_S
+    )
+    free = discretise(replace(get_law("mimo-gfm-practical"), inner=VirtualStator()), T_S)
     np.testing.assert_array_equal(point.loop(law).A, point.loop(free).A)
 
 

@@ -57,7 +57,7 @@ def test_example_scenario_completes(example_run: Run) -> None:
 def test_modes_of_the_example_law_are_looked_at_as_the_page_says(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "own-law.md").read_text("utf-8"), re.S)
+    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "laws.md").read_text("utf-8"), re.S)
     monkeypatch.chdir(DOCS.parent)
     exec(program, {})
     rates = [float(line.split()[0]) for line in capsys.readouterr().out.splitlines()]

@@ -18,7 +18,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.runner import run_scenario
@@ -308,7 +308,7 @@ def _look_back(folder: Path) -> None:
     """Run everything that reads a finished run."""
     command("export", str(folder), "--format", "csv", "-o", str(folder.parent / "out.csv"))
     with contextlib.suppress(UserError):
-        record = open_record(folder)
+        record = open_recording(folder)
         assert record.done() >= 0 and record.f_b > 0
         record.events()
         record.ended()
@@ -316,9 +316,9 @@ def _look_back(folder: Path) -> None:
 
 def _look_on(folder: Path) -> None:
     """Run everything that reads a run in progress."""
-    command("tell", str(folder))
+    command("command", str(folder))
     with contextlib.suppress(UserError):
-        record = open_record(folder)
+        record = open_recording(folder)
         assert record.done() >= 0 and record.f_b > 0
         record.events()
         record.look_up_laws()

@@ -29,7 +29,7 @@ from gfm_hil.ports.modbus.connection import Server
 from gfm_hil.ports.modbus.image import BASE, VENDOR
 from gfm_hil.ports.scope import server as scope_server
 from gfm_hil.ports.scope.access import Access
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario
 
@@ -169,7 +169,7 @@ def _scope(place: Path) -> Iterator[Take]:
     run = {"title": "f", "duration": 0.1, "law": "vsg-2", "link": {"type": "inproc"}}
     done = run_scenario(check_scenario(run, ""), place / "run")
     access, served, ports = Access(), Served(), list[int]()
-    scope = scope_server.Scope(open_record(done.folder), access)
+    scope = scope_server.Scope(open_recording(done.folder), access)
     pace, scope_server.FRAMES_PER_S = scope_server.FRAMES_PER_S, 500
     task = asyncio.run_coroutine_threadsafe(
         scope.serve("127.0.0.1", [0], None, ports.append), served.loop
@@ -210,7 +210,7 @@ LOOKS = (
     {"kind": "look", "id": 5, "channels": ["p"], "bins": 4096, "mode": "trigger", "span": 0.01,
      "trigger": {"channel": "p", "level": 0.5, "edge": "rising", "mode": "auto", "before": 0.2}},
     {"kind": "play", "start": 0.02, "speed": 0.1},
-    {"kind": "tell", "id": 7, "event": {"type": "reference", "P_ref": 0.6}},
+    {"kind": "command", "id": 7, "event": {"type": "reference", "P_ref": 0.6}},
     {"kind": "hello", "token": "@token@"},
 )  # fmt: skip
 

@@ -156,6 +156,6 @@ def test_every_miss_has_one_cause_and_is_in_one_burst(ticks: set[int]) -> None:
     timing = good()
     timing["plant_received"][sorted(ticks)] = -1
     assert sum(counts(attribute(timing, T)).values()) == len(ticks)
-    lengths = bursts(missed_ticks(timing))
+    lengths = dict(bursts([missed_ticks(timing)]))
     assert sum(n * c for n, c in lengths.items()) == len(ticks)
     assert sum(lengths.values()) == len(ticks - {k + 1 for k in ticks})

@@ -13,10 +13,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.bench.histogram import summary
-from gfm_hil.bench.page import write_page
-from gfm_hil.bench.plots import figures
-from gfm_hil.bench.rounds import Spread
-from gfm_hil.bench.tables import tables
+from gfm_hil.bench.page import all_tables, figures, write_page
+from gfm_hil.bench.rounds import spread
 from gfm_hil.realtime.environment import caveats, environment
 
 
@@ -44,7 +42,7 @@ def content() -> dict[str, Any]:
             ]
         )
     ]  # fmt: skip
-    ns = Spread.of([80.0, 90.0, 100.0]).plain()
+    ns = spread([80.0, 90.0, 100.0])
     badge = environment() | {"steal_pct": 0.3}
     return {
         "bench": "all",
@@ -64,7 +62,7 @@ def content() -> dict[str, Any]:
             ],
             "lockstep": [
                 {"link": "shm", "delay_samples": 1, "ticks_per_s": ns, "times_real_time": ns,
-                 "share_of_plant_alone": Spread.of([0.8]).plain()},
+                 "share_of_plant_alone": spread([0.8])},
             ],
             "laws": [
                 {"law": "mimo-gfm", "whole_ns": ns, "plant_ns": ns, "controller_ns": ns,
@@ -108,10 +106,10 @@ def read(content: dict[str, Any], folder: Path) -> Outline:
 
 def test_page_holds_every_table_and_figure(content: dict[str, Any], tmp_path: Path) -> None:
     page = read(content, tmp_path)
-    drawn = [table for _, table in tables(content)]
+    drawn = [table for _, table in all_tables(content)]
     assert page.tables == len(drawn) == 10
     for table in drawn:
-        assert table.heading in page.text
+        assert table.title in page.text
         assert all(cell in page.text for row in table.rows for cell in row)
     assert len(page.links) == len(figures(content)) == 5
     assert content["remarks"][0] in page.text
@@ -136,7 +134,7 @@ def test_page_of_one_part(content: dict[str, Any], kept: str, tmp_path: Path) ->
     part |= {"results": []} if kept != "results" else {}
     part[kept] = content[kept]
     page = read(part, tmp_path)
-    assert page.tables == len(list(tables(part))) > 0
+    assert page.tables == len(list(all_tables(part))) > 0
     assert page.links
 
 

@@ -137,8 +137,8 @@ def test_the_longest_message_gets_through_encrypted(tmp_path):
 
 PUBLISHER = """
 import sys, time
-from gfm_hil.ports.streams.publish import Ports, Publisher
-with Publisher(Ports("127.0.0.1", 0, 0)) as publisher:
+from gfm_hil.ports.streams.publish import Publisher
+with Publisher("127.0.0.1", 0, 0) as publisher:
     print(publisher.samples, publisher.blocks, flush=True)
     while True:
         publisher._samples.send(b"x")
@@ -219,7 +219,7 @@ def test_what_waits_for_a_reader_is_bounded(reader, attack_now):
 
 
 def test_the_largest_block_gets_through():
-    rows = blocks.Rows("plant", 0, np.ones((5000, len(SIGNALS_OF["plant"]))),
+    rows = blocks.NewRows("plant", 0, np.ones((5000, len(SIGNALS_OF["plant"]))),
                        np.zeros((5000, len(TIMES_OF["plant"])), np.int64))  # fmt: skip
     (message,) = blocks.messages(rows)
     with zmq.Context() as context, context.socket(zmq.PUB) as sender:
@@ -243,7 +243,7 @@ client._ANSWER_MS = 1000
 operator = client.Operator(Path({folder!r}))
 print("ready", flush=True)
 try:
-    operator.tell({{"type": "reset"}})
+    operator.command({{"type": "reset"}})
 except UserError as problem:
     print(problem, flush=True)
 sys.stdin.readline()

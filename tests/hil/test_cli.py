@@ -279,7 +279,7 @@ def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
         (["run", "short.toml", "--law", "bad.toml"], "law file bad.toml: phi.22.typ"),
         (["run", "short.toml", "--law", "vsg2"], "did you mean 'vsg-2'?"),
         (["run", "short.toml", "--link", "can", "--option", "every=99"], "--option every 99"),
-        (["tell", "run", "Pref=1"], "did you mean 'P_ref'?"),
+        (["command", "run", "Pref=1"], "did you mean 'P_ref'?"),
         (["run", "nowhere.toml"], "nowhere.toml: no such file"),
         (["run", "short.toml", "--duration", "-1"], "duration"),
         (["run", "short.toml", "--duration", "nan"], "duration"),

@@ -60,7 +60,7 @@ def test_the_help_loads_no_library(option):
 
 def test_an_operator_s_command_loads_no_compiler(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", _LIGHT, "tell", str(tmp_path)], capture_output=True, text=True
+        [sys.executable, "-c", _LIGHT, "command", str(tmp_path)], capture_output=True, text=True
     )
     refusal, modules = done.stderr.splitlines()
     assert "no run is going on there" in refusal

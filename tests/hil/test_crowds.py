@@ -118,7 +118,7 @@ def test_the_operator_goes_on_in_a_crowd(lab, attack_now) -> None:
                 k += 1
                 assert not plain.write_registers(beat, [number, k], device_id=1).isError()
                 event = {"type": "reference", "P_ref": 0.4 + 0.01 * (k % 2)}
-                page.say(kind="tell", id=k, event=event)
+                page.say(kind="command", id=k, event=event)
                 wait_for(lambda given=answers + k: len(page.answers) == given)
                 time.sleep(0.2)
             assert all(page.answers)

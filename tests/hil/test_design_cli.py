@@ -94,7 +94,7 @@ def test_a_loop_is_drawn_with_its_margins(kind: str, capsys: Capture, tmp_path: 
     figure = tmp_path / "loop.png"
     out = said(capsys, kind, "--law", "vsg-2", "--at", "E_u,V", "--out", str(figure))
     assert list(out["at"]) == ["E_u", "V"]
-    assert out["at"]["E_u"]["gain_high"] == pytest.approx(1.12, abs=0.01)  # docs/margins.md
+    assert out["at"]["E_u"]["gain_high"] == pytest.approx(1.12, abs=0.01)  # docs/tuning.md
     assert figure.read_bytes().startswith(b"\x89PNG")
     out = said(capsys, kind, "--law", "vsg-2", "--scenario", "rig_pref_step", code=3)
     assert out["mode"]["frequency_hz"] == pytest.approx(49.5, abs=0.1)

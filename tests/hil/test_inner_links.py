@@ -15,7 +15,7 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import Unfinished
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.ports.streams.blocks import messages
-from gfm_hil.ports.streams.follow import Rows
+from gfm_hil.ports.streams.follow import NewRows
 from gfm_hil.ports.streams.samples import Sampler
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
 from gfm_hil.recording.live import LiveRun
@@ -155,7 +155,7 @@ def test_the_parts_of_a_cut_run_are_followed_streamed_and_recovered(make, tmp_pa
     for role, name in (("plant", "u_E_q"), ("controller", "i_ref_d")):
         assert live.row(role, 200)[name] == whole[name][200]
         part = live.parts[role]
-        rows = Rows(role, 0, part.signals, part.times)
+        rows = NewRows(role, 0, part.signals, part.times)
         got = np.concatenate([np.load(io.BytesIO(body)) for _, body in messages(rows)])
         assert got[name].tobytes() == whole[name].tobytes()
         sent = Sampler(scenario.T_s, 1e4, 0).messages(rows, 1.0)

@@ -18,11 +18,12 @@ from pymodbus.client import ModbusTcpClient
 from sunspec2.modbus.client import SunSpecModbusClientDeviceTCP, SunSpecModbusClientException
 from sunspec2.modbus.modbus import ModbusClientException
 
+from gfm_hil.cli import main
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.modbus.image import VENDOR
 
 from ..support.modbus import MODELS, SCENARIO, SUNS, at, end, start
-from ..support.processes import GFMHIL, running, wait_for
+from ..support.processes import GFMHIL, PATIENCE_S, running, wait_for
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
@@ -119,17 +120,6 @@ def test_p_and_q(device, run):
     wait_for(lambda: (last(run)["ref_P_ref"], last(run)["ref_Q_ref"]) == (0.5, 0.1))
 
 
-def test_a_set_point_reverts(device, run):
-    before = len(settled(run))
-    write(device, 704, WSetRvrtTms=1, WSetEna=1, WSet=3200)
-    wait_for(lambda: any("name" in line["operator"] for line in told(run)[before:]))
-    labels = [line["label"] for line in told(run)[before:]]
-    assert "P_ref = 0.8" in labels and labels[-1] == "P_ref = 0.5"
-    wait_for(lambda: last(run)["ref_P_ref"] == 0.5)
-    wait_for(lambda: read(device, 704, "WSetEna") == 0)  # once the run has answered the server
-    write(device, 704, WSetRvrtTms=0)
-
-
 @pytest.mark.attack(
     "10.6", "who moved the set-point over Modbus?", '`by`: "operator", with no name'
 )
@@ -170,16 +160,6 @@ def test_droops_and_voltage(device, run):
     assert read(device, VENDOR, "Dq") == pytest.approx(0.08)
 
 
-def test_law(device, run):
-    write(device, VENDOR, Law=2)
-    wait_for(lambda: last(run)["active"] == "vsg-5-tuned")
-    write(device, VENDOR, Law=3)
-    assert read(device, VENDOR, "Law") == 3 and read(device, VENDOR, "Dq") is None
-    with pytest.raises((ModbusClientException, SunSpecModbusClientException), match="3"):
-        write(device, VENDOR, Dq=0.1)
-    assert "droop-3-tuned has no D_q" in read(device, VENDOR, "Refd")
-
-
 def test_the_client_s_heartbeat_and_ours(device, run):
     ours = read(device, 715, "DERHb")
     wait_for(lambda: read(device, 715, "DERHb") > ours)
@@ -202,8 +182,8 @@ def test_the_client_s_heartbeat_and_ours(device, run):
 
 def test_a_trip_and_the_reset(device, run):
     operator = Operator(run)
-    operator.tell({"type": "grid-phase-jump", "degrees": 170.0})
-    operator.tell({"type": "grid-voltage", "V_g": 0.0})
+    operator.command({"type": "grid-phase-jump", "degrees": 170.0})
+    operator.command({"type": "grid-voltage", "V_g": 0.0})
     wait_for(lambda: read(device, 701, "InvSt") == 6)
     assert read(device, 701, "Alrm") != 0 and read(device, 701, "St") == 0
     assert read(device, VENDOR, "Why") and read(device, 715, "OpCtl") == 0
@@ -371,9 +351,7 @@ def test_a_certificate_is_asked_of_every_client(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--host", "0.0.0.0"], "--host 0.0.0.0: others can reach it"),
-        (["--host", "bench"], "--host 'bench': must be an IP address"),
-        (["--port", "70000"], "--port 70000: must lie in"),
+        (["--host", "bench"], "--host bench: goes beyond this machine"),
         (["--heartbeat", "-1"], "--heartbeat -1: must be >= 0"),
         (["--tls", "no", "no", "no"], "--tls no no no: "),
         (["--host", "192.0.2.1", "--anyone-may-command"], "cannot listen there"),
@@ -385,3 +363,22 @@ def test_wrong_options(run, options, words):
     )
     assert done.returncode == 2 and words in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_vendor_model_is_a_file_for_clients(capsys):
+    assert main(["modbus", "--vendor-model"]) == 0
+    assert json.loads(capsys.readouterr().out)["id"] == VENDOR
+
+
+def test_stop_ends_the_run_and_the_server_with_it(tmp_path):
+    folder = tmp_path / "run"
+    with running(folder, SCENARIO) as run:
+        server, port = start(folder)
+        with ModbusTcpClient("127.0.0.1", port=port) as plain:
+            sunspec.set_model_defs_path([MODELS, sunspec.models_dir])
+            device = SunSpecModbusClientDeviceTCP(slave_id=1, ipport=port, timeout=20)
+            device.scan()
+            plain.write_register(at(device, 715, "OpCtl"), 0, device_id=1)
+        assert run.wait(PATIENCE_S) == 130
+        assert server.wait(PATIENCE_S) == 0
+    assert json.loads((folder / "summary.json").read_text())["status"] == "interrupted"

@@ -7,6 +7,7 @@ import errno
 import resource
 import socket
 import struct
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from functools import partial
@@ -16,11 +17,14 @@ import pytest
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.modbus import connection, serve
+from gfm_hil.ports.modbus import connection
 from gfm_hil.ports.modbus.connection import CLIENTS, Server
 from gfm_hil.ports.modbus.image import VENDOR
-from gfm_hil.ports.modbus.serve import Address
+from gfm_hil.ports.modbus.port import make_server, tick
+from gfm_hil.ports.port import BesideRun
 
 from ..support.modbus import SUNS
 from ..support.modbus_device import Bench
@@ -63,7 +67,7 @@ async def ended(streams: Streams) -> bool:
 @asynccontextmanager
 async def served(bench: Bench):
     """A server of a simulated run; connects a client at each call."""
-    server = serve._server(bench.device, Address("127.0.0.1", 0), None)
+    server = make_server(bench.device, ("127.0.0.1", 0))
     await server.serve_forever(background=True)
     async with AsyncExitStack() as stack:
 
@@ -216,39 +220,25 @@ def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now) -> None:
     "the server ends as if the run were over",
 )  # fmt: skip
 def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, attack_now) -> None:
-    monkeypatch.setattr("gfm_hil.core.supervised.PAUSE_S", 0.01)
+    for where in ("core.supervised.PAUSE_S", "ports.port.PAUSE_S", "ports.port._LOOK_S"):
+        monkeypatch.setattr(f"gfm_hil.{where}", 0.01)
     full = OSError(errno.EMFILE, "Too many open files")
     failures = {"clock": [full] * 3, "look": [UserError("Too many open files"), full]}
     seen = {"clock": 0, "look": 0}
 
-    def look(name: str) -> bool:
+    def look(name: str) -> list[str]:
         if failures[name]:
             raise failures[name].pop()
         seen[name] += 1
-        return min(seen.values()) < 5  # until both have worked again
+        return ["plant"] if min(seen.values()) < 5 else []  # until both have worked again
 
     class Stub:
-        slack = None
-        peers = property(lambda self: self)
-
         async def clock(self) -> None:
             look("clock")
 
-        def take(self, local: bool) -> None: ...
-        def reap(self) -> None: ...
-
-    async def work() -> None:
-        over, device = asyncio.Event(), Stub()
-        watcher = type("Watcher", (), {"slack": lambda self: None})()
-        monkeypatch.setattr(serve, "_going", lambda folder: look("look"))
-        await asyncio.gather(
-            serve.supervised("the clock", lambda: serve._clock(device, 0.0, over)),
-            serve.supervised(
-                "the look", lambda: serve._watch(tmp_path, device, watcher, device, over)
-            ),
-        )
-
-    asyncio.run(asyncio.wait_for(work(), PATIENCE_S))
+    monkeypatch.setattr("gfm_hil.ports.port.present", lambda folder: look("look"))
+    with Interrupt() as interrupt, BesideRun(tmp_path, "modbus", False, interrupt) as run:
+        run.serve_until(supervised("the clock", lambda: tick(Stub(), time.monotonic())))
     assert caplog.text.count("Too many open files") == 5
     attack_now("5 of 5 reported; clock and look go on to the end of the run")
 

@@ -30,9 +30,9 @@ def test_the_image_is_a_sunspec_map():
 
 @pytest.mark.parametrize("law", every_law())
 def test_the_droops_of_every_law_are_those_of_its_file_or_none(law):
-    from gfm_hil.ports.modbus.droops import Gains
+    from gfm_hil.ports.modbus.droops import LawDroops
 
-    gains = Gains([law])
+    gains = LawDroops([law])
     found = gains.droops(law, {})
     assert found.D_p in (None, 0.01) and found.D_q in (None, 0.05)
     for name in ("D_p", "D_q"):

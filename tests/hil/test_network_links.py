@@ -168,10 +168,10 @@ def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path: Path) ->
         with pytest.raises(UserError, match=r"is of a network; name the folder of a converter"):
             Operator(folder)
         a, b = Operator(folder / "A"), Operator(folder / "B")
-        told = b.tell({"type": "reference", "P_ref": 0.35})
-        closed = b.tell({"type": "breaker", "name": "step", "closed": True})
+        told = b.command({"type": "reference", "P_ref": 0.35})
+        closed = b.command({"type": "breaker", "name": "step", "closed": True})
         with pytest.raises(UserError, match="name = 'stop': must be one of"):
-            a.tell({"type": "breaker", "name": "stop", "closed": True})
+            a.command({"type": "breaker", "name": "stop", "closed": True})
         wait_for(lambda: has_run(folder / "A", closed["tick"] + 100), process)
         a.stop()
         code, *_ = end(process)

@@ -56,9 +56,9 @@ def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
     process, folder = going
     operator = Operator(folder)
     wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
-    reference = operator.tell({"type": "reference", "P_ref": 0.8})
-    law = operator.tell({"type": "law", "law": "vsg-2"})
-    grid = operator.tell({"type": "grid-frequency", "f_hz": 49.99})
+    reference = operator.command({"type": "reference", "P_ref": 0.8})
+    law = operator.command({"type": "law", "law": "vsg-2"})
+    grid = operator.command({"type": "grid-frequency", "f_hz": 49.99})
     assert reference["label"] == "P_ref = 0.8"
     wait_for(lambda: operator.snapshot()["tick"] > grid["tick"] + 100)
     seen = operator.snapshot()
@@ -80,18 +80,18 @@ def test_a_trip_is_waited_for_and_reset_and_gains_change(going):
     operator = Operator(folder)
     wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
     with pytest.raises(UserError, match="the controller is RUNNING, not SAFE"):
-        operator.tell({"type": "reset"})
-    operator.tell({"type": "law", "law": "vsg-5"})
-    gains = operator.tell({"type": "gains", "values": {"D_p": 0.012}})
+        operator.command({"type": "reset"})
+    operator.command({"type": "law", "law": "vsg-5"})
+    gains = operator.command({"type": "gains", "values": {"D_p": 0.012}})
     wait_for(lambda: operator.snapshot()["tick"] > gains["tick"])
     seen = operator.snapshot()
     assert (seen["active"], seen["gains"]) == ("vsg-5", {"D_p": 0.012})
     assert seen["laws"] == ["mimo-gfm", "vsg-2", "vsg-5"]
-    operator.tell({"type": "grid-voltage", "V_g": 0.0})
+    operator.command({"type": "grid-voltage", "V_g": 0.0})
     wait_for(lambda: operator.snapshot()["state"] == "SAFE" and operator.snapshot()["trip"])
     seen = operator.snapshot()
     assert (seen["trip"], seen["reason"]) == ("over-current", "the plant's protection tripped")
-    reset = operator.tell({"type": "reset"})
+    reset = operator.command({"type": "reset"})
     wait_for(lambda: operator.snapshot()["tick"] > reset["tick"] + 100)
     seen = operator.snapshot()
     assert (seen["state"], seen["active"], seen["trip"]) == ("RUNNING", "mimo-gfm", "")
@@ -122,7 +122,7 @@ def test_what_is_refused_changes_nothing(going):
     wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
     for event, words in REFUSED:
         with pytest.raises(UserError, match=words):
-            operator.tell(event)
+            operator.command(event)
         seen = operator.snapshot()
         assert (seen["ref_P_ref"], seen["law"], seen["true_trip"]) == (0.5, 0.0, 0.0), event
     operator.close()
@@ -133,7 +133,7 @@ def test_the_command(going):
     process, folder = going
 
     def tell(*words: str) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-m", "gfm_hil", "tell", str(folder), *words]
+        command = [sys.executable, "-m", "gfm_hil", "command", str(folder), *words]
         return subprocess.run(command, capture_output=True, text=True)
 
     wait_for(lambda: json.loads(tell().stdout or "{}").get("tick", 0) > 0)

@@ -19,7 +19,7 @@ from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.ports.commands import Operator
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.recording.log import read_log
 from gfm_hil.scenario.events.reference import Reference
 
@@ -115,7 +115,7 @@ def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, a
 def test_no_descriptor_left_is_not_the_end_of_a_run(
     ends, run, tmp_path, monkeypatch, attack_now
 ) -> None:
-    record = open_record(run().folder)
+    record = open_recording(run().folder)
     record.folder = tmp_path
     assert present(tmp_path) == ["controller"] and record.ended() is None
 
@@ -155,11 +155,11 @@ def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_n
 
 @pytest.mark.attack("10.4", "who told the run to stop?", "nothing in events.jsonl")
 def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now) -> None:
-    operator = Operator(tmp_path, through="tell")
-    operator.tell(P_REF)
+    operator = Operator(tmp_path, through="command")
+    operator.command(P_REF)
     operator.stop()
     operator.close()
-    who = {"through": "tell", "uid": os.getuid(), "pid": os.getpid()}
+    who = {"through": "command", "uid": os.getuid(), "pid": os.getpid()}
     told, end = read_log(tmp_path / "events_controller.jsonl")
     for line in (told, end):
         assert {k: v for k, v in line["operator"].items() if k != "name"} == who

@@ -26,7 +26,7 @@ from gfm_hil.core import files
 from gfm_hil.core.errors import Unfinished, UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.recording import npz
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import RolePart
@@ -125,7 +125,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
         {"timing.png"} if mode == "realtime" else set()
     )
     assert not memory.exists()
-    assert len(open_record(folder).columns["tick"]) == found["ticks"]
+    assert len(open_recording(folder).columns["tick"]) == found["ticks"]
     attack_now(f"gfmhil recover completes the folder: {found['ticks']} ticks, {found['status']}")
 
 

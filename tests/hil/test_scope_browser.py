@@ -139,7 +139,7 @@ def test_without_the_token_one_may_look_not_touch(going: Rig, page: Browser) -> 
 def test_a_wrong_token_is_none(going: Rig) -> None:
     with connect(going.look.replace("http", "ws") + "socket") as socket:
         socket.send(json.dumps({"kind": "hello", "token": going.token[::-1]}))
-        socket.send(json.dumps({"kind": "tell", "id": 5, "event": {"type": "reset"}}))
+        socket.send(json.dumps({"kind": "command", "id": 5, "event": {"type": "reset"}}))
         heard = [json.loads(socket.recv(10)) for _ in range(4)]
     assert {"kind": "control", "granted": False} in heard
     assert [m["ok"] for m in heard if m["kind"] == "answer"] == [False]

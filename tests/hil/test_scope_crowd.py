@@ -16,9 +16,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from gfm_hil.ports.scope import server, session
 from gfm_hil.ports.scope.access import Access
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.picture import Picture
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.scope.server import Scope
-from gfm_hil.ports.scope.view import View
 
 from ..support.processes import takes_commands, wait_for
 from ..support.scope import Rig, mute, rig, serving, words
@@ -31,7 +31,7 @@ LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "held", 
 @pytest.fixture
 def scope(run) -> Scope:
     """The scope of a finished run."""
-    return Scope(open_record(run().folder), Access())
+    return Scope(open_recording(run().folder), Access())
 
 
 @pytest.fixture
@@ -82,14 +82,14 @@ def test_numbers_without_bounds_are_refused(port, more, attack_now) -> None:
     "3.2", "a page whose picture raises an exception", "the scope ends for every page"
 )
 def test_an_exception_ends_its_own_page_alone(port, monkeypatch, caplog, attack_now) -> None:
-    frame = View.frame
+    frame = Picture.frame
 
-    def fails(self: View, head: int) -> bytes | None:
-        if self._look.id == 13:
+    def fails(self: Picture, head: int) -> bytes | None:
+        if self._request.id == 13:
             raise ZeroDivisionError("of this page")
         return frame(self, head)
 
-    monkeypatch.setattr(View, "frame", fails)
+    monkeypatch.setattr(Picture, "frame", fails)
     with connect(address(port)) as page, connect(address(port)) as other:
         say(page, **{**LOOK, "id": 13})
         assert gone(page)
@@ -249,10 +249,10 @@ def told(lab: Rig) -> list[dict[str, Any]]:
 )
 def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now) -> None:
     with operator(lab) as page:
-        say(page, kind="tell", id=1, event=event)
+        say(page, kind="command", id=1, event=event)
         answer = words(page, "answer")
         assert not answer["ok"] and text in answer["text"]
-        say(page, kind="tell", id=2, event={"type": "reference", "Q_ref": 0.01})
+        say(page, kind="command", id=2, event={"type": "reference", "Q_ref": 0.01})
         assert words(page, "answer")["ok"]
     attack_now("refused in one line; the next command from the same page is carried out")
 
@@ -261,7 +261,7 @@ def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now) -> No
 def test_the_log_says_who_commanded(lab, attack_now) -> None:
     with operator(lab) as page:
         host, port = page.local_address[:2]
-        say(page, kind="tell", id=1, event={"type": "reference", "P_ref": 0.41})
+        say(page, kind="command", id=1, event={"type": "reference", "P_ref": 0.41})
         assert words(page, "answer")["ok"]
     line = wait_for(lambda: [e for e in told(lab) if e["label"] == "P_ref = 0.41"])[0]
     who = {"through": "scope", "name": "operator", "peer": f"{host}:{port}"}
@@ -275,7 +275,7 @@ def test_the_log_says_who_commanded(lab, attack_now) -> None:
 def test_a_page_has_a_limit_of_commands(lab, attack_now) -> None:
     with operator(lab) as page:
         for k in range(400):
-            say(page, kind="tell", id=k, event={"type": "reference", "Q_ref": 0.02})
+            say(page, kind="command", id=k, event={"type": "reference", "Q_ref": 0.02})
         answers = [words(page, "answer") for _ in range(400)]
     refused = [a["text"] for a in answers if not a["ok"]]
     assert all(a["ok"] for a in answers[: session.BURST])

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.ports.scope.channels import make_channels
+from gfm_hil.ports.scope.picture import HEAD, Picture, PictureRequest
 from gfm_hil.ports.scope.pyramid import Pyramid
-from gfm_hil.ports.scope.record import Record
+from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.trigger import ARMED, AUTO, FILLING, HELD, Acquisition, Trigger, edges
-from gfm_hil.ports.scope.view import HEAD, Look, View
 from gfm_hil.scenario import Scenario
 
 T_S = 1e-4
@@ -19,7 +19,7 @@ SCENARIO = Scenario(title="growing", duration=2.0, T_s=T_S)
 TICKS = 20_000
 
 
-class Growing(Record):
+class Growing(Recording):
     """A recording in memory, of which ``there`` ticks are done."""
 
     def __init__(self, p: np.ndarray, **more: np.ndarray) -> None:
@@ -31,7 +31,7 @@ class Growing(Record):
         return self.there
 
 
-def pyramid_of(record: Record) -> Pyramid:
+def pyramid_of(record: Recording) -> Pyramid:
     return Pyramid(record, make_channels(T_S, 50.0))
 
 
@@ -158,9 +158,9 @@ def test_auto_rolls_when_nothing_comes() -> None:
     assert auto.doing == AUTO
 
 
-def look(**more) -> Look:
+def look(**more) -> PictureRequest:
     content = {"kind": "look", "id": 7, "channels": ["p"], "bins": 100, "mode": "roll", "span": 0.5}
-    return Look(**{**content, **more})
+    return PictureRequest(**{**content, **more})
 
 
 def taken_apart(frame: bytes, channels: int = 1, watched: int = 0):
@@ -177,7 +177,7 @@ def test_frames_roll_along_and_say_what_is_the_case() -> None:
     state[12_000:] = 3.0
     pyramid = pyramid_of(Growing(p, state=state, law=np.full(TICKS, 1.0)))
     pyramid.update()
-    view = View(pyramid, look(watched=["p"]), 0)
+    view = Picture(pyramid, look(watched=["p"]), 0)
     head, values, now = taken_apart(view.frame(10_000), watched=1)
     assert (head["start"], head["stop"], head["head"]) == (5000, 10_000, 10_000)
     assert (head["view"], head["state"], head["law"], head["live"]) == (7, 2, 1, 1)
@@ -193,7 +193,7 @@ def test_frames_roll_along_and_say_what_is_the_case() -> None:
 def test_a_held_window_is_sent_once_and_then_only_what_else_is_new() -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
-    view = View(pyramid, look(mode="held", start=0.1, span=0.2), 0)
+    view = Picture(pyramid, look(mode="held", start=0.1, span=0.2), 0)
     head, values, _ = taken_apart(view.frame(10_000))
     assert (head["start"], head["stop"], head["same"]) == (1000, 3000, 0)
     assert values.size
@@ -205,7 +205,7 @@ def test_a_window_beyond_what_is_recorded_is_empty() -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     for start in (-5.0, 5.0):
-        view = View(pyramid, look(mode="held", start=start, span=0.2), 0)
+        view = Picture(pyramid, look(mode="held", start=start, span=0.2), 0)
         head, _, _ = taken_apart(view.frame(10_000))
         assert head["bins"] == 0
 
@@ -214,7 +214,7 @@ def test_a_window_beyond_what_is_recorded_is_empty() -> None:
 def test_a_look_that_cannot_be_is_refused(wrong) -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     with pytest.raises(ValueError, match=r"channel = .*: unknown|trigger: missing"):
-        View(pyramid, look(**wrong), 0)
+        Picture(pyramid, look(**wrong), 0)
 
 
 @given(
@@ -228,7 +228,7 @@ def test_no_look_is_too_odd(start, span, bins, mode, heads) -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     trigger = Trigger(channel="p", level=0.0)
-    view = View(pyramid, look(start=start, span=span, bins=bins, mode=mode, trigger=trigger), 0)
+    view = Picture(pyramid, look(start=start, span=span, bins=bins, mode=mode, trigger=trigger), 0)
     for done in heads:
         frame = view.frame(done)
         if frame is not None:

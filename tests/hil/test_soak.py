@@ -23,7 +23,7 @@ from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.modbus.image import Image
 from gfm_hil.ports.modbus.measures import Measures
 from gfm_hil.ports.scope.channels import make_channels
-from gfm_hil.ports.scope.record import open_record
+from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.scenario import load_scenario
 
 from ..support.modbus import GFMHIL
@@ -116,7 +116,7 @@ def test_nothing_grows_and_nothing_is_left(link, capsys, attack_now):
             assert {name: p.poll() for name, p in started.items()} == dict.fromkeys(started)
             clients.round()
             sampler.take()
-        ticks = open_record(folder).done()
+        ticks = open_recording(folder).done()
         operator = Operator(folder)
         operator.stop()
         operator.close()

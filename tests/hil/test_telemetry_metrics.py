@@ -55,7 +55,7 @@ def test_a_run_is_collected_while_it_goes_on(start, tmp_path):
     wait_for(lambda: scraped(port).get(("gfmhil_ticks_total", "plant"), 0) >= 10)
     first = scraped(port)
     operator = Operator(folder)
-    operator.tell({"type": "law", "law": "vsg-2"})
+    operator.command({"type": "law", "law": "vsg-2"})
     wait_for(lambda: ("gfmhil_law_info", "vsg-2") in scraped(port))
     second = scraped(port)
     operator.stop()
@@ -127,7 +127,7 @@ def test_what_is_missing_is_said(tmp_path, capsys, monkeypatch, recorded):
         words = ["stream", str(recorded.folder), "--port", "0", "--prometheus", str(port)]
         assert main(words) == 2
     assert f"--prometheus {port}: 127.0.0.1: Address already in use" in capsys.readouterr().err
-    monkeypatch.setattr("gfm_hil.cli.stream.find_spec", lambda name: None)
+    monkeypatch.setattr("gfm_hil.core.errors.importlib.util.find_spec", lambda name: None)
     assert main(["stream", "x", "--prometheus", "0"]) == 2
     assert "pip install 'gfmhil[metrics]'" in capsys.readouterr().err
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.ports.xcp.lines import CanFd, packed
 from gfm_hil.ports.xcp.memory import Memory
+from gfm_hil.ports.xcp.transports import CanFd, packed
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.recording.log import read_log
 from gfm_runtime import law_file
@@ -238,8 +238,7 @@ def test_several_packets_of_a_datagram_and_what_is_no_packet(run: MadeUpRun) -> 
 def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> None:
     line = CanFd("virtual", "xcp", [0x123, 0x124])
     one = slave(run, most=line.most)
-    with can.Bus(interface="virtual", channel="xcp", fd=True) as bus:
-        line.words()
+    with can.Bus(interface="virtual", channel="xcp", fd=True) as bus, line:
 
         def ask(packet: bytes, arbitration_id: int = 0x123) -> bytes:
             size = next(n for n in (8, 12, 16, 64) if n >= len(packet))
@@ -262,7 +261,6 @@ def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> Non
         assert ask(short_download(REFERENCES + 8, 0.8))[:1] == b"\xff"
         assert run.told == [{"type": "reference", "P_ref": 0.8}]
         assert ask(b"\xfd", arbitration_id=0x200) == b""  # of others on the bus
-    line.close()
     file = tmp_path / "can.a2l"
     memory = Memory(run, LAWS, False, lambda: 100)
     file.write_text(memory.a2l("bench", packed(line, 1000, ["UPLOAD"])))
@@ -343,7 +341,7 @@ def test_it_waits_for_the_command_server_not_for_the_recording_alone(
     def stop(_: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gfm_hil.cli.xcp.time.sleep", stop)
+    monkeypatch.setattr("gfm_hil.ports.port.time.sleep", stop)
     assert main(["xcp", str(tmp_path), "--wait", "--port", "0"]) == 130
 
 

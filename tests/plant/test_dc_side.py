@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.model import V_DC, f
-from gfm_runtime.inner import Inner
+from gfm_runtime.inner import VirtualStator
 
 T_S = 1e-4
 
@@ -109,5 +109,6 @@ def test_a_stage_and_the_bridge_have_the_same_limit_of_space_vector_modulation()
     """They differed in the fifth digit, 1.30255 and 1.30257, in the stage
     and the bridge; the circle in the hexagon has sqrt(3/2) / sqrt(3) of v_dc line to line."""
     plant = make_plant(Plant.model_validate({"modulation": "space-vector"}), 1e-4)
-    assert Inner().m == plant.par[0]["m_max"]
-    assert Inner().m == pytest.approx(700 / 380 * math.sqrt(3 / 2) / math.sqrt(3), rel=1e-15)
+    assert VirtualStator().m == plant.par[0]["m_max"]
+    m = VirtualStator().m
+    assert m == pytest.approx(700 / 380 * math.sqrt(3 / 2) / math.sqrt(3), rel=1e-15)

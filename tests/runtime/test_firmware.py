@@ -23,7 +23,7 @@ from gfm_runtime.firmware.c_text import chosen, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
-from gfm_runtime.inner import INNER_STATE, Inner, settle
+from gfm_runtime.inner import INNER_STATE, VirtualStator, settle
 from gfm_runtime.signals import NU, NY, carried_rows, command_rows, group
 from gfm_runtime.states import BAD_U, BAD_Y, OK, RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
@@ -336,7 +336,7 @@ def test_the_report_counts_the_operations_as_by_hand() -> None:
 def test_the_report_counts_the_operations_of_a_stage_as_by_hand() -> None:
     """What a virtual stator adds; in brackets its equations in ``gfm_runtime.inner``."""
     counts = []
-    for stage in (None, Inner("virtual-stator")):
+    for stage in (None, VirtualStator()):
         law = replace(LAWS["droop-1"], inner=stage)
         text = export({"x": law}, T_S, "float32", "unrolled")["report.json"]
         counts.append(json.loads(text)["laws"][0])
@@ -366,7 +366,7 @@ def test_two_laws_with_one_name_in_c_are_refused() -> None:
 
 
 def test_limits_that_are_not_finite_are_refused() -> None:
-    endless = replace(LAWS["vsg-1"].limits, high=(np.inf, 1.1, 1.5))
+    endless = LAWS["vsg-1"].limits.model_copy(update={"i_u": (-5.0, np.inf)})
     with pytest.raises(LawError, match=r"'x'.*high must be finite"):
         make_modules({"x": replace(LAWS["vsg-1"], limits=endless)}, T_S, "float32")
 

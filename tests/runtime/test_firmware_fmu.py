@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from importlib.resources import files
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -249,7 +249,7 @@ def test_an_importer_builds_the_sources(built: Any, fmi: str, tmp_path: Path) ->
 @pytest.mark.parametrize("fmi", FMI)
 def test_the_interface_is_whole_and_compiles_without_a_warning(built: Any, fmi: str) -> None:
     folder = built("vsg-2", "cascaded", "float64", fmi)
-    headers = files("gfm_runtime.firmware").joinpath("fmi")
+    headers = Path(fmpy.__file__).parent / "c-code"
     for compiler in ("gcc", "clang"):
         arguments = ["-isystem", str(headers), "-fsyntax-only", f"fmi{fmi}.c"]
         done = cc(folder / "sources", *STRICT, *arguments, compiler=compiler)
@@ -291,6 +291,11 @@ def test_what_the_command_refuses(
     out = ["-o", str(tmp_path / "law.fmu")]
     assert main(["firmware", "fmu", "vsg-1", "-o", str(tmp_path / "no" / "law.fmu")]) == 2
     assert f"{tmp_path}/no/law.fmu: No such file or directory" in capsys.readouterr().err
+    with monkeypatch.context() as without:
+        module = sys.modules["gfm_runtime.firmware.fmu"]
+        without.setattr(module, "find_spec", lambda _: None)
+        assert main(["firmware", "fmu", "vsg-1", *out]) == 2
+    assert "pip install 'gfmhil[fmu]'" in capsys.readouterr().err
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "fmu", "vsg-1", *out]) == 2
     assert "apt-get install gcc libc6-dev" in capsys.readouterr().err

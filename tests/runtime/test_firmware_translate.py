@@ -12,8 +12,8 @@ from gfm_runtime.firmware.translate import (
     Algebra,
     Array,
     Expr,
-    Record,
-    Text,
+    Printer,
+    Struct,
     Translator,
     Untranslatable,
     constants,
@@ -23,8 +23,8 @@ from gfm_runtime.firmware.translate import (
 )
 
 X = Expr("var", ("s->x",))
-STATE = Record({"x": X, "z": Array("s->z", (3,)), "on": Expr("var", ("s->on",), "int")})
-C = Record({"a": 2.0, "zero": 0.0, "one": 1.0, "row": np.array([0.5, 0.0, -1.0]), "n": 3})
+STATE = Struct({"x": X, "z": Array("s->z", (3,)), "on": Expr("var", ("s->on",), "int")})
+C = Struct({"a": 2.0, "zero": 0.0, "one": 1.0, "row": np.array([0.5, 0.0, -1.0]), "n": 3})
 
 
 def weighted(c: Any, s: Any) -> Any:
@@ -54,7 +54,7 @@ def branches(c: Any, s: Any) -> None:
 
 def text(python: Any, unroll: bool = True, algebra: Algebra | None = None, c: Any = C) -> str:
     entry = Translator(unroll, algebra).function(python, [c, STATE])
-    printer = Text(np.dtype("f4"), {"c": "c_t", "s": "s_t"})
+    printer = Printer(np.dtype("f4"), {"c": "c_t", "s": "s_t"})
     return "\n".join(map(printer.function, reached([entry])))
 
 
@@ -70,7 +70,7 @@ def test_a_loop_with_known_bounds_becomes_one_sum_without_zeros() -> None:
 
 
 def test_without_known_constants_the_loop_and_the_function_stay() -> None:
-    at_run_time = Record(
+    at_run_time = Struct(
         {"a": Expr("var", ("c->a",)), "n": Expr("var", ("c->n",), "int"),
          "row": Array("c->row", (3,))}
     )  # fmt: skip

@@ -95,7 +95,9 @@ def test_round_trip() -> None:
     assert law.psi == {(1, 1): D(0.1) * IF(1.0, 0.1)}
     assert law.u_0 == ("P_ref", 1.0, 1)
     assert (law.error_map, law.error_parameters) == ("hybrid-angle", (0.001, 0.1))
-    assert law.limits == Limits((-2.0, 0.95, 0.1), (2.0, 1.05, 1.2), 0.03, 0.4)
+    assert law.limits == Limits(
+        i_u=(-2.0, 2.0), omega_u=(0.95, 1.05), E_u=(0.1, 1.2), T_t=0.03, T_off=0.4
+    )
     assert (law.home_grid.L_g, law.home_grid.R_g, law.home_grid.note) == (5.0, 1.0, "weak")
     assert law.parameters["D_p"].source == "Table III"
 
@@ -164,14 +166,14 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "both forms": ("T = 2.0 }", "T = 2.0, k_i = 1 }", ("phi_34", "['T'] or ['k_i']")),
     "improper": (", T_f = 0.001", "", ("phi_21", "improper", "T_f")),
-    "unstable T": ("k = 1.0, T = 0.2", "k = 1.0, T = -0.2", ("phi_23, IF", "T = -0.2", "> 0")),
-    "unstable T_f": ("T_f = 0.001", "T_f = -1", ("phi_21.T_f", "-1", "> 0")),
+    "unstable T": ("k = 1.0, T = 0.2", "k = 1.0, T = -0.2", ("phi_23, IF", "T = -0.2", "1e-09")),
+    "unstable T_f": ("T_f = 0.001", "T_f = -1", ("phi_21.T_f", "-1", "1e-09")),
     "unstable xi": ("xi = 0.7", "xi = 0", ("phi_22, O", "xi = 0", "> 0")),
-    "absurd T": ("T = 2.0 }", "T = 1e-200 }", ("phi_34, I", "1e-200", "[1e-09, 1e+09]")),
+    "absurd T": ("T = 2.0 }", "T = 1e-200 }", ("phi_34, I", "1e-200", "1e-09")),
     "infinite gain": ("k_i = 400", "k_i = inf", ("phi_11.k_i", "inf", "finite")),
     "gigantic integer": ("k_i = 400", "k_i = 1" + 400 * "0", ("phi.11.k_i", "must be a number")),
     "gigantic parameter": ("value = 90.0", "value = 1" + 400 * "0", ("parameters.k_p.value",)),
-    "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11.k_i", "1e+300", "1e+12")),
+    "absurd gain": ("k_i = 400", "k_i = 1e300", ("phi_11", "k_i = 1e+300", "1e+12")),
     "nan parameter": ("value = 90.0", "value = nan", ("parameters.k_p.value", "nan", "finite")),
     "text in place of a parameter": (
         'D_p = { value = 0.01, unit = "p.u.", source = "Table III" }',
@@ -220,9 +222,9 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "[1.05, 0.95]",
         ("limits.omega_u", "[1.05, 0.95]", "ascending"),
     ),
-    "one limit": ("[0.95, 1.05]", "[0.95]", ("limits.omega_u", "[0.95]", "at least 2")),
-    "T_t": ("T_t = 0.03", "T_t = 0.0", ("limits.T_t", "0 s", "> 0")),
-    "T_off": ("T_off = 0.4", "T_off = nan", ("limits.T_off", "nan", "> 0")),
+    "one limit": ("[0.95, 1.05]", "[0.95]", ("limits.omega_u", "missing")),
+    "T_t": ("T_t = 0.03", "T_t = 0.0", ("limits.T_t", "0.0", "greater than 0")),
+    "T_off": ("T_off = 0.4", "T_off = nan", ("limits.T_off", "nan", "greater than 0")),
     "home grid": ("L_g = 5.0", "L_g = 0.0", ("home_grid.L_g", "0.0", "greater than 0")),
     "not TOML": ("[psi]", "[psi", ("law file", "not TOML", "line")),
     "key twice": ("34 = {", "23 = {", ("law file", "not TOML")),
@@ -253,7 +255,7 @@ def test_all_mistakes_at_once() -> None:
 def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
     text = CUSTOM.replace('k = "D_p"', 'k = "D_q"').replace("34 = {", "46 = {")
     text = text.replace('type = "hybrid-angle"', 'type = "hybrid_angle"')
-    text = text.replace("[0.95, 1.05]", "[1.05, 0.95]").replace(", T_f = 0.001", "")
+    text = text.replace(", T_f = 0.001", "")
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(LawError) as caught:
@@ -265,7 +267,6 @@ def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
         "did you mean 'D_p'?",
         "phi.46: a cell is row",
         "did you mean 'hybrid-angle'?",
-        "limits.omega_u: [1.05, 0.95]",
         "phi_21: improper",
     ):
         assert sum(part in line for line in lines) == 1, part

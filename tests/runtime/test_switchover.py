@@ -131,7 +131,7 @@ def test_tighter_limits_are_reported_as_a_bump() -> None:
     ref, y = REF, REF - [0.0, 0.0, 0.0, 0.0, 0.001]
     expected = before.step(ref, y)
     law = get_law("vsg-5")
-    tight = Limits(low=law.limits.low, high=(5.0, 1.1, float(expected[2]) - 0.01))
+    tight = law.limits.model_copy(update={"E_u": (0.0, float(expected[2]) - 0.01)})
     before = running("vsg-2", seed=1)
     _, u, bump = change(before, discretise(replace(law, limits=tight), T_S), ref, y)
     assert bump == pytest.approx(0.01, abs=1e-3)
@@ -143,7 +143,7 @@ def test_limited_omega_u_does_not_spoil_the_other_rows() -> None:
     """VSG-3 feeds omega_u to E_u: a tighter limit of omega_u makes a bump of omega_u alone."""
     before = running("vsg-2", seed=1)
     expected = running("vsg-2", seed=1).step(REF, REF)
-    tight = Limits(low=(-5.0, float(expected[1]) + 0.001, 0.0))
+    tight = Limits(omega_u=(float(expected[1]) + 0.001, 1.1))
     new = discretise(replace(get_law("vsg-3"), limits=tight), T_S)
     _, u, bump = change(before, new, REF, REF)
     assert bump == pytest.approx(0.001)

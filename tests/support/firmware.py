@@ -14,7 +14,7 @@ from gfm_runtime import Law, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
-from gfm_runtime.inner import KINDS, PRIORITIES, Inner, settle
+from gfm_runtime.inner import PRIORITIES, STAGES, PowerLimiter, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
 from gfm_runtime.signals import NU, carried_rows, group
 from gfm_runtime.switchover import settle_into
@@ -36,11 +36,11 @@ def _staged() -> dict[str, Law]:
         for k, stage in enumerate(shipped)
         for law in ("vsg-2", *SOME[k :: len(shipped)])
     }
-    for kind in KINDS:
-        for k, priority in enumerate(PRIORITIES if kind != NO_INNER else ()):
-            stage = Inner(
-                kind, priority=priority, angle=-30.0, k_ci=5.0 * (k % 2), freeze=k != 2,
-                P_max=1.0, P_min=-1.0, f_pll=20.0,
+    for kind, one in STAGES.items():
+        for k, priority in enumerate(PRIORITIES):
+            stage = one(
+                priority=priority, angle=-30.0, k_ci=5.0 * (k % 2), freeze=k != 2,
+                power=PowerLimiter(P_max=1.0, P_min=-1.0), f_pll=20.0,
             )  # fmt: skip
             laws[f"{kind} {priority}"] = replace(LAWS["vsg-2"], inner=stage)
     return laws | {"no stage": LAWS["mimo-gfm"]}

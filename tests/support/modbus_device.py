@@ -9,7 +9,7 @@ from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.modbus.device import TICK_S, Device
-from gfm_hil.ports.modbus.view import View
+from gfm_hil.ports.modbus.run_state import RunState
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario import check_scenario
 from gfm_runtime.states import RUNNING
@@ -33,15 +33,15 @@ class Bench:
         self.deaf = False
         self.scenario = check_scenario({"title": "made up", "duration": 1.0, "law": LAWS[0]}, "")
         self.device = Device(
-            self.scenario, LAWS, self.look, self.tell, heartbeat_ms, lambda: self.now
+            self.scenario, LAWS, self.look, self.command, heartbeat_ms, lambda: self.now
         )
 
-    def look(self) -> View:
+    def look(self) -> RunState:
         row = dict(self.row)
         reason = "over-current" if row["true_trip"] else ""
-        return View(row, 1, 0, int(row["state"]), self.law, dict(self.gains), reason)
+        return RunState(row, 1, 0, int(row["state"]), self.law, dict(self.gains), reason)
 
-    def tell(self, event: dict) -> None:
+    def command(self, event: dict) -> None:
         if self.deaf:
             raise UserError("the controller does not answer")
         self.told.append(event)

@@ -191,7 +191,7 @@ class Clients:
                 page.send(json.dumps(_LOOK))
             one.send(json.dumps({"kind": "hello", "token": self.token}))
             event = {"type": "reference", "P_ref": 0.4 + 0.02 * (k % 5), "ramp_s": 0.05}
-            one.send(json.dumps({"kind": "tell", "id": k, "event": event}))
+            one.send(json.dumps({"kind": "command", "id": k, "event": event}))
             answer = _until(one.recv, lambda m: isinstance(m, str) and '"answer"' in m)
             assert json.loads(answer)["ok"] or "SAFE" in answer, answer
             for _ in range(5):
@@ -225,17 +225,17 @@ class Clients:
     def _operator(self, k: int) -> None:
         operator = Operator(self.folder)
         try:
-            operator.tell({"type": "law", "law": "droop-5"})
-            operator.tell({"type": "gains", "values": {"D_p": 0.01 + 1e-5 * (k % 7)}})
-            operator.tell({"type": "grid-frequency", "f_hz": 50.0 + 0.01 * (k % 2), "rate": 1.0})
+            operator.command({"type": "law", "law": "droop-5"})
+            operator.command({"type": "gains", "values": {"D_p": 0.01 + 1e-5 * (k % 7)}})
+            operator.command({"type": "grid-frequency", "f_hz": 50.0 + 0.01 * (k % 2), "rate": 1.0})
             if k % 3 == 2:  # a trip, and back to the start
-                operator.tell({"type": "grid-voltage", "V_g": 0.0})
+                operator.command({"type": "grid-voltage", "V_g": 0.0})
                 _until(operator.snapshot, lambda seen: seen["state"] == "SAFE")
-                operator.tell({"type": "reset"})
+                operator.command({"type": "reset"})
                 _until(operator.snapshot, lambda seen: seen["state"] == "RUNNING")
         finally:
             operator.close()
-        command = [sys.executable, "-m", "gfm_hil", "tell", str(self.folder), "Q_ref=0.0"]
+        command = [sys.executable, "-m", "gfm_hil", "command", str(self.folder), "Q_ref=0.0"]
         told = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
         )

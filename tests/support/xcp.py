@@ -34,7 +34,7 @@ class MadeUpRun:
     def snapshot(self) -> dict[str, Any]:
         return self.now
 
-    def tell(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
+    def command(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
         _EVENT.validate_python({**event, "tick": 0})
         if self.refuses:
             raise UserError(self.refuses)

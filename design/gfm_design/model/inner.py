@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from gfm_design.model.linear import LinearLaw
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_plant import NoEquilibrium
-from gfm_runtime.inner import INNER_NUMBERS, Inner, inner_fields
+from gfm_runtime.inner import (
+    INNER_NUMBERS,
+    InnerStage,
+    ThresholdImpedance,
+    inner_fields,
+    pack_inner,
+)
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
 from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW
 
@@ -91,7 +97,9 @@ def _block(*rows: list[Matrix]) -> Matrix:
     return np.concatenate([np.concatenate(row, axis=-1) for row in wide], axis=-2)
 
 
-def linearise_stage(inner: Inner, T_s: float, omega_b: float, op: OperatingPoint) -> LinearStage:
+def linearise_stage(
+    inner: InnerStage, T_s: float, omega_b: float, op: OperatingPoint
+) -> LinearStage:
     """A stage around ``op``.
 
     Args:
@@ -102,7 +110,7 @@ def linearise_stage(inner: Inner, T_s: float, omega_b: float, op: OperatingPoint
         NoEquilibrium: a limit of the stage acts at ``op``.
     """
     c = np.zeros(1, np.dtype([*INNER_NUMBERS, *inner_fields(np.dtype(float))]))[0]
-    inner.pack(c, T_s, omega_b)
+    pack_inner(inner, c, T_s, omega_b)
     omega_0, stator = float(op.u[1]), inner.kind == "virtual-stator"
     i_0, v_0, i_o_0 = (complex(op.x[k], op.x[k + 1]) for k in (0, 2, 4))
     _check_limits(inner, op, abs(i_0))
@@ -153,7 +161,7 @@ def linearise_stage(inner: Inner, T_s: float, omega_b: float, op: OperatingPoint
     return LinearStage(A, B_u, B_y, C, D_u, D_y, C_pll, D_pll, states=tuple(states))
 
 
-def _check_limits(inner: Inner, op: OperatingPoint, size: float) -> None:
+def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
     """Refuse an operating point at which a limit acts; |i*| is within I_max at any."""
     p, e, most = float(op.y[1]), abs(op.e), inner.m * float(op.y[0])
     why = ""
@@ -161,7 +169,7 @@ def _check_limits(inner: Inner, op: OperatingPoint, size: float) -> None:
         why = (
             f"the power limiter acts: p is {p:.4g} p.u., not in [{inner.P_min:g}, {inner.P_max:g}]"
         )
-    elif inner.kind == "threshold-impedance" and size > inner.I_thr:
+    elif isinstance(inner, ThresholdImpedance) and size > inner.I_thr:
         why = f"the threshold impedance acts: |i| is {size:.4g} p.u., I_thr is {inner.I_thr:g}"
     elif e > most + _ROUNDING:
         why = f"the limit of modulation acts: |e| is {e:.4g} p.u., m v_dc is {most:.4g}"

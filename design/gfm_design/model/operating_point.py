@@ -11,7 +11,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -339,7 +339,7 @@ def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> c
     if inner is None:
         return e
     if not limited:
-        inner = replace(inner, I_max=math.inf)
+        inner = inner.model_copy(update={"I_max": math.inf})
     i, v, i_o = (complex(x[k], x[k + 1]) for k in (0, 2, 4))
     try:
         return inner.internal_voltage(i, v, i_o, e, float(u[1]))

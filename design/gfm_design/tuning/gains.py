@@ -20,7 +20,7 @@ from gfm_design.model.batch import realise_each
 from gfm_design.model.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
 from gfm_design.model.operating_point import OperatingPoint
 from gfm_runtime.errors import LawError
-from gfm_runtime.expressions import evaluate_each
+from gfm_runtime.expressions import evaluate
 from gfm_runtime.lawfile import LawFile, build_law, tied
 from gfm_runtime.realisation import realise
 
@@ -153,7 +153,7 @@ class GainedLaw:
         numbers |= {g.name: values[:, k] for k, g in enumerate(self.gains)}
         for name, p in self.file.parameters.items():
             if p.tied is not None:
-                numbers[name] = evaluate_each(f"parameters.{name}.tied", p.tied, numbers)
+                numbers[name] = evaluate(f"parameters.{name}.tied", p.tied, numbers)
         law = closed_law(realise_each(self.file, numbers), self._map(numbers), self._dc_control)
         return LinearLaw(*(m[1:] for m in law.matrices))
 
@@ -162,7 +162,7 @@ class GainedLaw:
         kind = self.file.error_map
         given = [v for v in (kind.R, kind.X) if v is not None]
         shape = next(iter(numbers.values())).shape
-        impedance = [np.broadcast_to(evaluate_each("error_map", v, numbers), shape) for v in given]
+        impedance = [np.broadcast_to(evaluate("error_map", v, numbers), shape) for v in given]
         rows = np.array(impedance).reshape(len(given), *shape).T
         distinct, where = np.unique(rows, axis=0, return_inverse=True)
         slopes = [error_map_slopes(kind.type, row, self._op.y, self._ref) for row in distinct]

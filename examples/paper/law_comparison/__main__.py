@@ -3,7 +3,7 @@
 Usage, in examples/paper:  python -m law_comparison [--jobs N] [--out FOLDER] [--publish ROOT]
 
 ``--publish`` copies what the project keeps of a whole comparison into its repository: the tables
-and figures of docs/law-comparison.md, and the laws of runtime/gfm_runtime/laws/tuned.
+and figures of docs/deployable.md, and the laws of runtime/gfm_runtime/laws/tuned.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Any
 
 from gfm_design.margins.tolerance import End, Range
 from gfm_design.model.least_stable import LeastStable
-from gfm_design.norms.performance import Channel
+from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.api.tuned_law import channels_as_json, write_law
 from gfm_hil.results.report import finite
 from gfm_runtime import law_file
@@ -101,7 +101,7 @@ def _found(found: Found) -> Row:
     }
 
 
-def _channels(found: Sequence[Channel] | LeastStable) -> Row:
+def _channels(found: Sequence[WeightedChannel] | LeastStable) -> Row:
     """gamma and channels, or the reason why there are none."""
     if isinstance(found, LeastStable):
         mode = {**found.mode.plain(), "states": [list(s) for s in found.states]}

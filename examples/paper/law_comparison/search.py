@@ -21,7 +21,7 @@ from gfm_design.model.closed_loop import T_S, ClosedLoop
 from gfm_design.model.least_stable import LeastStable, least_stable
 from gfm_design.model.linear import LinearLaw, Mode
 from gfm_design.norms.hinf import Unstable
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
+from gfm_design.norms.performance import PAPER_WEIGHTS, WeightedChannel
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_design.tuning.paper_tune import tune_paper
@@ -43,7 +43,7 @@ ALPHA = 1.0  # 1/s
 _SHARES = (1.0, 0.3, 0.1)  # of a polish's step that are tried
 
 Pair = tuple[int, int]  # i, j of a channel
-After = tuple[Channel, ...] | LeastStable
+After = tuple[WeightedChannel, ...] | LeastStable
 Progress = Callable[[int, float], None]
 
 
@@ -169,7 +169,7 @@ def search(
     def from_(values: Vector) -> tuple[FreeGain, ...]:
         return free_gains(file, dict(zip(free, map(float, values), strict=True)))
 
-    def channels_at(values: Vector) -> tuple[Channel, ...]:
+    def channels_at(values: Vector) -> tuple[WeightedChannel, ...]:
         return PaperProblem(file, from_(values)).channels(values)
 
     def late(starts: tuple[FreeGain, ...], without: Sequence[Pair] = ()) -> Tuned:
@@ -259,12 +259,12 @@ def as_it_is(file: LawFile) -> Found:
     return Found(free, channels, channels, named, channels, (), 0, 0.0)
 
 
-def gamma(channels: Sequence[Channel]) -> float:
+def gamma(channels: Sequence[WeightedChannel]) -> float:
     """The largest norm."""
     return max(c.norm for c in channels)
 
 
-def _at_its_limit(channels: Sequence[Channel], fixed: Sequence[Pair]) -> Pair | None:
+def _at_its_limit(channels: Sequence[WeightedChannel], fixed: Sequence[Pair]) -> Pair | None:
     """The largest channel but ``fixed`` whose peak is at omega = 0 or infinity, if it is as good
     as the largest of all: a search brings others up to one that it cannot lower."""
     left = [c for c in channels if (c.i, c.j) not in fixed]
@@ -277,11 +277,14 @@ def _at_its_limit(channels: Sequence[Channel], fixed: Sequence[Pair]) -> Pair | 
 
 
 def _no_worse(
-    new: Sequence[Channel], old: Sequence[Channel], fixed: Sequence[Pair], by: float = _SAME
+    new: Sequence[WeightedChannel],
+    old: Sequence[WeightedChannel],
+    fixed: Sequence[Pair],
+    by: float = _SAME,
 ) -> bool:
     """gamma, and the largest of what is left of it without each of ``fixed`` in turn."""
 
-    def largest(channels: Sequence[Channel], without: Sequence[Pair]) -> float:
+    def largest(channels: Sequence[WeightedChannel], without: Sequence[Pair]) -> float:
         return gamma([c for c in channels if (c.i, c.j) not in without])
 
     stages = [fixed[:k] for k in range(len(fixed) + 1)]

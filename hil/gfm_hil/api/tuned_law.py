@@ -11,9 +11,10 @@ import numpy as np
 from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.scenario import Scenario, toml_text
 from gfm_runtime import law_file
-from gfm_runtime.lawfile import GridSpec, LawFile, shipped_law
+from gfm_runtime.law import HomeGrid
+from gfm_runtime.lawfile import LawFile, shipped_law
 
-_PAPERS_GRID = GridSpec().model_dump(mode="json")
+_PAPERS_GRID = HomeGrid().model_dump(mode="json")
 
 
 def channels_as_json(channels: Sequence[WeightedChannel]) -> dict[str, Any]:

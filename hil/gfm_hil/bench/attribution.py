@@ -14,8 +14,8 @@ If a tick began while a side was still late from the missed tick before it, it h
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,14 +108,14 @@ def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> N
 
 
 def counts(causes: NDArray[np.int64]) -> dict[str, int]:
-    """How often each cause was found."""
+    """How many ticks each cause has."""
     return {name: int(np.sum(causes == k)) for k, name in enumerate(CAUSES)}
 
 
-def bursts(missed: NDArray[Any]) -> dict[int, int]:
-    """Number of bursts of each length, from the missed ticks in ascending order."""
-    if not len(missed):
-        return {}
-    ends = np.flatnonzero(np.diff(missed) != 1)
-    lengths = np.diff(np.concatenate([[-1], ends, [len(missed) - 1]]))
-    return {int(n): int(c) for n, c in zip(*np.unique(lengths, return_counts=True), strict=True)}
+def bursts(runs: Iterable[NDArray[np.int64]]) -> list[tuple[int, int]]:
+    """(length, number of bursts of it), from the missed ticks of runs, each in ascending order."""
+    lengths = Counter[int]()
+    for missed in runs:
+        ends = np.flatnonzero(np.diff(missed, append=-1) != 1)
+        lengths.update(np.diff(ends, prepend=-1).tolist())
+    return sorted(lengths.items())

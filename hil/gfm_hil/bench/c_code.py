@@ -21,7 +21,7 @@ from gfm_runtime.signals import NU
 Drive = Callable[..., None]
 
 T_S = 1e-4  # s, of the laws
-SOURCES = Path(__file__).parent
+_DRIVE = Path(__file__).with_name("kernel_drive.c")
 FLAGS = "-O3"
 # A fused multiply-add rounds once, the kernel twice. Compilers for x86-64 do not fuse with -O3
 # alone; compilers for other processors do.
@@ -32,42 +32,24 @@ class NoCompiler(Exception):
     """There is no C compiler, or it fails; the message is one line for the report."""
 
 
-def compiler() -> str:
-    """The C compiler: $CC or cc.
-
-    Raises:
-        NoCompiler: there is none.
-    """
-    name = os.environ.get("CC", "cc")
-    if shutil.which(name) is None:
-        raise NoCompiler(f"no C compiler: {name} is not there; install one or set CC")
-    return name
-
-
 def compile_c(
-    source: str, folder: Path, name: str, flags: str = FLAGS, more: Sequence[Path] = ()
+    source: Path, folder: Path, name: str, flags: str = FLAGS, more: Sequence[Path] = ()
 ) -> Path:
-    """Compile a source of this package and more into ``folder``/``name``.so; headers may be there
-    too.
+    """Compile sources into ``folder``/``name``.so by $CC or cc; headers may be there too.
 
     Raises:
         NoCompiler: there is none, or it fails.
     """
-    library = folder / f"{name}.so"
-    command = [compiler(), *shlex.split(flags), *_ALWAYS, f"-I{folder}"]
-    command += [str(SOURCES / source), *map(str, more)]
-    done = subprocess.run(
-        [*command, "-o", str(library), "-lm"], capture_output=True, text=True, check=False
-    )
+    compiler, library = os.environ.get("CC", "cc"), folder / f"{name}.so"
+    if shutil.which(compiler) is None:
+        raise NoCompiler(f"no C compiler: {compiler} is not there; install one or set CC")
+    command = [compiler, *shlex.split(flags), *_ALWAYS, f"-I{folder}"]
+    command += [str(source), *map(str, more), "-o", str(library), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         first = next(iter(done.stderr.splitlines()), "")
-        raise NoCompiler(f"the C compiler refused {source}: {first}")
+        raise NoCompiler(f"the C compiler refused {source.name}: {first}")
     return library
-
-
-def load_c(library: Path) -> ctypes.CDLL:
-    """The compiled functions; calls release the interpreter's lock."""
-    return ctypes.CDLL(str(library))
 
 
 class Twin:
@@ -119,4 +101,4 @@ def compile_twin(folder: Path, names: Sequence[str], real: DTypeLike, flags: str
         (folder / file).write_text(text, encoding="utf-8")
     laws = [folder / file for file in files if file.endswith(".c") and file != "gfm.c"]
     name = f"twin_{np.dtype(real)}"
-    return Twin(load_c(compile_c("kernel_drive.c", folder, name, flags, laws)), modules)
+    return Twin(ctypes.CDLL(str(compile_c(_DRIVE, folder, name, flags, laws))), modules)

@@ -10,38 +10,35 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from statistics import NormalDist, median
+from statistics import median
 from typing import Any
 
 import numpy as np
+from scipy.stats import mannwhitneyu, rankdata
 
-from gfm_hil.bench.tables import Table, lockstep_name, times
+from gfm_hil.bench.tables import lockstep_name, times
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.table import Table
 
 BELIEVED = 0.05  # limit of a corrected p value
 _EXACT = 200_000  # most orders counted one by one; beyond, use the normal approximation
+
+Sample = tuple[str, list[float]]
 
 
 def rank_test(a: Sequence[float], b: Sequence[float]) -> float:
     """p value of the two-sided Mann-Whitney test, ties at their mean rank.
 
-    If there are few, it counts all assignments of the ranks, and so is exact with ties too; else it
-    uses the normal approximation with the corrections for ties and continuity.
+    If there are few, it counts all assignments of the ranks, and so is exact with ties too, which
+    SciPy's is not; else it is SciPy's normal approximation.
     """
     n, m = len(a), len(b)
-    both = np.asarray([*a, *b], float)
-    ranks = np.array([(both < x).sum() + (1 + (both == x).sum()) / 2 for x in both])
+    if math.comb(n + m, n) > _EXACT:
+        return float(mannwhitneyu(a, b, method="asymptotic").pvalue)
+    ranks = rankdata([*a, *b])
     mean = n * (n + m + 1) / 2
-    distance = abs(ranks[:n].sum() - mean)
-    if math.comb(n + m, n) <= _EXACT:
-        sums = np.array([sum(some) for some in combinations(ranks.tolist(), n)])
-        return float(np.mean(np.abs(sums - mean) >= distance - 1e-9))
-    _, ties = np.unique(both, return_counts=True)
-    shrink = 1 - float((ties**3 - ties).sum()) / ((n + m) ** 3 - (n + m))
-    sigma = math.sqrt(n * m * (n + m + 1) / 12 * shrink)
-    if sigma == 0:
-        return 1.0
-    return min(1.0, 2 * (1 - NormalDist().cdf(max(distance - 0.5, 0.0) / sigma)))
+    sums = np.array([sum(some) for some in combinations(ranks.tolist(), n)])
+    return float(np.mean(np.abs(sums - mean) >= abs(ranks[:n].sum() - mean) - 1e-9))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -63,38 +60,38 @@ def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[s
     Raises:
         UserError: they have nothing in common.
     """
-    ours, theirs = (dict(_samples(content, by_limit)) for content in (a, b))
-    names = [name for name in ours if name in theirs and ours[name][0] == theirs[name][0]]
-    if not names:
+    in_a, in_b = (dict(_samples(content, by_limit)) for content in (a, b))
+    rows = [name for name in in_a if name in in_b and in_a[name][0] == in_b[name][0]]
+    if not rows:
         raise UserError("A and B have no row in common: the same `gfmhil bench` must be run twice")
-    pairs = [(ours[name][1], theirs[name][1]) for name in names]
-    corrected = holm([rank_test(*pair) for pair in pairs])
-    rows = []
-    for name, (x, y), p in zip(names, pairs, corrected, strict=True):
-        # the smallest p possible with this number of rounds, corrected as the smallest of all rows
-        reach = 2 / math.comb(len(x) + len(y), len(x)) * len(names)
-        real = p < BELIEVED
-        rows.append(
-            {
-                "row": name,
-                "unit": ours[name][0],
-                "a": median(x),
-                "b": median(y),
-                "ratio": median(y) / median(x),
-                "rounds": [len(x), len(y)],
-                "p": p,
-                "verdict": "real change"
-                if real
-                else ("noise" if reach < BELIEVED else "too few rounds to tell"),
-            }
-        )
-    return rows
+    corrected = holm([rank_test(in_a[name][1], in_b[name][1]) for name in rows])
+    return [
+        _row(name, *in_a[name], in_b[name][1], p, len(rows))
+        for name, p in zip(rows, corrected, strict=True)
+    ]
+
+
+def _row(
+    name: str, unit: str, x: list[float], y: list[float], p: float, rows: int
+) -> dict[str, Any]:
+    # the smallest p possible with this number of rounds, corrected as the smallest of all rows
+    reach = 2 / math.comb(len(x) + len(y), len(x)) * rows
+    undecided = "noise" if reach < BELIEVED else "too few rounds to tell"
+    return {
+        "row": name,
+        "unit": unit,
+        "a": median(x),
+        "b": median(y),
+        "ratio": median(y) / median(x),
+        "rounds": [len(x), len(y)],
+        "p": p,
+        "verdict": "real change" if p < BELIEVED else undecided,
+    }
 
 
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
     """The rows as a table for display."""
     return Table(
-        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
         ("", "A", "B", "unit", "B : A", "p", "verdict"),
         [
             (
@@ -103,12 +100,11 @@ def comparison_table(rows: list[dict[str, Any]]) -> Table:
             )
             for r in rows
         ],
+        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
     )  # fmt: skip
 
 
-def _samples(
-    content: dict[str, Any], by_limit: bool
-) -> Iterator[tuple[str, tuple[str, list[float]]]]:
+def _samples(content: dict[str, Any], by_limit: bool) -> Iterator[tuple[str, Sample]]:
     """(row, (unit, value of each round))."""
     for r in content["results"]:
         name = f"{r['name']}, {r['mode']}, {r['load']}, {r['policy']}, {r['payload']} B"

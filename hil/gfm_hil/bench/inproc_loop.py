@@ -9,7 +9,8 @@ but not of the closed loop, so the parts need not add up to the whole.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
-from gfm_hil.bench.rounds import RUNS, Spread, quickest, seconds, take_turns
+from gfm_hil.bench.rounds import RUNS, ShowProgress, quickest, seconds, spread, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
@@ -36,6 +37,7 @@ LAWS = (
     "matching-1", "hybrid-angle",
 )  # fmt: skip
 RIG = "mimo-gfm, rig"
+_TICKS = 2_000  # of a short run
 
 
 @compiled
@@ -78,8 +80,11 @@ def recording_alone(plant, ctl, states, est, y, u, plant_rows, controller_rows):
         record_command(plant_rows[k], u)
 
 
-class Loop:
-    """A bench that can be reset to its start, and files for its recording."""
+class InprocLoop:
+    """A bench that can be reset to its start, and files for its recording.
+
+    What measures returns ns per tick.
+    """
 
     def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
         bench = make_bench(load_scenario(scenario, law=law, in_process=True))
@@ -98,12 +103,13 @@ class Loop:
         self._y, self._u = np.split(self.plant[:, : NY + NU].copy(), [NY], axis=1)
 
     def reset(self) -> Bench:
+        """Put every record back to the start."""
         for array, start in zip(self._kept, self._start, strict=True):
             array[:] = start
         return self.bench
 
     def whole(self, ticks: int | None = None) -> float:
-        """ns per tick of the closed loop.
+        """The closed loop.
 
         Raises:
             UserError: the run ended early, so that there is nothing to time.
@@ -123,28 +129,26 @@ class Loop:
         return time
 
     def plant_part(self) -> float:
-        """ns per tick of the plant alone."""
+        """The plant alone."""
         b = self.reset()
-        return self._per_tick(lambda: plant_alone(b.plant.records, b.y, b.u, self._u))
+        return self._per_tick(plant_alone, b.plant.records, b.y, b.u, self._u)
 
     def plants_half(self) -> float:
-        """ns per tick of the plant and its recording, into rows not written lately, as in a run."""
+        """The plant and its recording, into rows not written lately, as in a run."""
         b, rows = self.reset(), next(self._rows)
-        return self._per_tick(lambda: plants_half(b.plant.records, b.y, b.u, self._u, rows))
+        return self._per_tick(plants_half, b.plant.records, b.y, b.u, self._u, rows)
 
     def controller_part(self) -> float:
-        """ns per tick of the controller alone."""
+        """The controller alone."""
         b, c = self.reset(), self.bench.controller
-        return self._per_tick(
-            lambda: controller_alone(c.ctl, c.laws, c.states, c.est, b.y, b.u, self._y)
-        )
+        return self._per_tick(controller_alone, c.ctl, c.laws, c.states, c.est, b.y, b.u, self._y)
 
     def recording_part(self) -> float:
-        """ns per tick of the recording alone."""
+        """The recording alone."""
         b, c = self.reset(), self.bench.controller
-        rows = (self.plant, self.controller)
+        rows = self.plant, self.controller
         return self._per_tick(
-            lambda: recording_alone(b.plant.records, c.ctl, c.states, c.est, b.y, b.u, *rows)
+            recording_alone, b.plant.records, c.ctl, c.states, c.est, b.y, b.u, *rows
         )
 
     def allocations_per_tick(self) -> float:
@@ -159,46 +163,33 @@ class Loop:
         self.whole(ticks)
         return int(rtsys.get_allocation_stats().alloc) - before
 
-    def _per_tick(self, work: Callable[[], object]) -> float:
-        return seconds(work) / self.ticks * 1e9
+    def _per_tick(self, work: Callable[..., object], *arguments: Any) -> float:
+        return seconds(lambda: work(*arguments)) / self.ticks * 1e9
 
 
-def measure(
-    laws: Sequence[str], ticks: int, turns: int, folder: Path, tell: Callable[[str, float], None]
-) -> list[dict[str, Any]]:
-    """ns per tick of laws and of the rig, one row each.
-
-    Args:
-        laws: names.
-        ticks: of a short run; a turn has ``RUNS`` of them.
-        turns: of each.
-        folder: for the recordings.
-        tell: called with the present work and the share done.
+def measure_laws(
+    laws: Sequence[str], rounds: int, folder: Path, show: ShowProgress
+) -> Iterator[dict[str, Any]]:
+    """ns per tick of laws and of the rig, one row each; ``folder`` is for the recordings.
 
     Raises:
         UserError: a run ended early, so that there is nothing to time.
     """
-    jobs = {name: ("pref_step", name) for name in laws}
-    jobs[RIG] = ("rig_pref_step", "mimo-gfm")
-    rows = []
-    for k, (name, (scenario, law)) in enumerate(jobs.items()):
-        tell(f"loop in process, {name}", k / len(jobs))
-        rows.append({"law": name, **_measure(Loop(scenario, law, ticks, folder / name), turns)})
-    return rows
-
-
-def _measure(loop: Loop, turns: int) -> dict[str, Any]:
-    found = take_turns(
-        {
-            "whole": lambda: quickest(loop.whole),
-            "plant": lambda: quickest(loop.plant_part),
-            "controller": lambda: quickest(loop.controller_part),
-            "recording": lambda: quickest(loop.recording_part),
-        },
-        turns,
-    )
-    rate = Spread.of([loop.T_s * 1e9 / ns for ns in found["whole"]])
-    return {f"{name}_ns": Spread.of(times).plain() for name, times in found.items()} | {
-        "times_real_time": rate.plain(),
-        "allocations_per_tick": loop.allocations_per_tick(),
-    }
+    runs = {name: ("pref_step", name) for name in laws or LAWS}
+    runs[RIG] = ("rig_pref_step", "mimo-gfm")
+    for k, (name, (scenario, law)) in enumerate(runs.items()):
+        show(f"loop in process, {name}", k / len(runs))
+        loop = InprocLoop(scenario, law, _TICKS, folder / name)
+        parts = {
+            "whole": loop.whole,
+            "plant": loop.plant_part,
+            "controller": loop.controller_part,
+            "recording": loop.recording_part,
+        }
+        times = take_turns({n: partial(quickest, part) for n, part in parts.items()}, rounds)
+        yield {
+            "law": name,
+            **{f"{part}_ns": spread(ns) for part, ns in times.items()},
+            "times_real_time": spread([loop.T_s * 1e9 / ns for ns in times["whole"]]),
+            "allocations_per_tick": loop.allocations_per_tick(),
+        }

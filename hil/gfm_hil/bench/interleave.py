@@ -7,19 +7,19 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gfm_hil.bench.options import KINDS
 from gfm_hil.bench.result import check_result, write_result
+from gfm_hil.bench.rounds import ShowProgress, in_turn
 from gfm_hil.core.errors import UserError
 
-KINDS = ("latency", "jitter", "kernel", "loop")
 _LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # lists that every round extends
 
 
 def interleave(
-    a: str, b: str, turns: int, what: str, folder: Path, tell: Callable[[str, float], None]
+    a: str, b: str, turns: int, what: str, folder: Path, show: ShowProgress
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run both ``turns`` times, one round each; returns the results and writes them to ``folder``.
 
@@ -28,7 +28,7 @@ def interleave(
         turns: of each; every second one begins with B.
         what: kind and options of ``gfmhil bench``.
         folder: for A.json and B.json: the first turn's result with the rounds of all turns.
-        tell: called with the present work and the share done.
+        show: gets the present work and the share done.
 
     Raises:
         UserError: there is no such command, or it fails (with its message).
@@ -42,15 +42,15 @@ def interleave(
     for name, command in commands.items():
         if not command or shutil.which(command[0]) is None:
             raise UserError(f"{name} = {shlex.join(command)!r}: no such command")
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in commands}
-    for turn in range(turns):
-        for k, name in enumerate(list(commands)[:: -1 if turn % 2 else 1]):
-            tell(f"round {turn + 1}, {name}", (turn + k / 2) / turns)
-            found[name].append(_once(name, commands[name], chosen))
-    results = {name: _merged(runs) for name, runs in found.items()}
-    for name, content in results.items():
-        write_result(content, folder / f"{name}.json")
-    return results["A"], results["B"]
+    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in commands}
+    for turn, share, name in in_turn(list(commands), turns):
+        show(f"round {turn + 1}, {name}", share)
+        runs[name].append(_once(name, commands[name], chosen))
+    for name, (first, *others) in runs.items():
+        for other in others:
+            _extend(first, other)
+        write_result(first, folder / f"{name}.json")
+    return runs["A"][0], runs["B"][0]
 
 
 def _once(name: str, command: list[str], chosen: list[str]) -> dict[str, Any]:
@@ -60,29 +60,22 @@ def _once(name: str, command: list[str], chosen: list[str]) -> dict[str, Any]:
         done = subprocess.run(line, capture_output=True, text=True, check=False)
     about = f"{name}: {shlex.join([*command, 'bench', *chosen])}"
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        raise UserError(f"{about}: {said[-1] if said else f'exit code {done.returncode}'}")
+        lines = done.stderr.strip().splitlines()
+        raise UserError(f"{about}: {lines[-1] if lines else f'exit code {done.returncode}'}")
     try:
         return check_result(json.loads(done.stdout), about)
     except ValueError:
         raise UserError(f"{about}: printed no JSON") from None
 
 
-def _merged(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """The first result, its lists of rounds extended by those of the others."""
-    first: dict[str, Any] = runs[0]
-    for other in runs[1:]:
-        _continue(first, other)
-    return first
-
-
-def _continue(kept: Any, more: Any) -> None:
+def _extend(kept: Any, more: Any) -> None:
+    """Extend a result's lists of rounds by those of another one."""
     if isinstance(kept, dict):
         for key, value in kept.items():
             if key in _LISTS:
                 value += more[key]
             elif key in more:
-                _continue(value, more[key])
+                _extend(value, more[key])
     elif isinstance(kept, list):
         for a, b in zip(kept, more, strict=False):
-            _continue(a, b)
+            _extend(a, b)

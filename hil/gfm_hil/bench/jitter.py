@@ -7,9 +7,8 @@ the ticks lost here: they are the host's share of the misses.
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable
 from contextlib import ExitStack
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,11 @@ from numpy.typing import NDArray
 
 from gfm_hil.bench.attribution import bursts
 from gfm_hil.bench.contenders import memory_folder
-from gfm_hil.bench.cpu_load import Load, cpu_load
+from gfm_hil.bench.cpu_load import cpu_load
 from gfm_hil.bench.histogram import summary
-from gfm_hil.bench.pair import Pair, Policy, pair
-from gfm_hil.bench.rounds import REST, Plan, rounds
+from gfm_hil.bench.options import BenchOptions
+from gfm_hil.bench.pair import Pair, pair
+from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
 from gfm_hil.realtime.clock import now_ns, sleep_until, wait_until
 from gfm_runtime.compiled import cached
 
@@ -63,44 +63,40 @@ def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
     return np.flatnonzero((late > allowed_ns).any(axis=0))
 
 
-def measure(plan: Plan, tell: Callable[[str, float], None]) -> list[dict[str, Any]]:
-    """Measure; returns one row per way to wait, load and policy."""
-    cells: dict[tuple[Policy, Load, str], list[NDArray[np.int64]]] = {
-        (policy, load, wait): []
-        for policy in plan.policies for load in plan.loads for wait in WAITS
-    }  # fmt: skip
+def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
+    """Add a row per policy, load and way to wait to ``jitter``."""
+    cells = list(product(options.policies, options.loads, WAITS))
+    late: dict[tuple[str, str, str], list[NDArray[np.int64]]] = {cell: [] for cell in cells}
     with ExitStack() as stack:
         load_is = stack.enter_context(cpu_load())
         two = {
             policy: stack.enter_context(pair(policy, memory_folder(stack)))
-            for policy in plan.policies
+            for policy in options.policies
         }
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compile before timing
-        for number in rounds(plan.rounds, plan.until):
-            for n, (policy, load, wait) in enumerate(list(cells)[:: -1 if number % 2 else 1]):
-                tell(f"{policy}, {load}, {wait}", (number + n / len(cells)) / plan.rounds)
-                with load_is(load):
-                    late = pace_both(two[policy], PERIOD_NS, WAITS[wait], plan.seconds)
-                cells[policy, load, wait].append(late)
-                time.sleep(REST * plan.seconds)
-    return [
-        {"policy": policy, "load": load, "wait": wait, "period_us": PERIOD_NS / 1e3}
-        | summary([late.ravel() for late in found])
-        | _lost(found, PERIOD_NS)
-        for (policy, load, wait), found in cells.items()
-    ]
+        for _, share, cell in in_turn(cells, options.rounds, options.until):
+            policy, load, wait = cell
+            show(", ".join(cell), share)
+            with load_is(load):
+                times = pace_both(two[policy], PERIOD_NS, WAITS[wait], options.seconds)
+            late[cell].append(times)
+            time.sleep(REST * options.seconds)
+    content["jitter"] = [_row(*cell, late[cell]) for cell in cells]
 
 
-def _lost(found: list[NDArray[np.int64]], period_ns: int) -> dict[str, Any]:
-    ticks = sum(late.shape[1] for late in found)
-    gone = [lost(late, period_ns) for late in found]
-    lengths = Counter[int]()
-    for some in gone:
-        lengths.update(bursts(some))
+def _row(policy: str, load: str, wait: str, rounds: list[NDArray[np.int64]]) -> dict[str, Any]:
+    ticks = sum(late.shape[1] for late in rounds)
+    gone = [lost(late, PERIOD_NS) for late in rounds]
+    count = sum(map(len, gone))
     return {
+        "policy": policy,
+        "load": load,
+        "wait": wait,
+        "period_us": PERIOD_NS / 1e3,
+        **summary([late.ravel() for late in rounds]),
         "ticks": ticks,
-        "lost": sum(map(len, gone)),
-        "lost_pct": round(100 * sum(map(len, gone)) / ticks, 4),
-        "bursts": sorted(lengths.items()),
+        "lost": count,
+        "lost_pct": round(100 * count / ticks, 4),
+        "bursts": bursts(gone),
     }

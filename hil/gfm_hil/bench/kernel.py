@@ -8,17 +8,19 @@ output into its limits, and their outputs and states are compared bit by bit.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.bench.c_code import FLAGS, T_S, Drive, NoCompiler, Twin, compile_twin
-from gfm_hil.bench.rounds import Spread, quickest, ratio, seconds, take_turns
-from gfm_runtime import discretise, get_law
+from gfm_hil.bench.c_code import T_S, Drive, NoCompiler, Twin, compile_twin
+from gfm_hil.bench.options import BenchOptions
+from gfm_hil.bench.rounds import ShowProgress, quickest, ratios, seconds, spread, take_turns
+from gfm_runtime import discretise, get_law, law_names
 from gfm_runtime.compiled import compiled
 from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
@@ -26,6 +28,8 @@ from gfm_runtime.signals import NU, NY, group
 ROWS = 256  # different measurements, used in turn
 FEEDBACK = 1e-6  # p.u. of y per p.u. of u
 REALS = ("float64", "float32")
+_STEPS = 10_000  # in one of the short runs of a turn
+_COMPARED = 40  # times all rows, before the timing
 
 
 def io_dtype(real: DTypeLike) -> np.dtype[Any]:
@@ -105,93 +109,65 @@ def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
     return int(np.max(np.abs(ordered(a) - ordered(b)), initial=0))
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Distance of two chains, and how often the outputs i_u, omega_u, E_u were limited."""
+def compare(name: str, real: DTypeLike, twin: Twin, rounds: int) -> tuple[int, list[int]]:
+    """Run numba and C on the same extreme inputs, ``rounds`` times all rows.
 
-    ulps: int
-    limited: tuple[int, ...]
-
-
-def compare(name: str, real: DTypeLike, twin: Twin, rounds: int) -> Agreement:
-    """Run numba and C on the same extreme inputs; ``rounds`` times all rows."""
+    Returns the largest distance of their outputs and states, ``ulps``, and how often the outputs
+    i_u, omega_u, E_u were limited.
+    """
     ours, theirs = (Chain.make(name, real, 0.5, of) for of in (None, twin))
     n = int(ours.law["n"][0])
     worst, limited = 0, np.zeros(NU, int)
     for _ in range(rounds):
         ours.run(ROWS)
         theirs.run(ROWS)
-        worst = max(worst, ulps(ours.outputs, theirs.outputs))
-        worst = max(worst, ulps(ours.state["x"][:, :n], theirs.state["x"][:, :n]))
-        for field in ("offset", "u", "trend"):
-            worst = max(worst, ulps(ours.state[field], theirs.state[field]))
+        pairs = [(ours.outputs, theirs.outputs)]
+        pairs += [(ours.state["x"][:, :n], theirs.state["x"][:, :n])]
+        pairs += [(ours.state[f], theirs.state[f]) for f in ("offset", "u", "trend")]
+        worst = max(worst, *(ulps(a, b) for a, b in pairs))
         limited += ours.limited().sum(axis=0)
-    return Agreement(worst, tuple(int(n) for n in limited))
+    return worst, limited.tolist()
 
 
-def time_laws(
-    names: Sequence[str], real: DTypeLike, twin: Twin | None, steps: int, turns: int
-) -> dict[str, dict[str, Any]]:
-    """ns per step of every law by numba and by C, and their ratio; None without a twin."""
+def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
+    """Add a row per law and real type to ``kernel``."""
+    names = options.laws or law_names()
+    content["kernel"] = []
+    for k, real in enumerate(REALS):
+        show(f"kernel, {real}", k / len(REALS))
+        with tempfile.TemporaryDirectory() as place:
+            try:
+                twin = compile_twin(Path(place), names, real, options.cflags)
+            except NoCompiler as problem:
+                twin = None
+                content["remarks"].append(f"kernel, {real}: {problem}; nothing to compare with")
+            content["kernel"] += _rows(names, real, twin, options.rounds)
+
+
+def _rows(
+    names: Sequence[str], real: str, twin: Twin | None, rounds: int
+) -> Iterator[dict[str, Any]]:
+    agreement = {n: compare(n, real, twin, _COMPARED) for n in names} if twin else {}
 
     def job(name: str, of: Twin | None) -> float:
+        """ns per step."""
         chain = Chain.make(name, real, 1e-3, of)
         chain.run(ROWS)  # warm up
-        return quickest(lambda: seconds(lambda: chain.run(steps))) / steps * 1e9
+        return quickest(lambda: seconds(lambda: chain.run(_STEPS))) / _STEPS * 1e9
 
-    ways: dict[str, Twin | None] = {"numba": None} | ({"c": twin} if twin else {})
-    jobs = {
-        f"{n} {way}": (lambda n=n, of=of: job(n, of)) for n in names for way, of in ways.items()
-    }
-    found = take_turns(jobs, turns)
-    return {
-        n: {
-            "numba_ns": Spread.of(found[f"{n} numba"]).plain(),
-            "c_ns": Spread.of(found[f"{n} c"]).plain() if twin else None,
-            "ratio": ratio(found[f"{n} numba"], found[f"{n} c"]).plain() if twin else None,
+    ways: dict[str, Twin | None] = {"numba": None} | ({"C": twin} if twin else {})
+    jobs = {f"{n} {way}": partial(job, n, of) for n in names for way, of in ways.items()}
+    times = take_turns(jobs, rounds)
+    for n in names:
+        numba, c = times[f"{n} numba"], times.get(f"{n} C")
+        worst, limited = agreement.get(n, (None, None))
+        yield {
+            "law": n,
+            "real": real,
+            "states": int(Chain.make(n, real, 0.0).law["n"][0]),
+            "numba_ns": spread(numba),
+            "c_ns": spread(c) if c else None,
+            "ratio": spread(ratios(numba, c)) if c else None,
+            "ulps": worst,
+            "limited": limited,
         }
-        for n in names
-    }
-
-
-def measure(
-    names: Sequence[str],
-    steps: int,
-    turns: int,
-    tell: Callable[[str, float], None],
-    flags: str = FLAGS,
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Measure laws; returns (rows, remarks), one row per law and real type.
-
-    Args:
-        names: of laws.
-        steps: in one of the ``RUNS`` short runs of a turn.
-        turns: of each.
-        tell: called with the present work and the share done.
-        flags: for the C compiler.
-    """
-    rows: list[dict[str, Any]] = []
-    remarks: list[str] = []
-    for k, real in enumerate(REALS):
-        tell(f"kernel, {real}", k / len(REALS))
-        with tempfile.TemporaryDirectory() as place:
-            twin: Twin | None = None
-            try:
-                twin = compile_twin(Path(place), names, real, flags)
-            except NoCompiler as problem:
-                remarks.append(f"kernel, {real}: {problem}; nothing to compare with")
-            agreements = {n: compare(n, real, twin, rounds=40) for n in names} if twin else {}
-            times = time_laws(names, real, twin, steps, turns)
-        for n in names:
-            same = agreements.get(n)
-            rows.append(
-                {
-                    "law": n,
-                    "real": real,
-                    "states": int(Chain.make(n, real, 0.0).law["n"][0]),
-                    **times[n],
-                    "ulps": same.ulps if same else None,
-                    "limited": list(same.limited) if same else None,
-                }
-            )
-    return rows, remarks

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.bench.c_code import NoCompiler, compile_c
-from gfm_hil.bench.contenders import Contender, memory_folder, of_links
+from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
 from gfm_hil.bench.cpu_load import Load, cpu_load
 from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.options import BenchOptions, Mode
 from gfm_hil.bench.pair import pair
-from gfm_hil.bench.rounds import REST, Plan, rounds
+from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
 from gfm_hil.core.errors import UserError
 
-Mode = Literal["lockstep", "realtime"]
-MODES: tuple[Mode, ...] = ("lockstep", "realtime")
 PERIOD_NS = 100_000
-
 _FIRST_S = 0.02  # length of the warm-up round
-
-Tell = Callable[[str, float], None]  # present work and share done
 
 
 @dataclass
-class _Cell:
-    """One contender in one mode under one load.
+class _RoundTrips:
+    """Those of one contender in one mode under one load.
 
     Attributes:
         rounds: round trips of each round, ns.
@@ -45,57 +39,53 @@ class _Cell:
     silent: int = 0
 
 
-def measure(plan: Plan, tell: Tell) -> tuple[list[dict[str, Any]], list[str]]:
-    """Measure; returns (results, remarks), one result per contender, mode and load.
+def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
+    """Add a row per contender, mode and load to ``results``.
 
     A link that is not available here is left out, with a remark.
     """
-    remarks: list[str] = []
+    cells: list[_RoundTrips] = []
     with ExitStack() as stack:
         place = memory_folder(stack)
-        try:
-            library = compile_c("pingpong.c", place, "pingpong")
-        except NoCompiler as problem:
-            library = None
-            remarks.append(f"{problem}: no limits in C, no ratios")
-        contenders = of_links(list(plan.links), place, library)
-        two = stack.enter_context(pair(plan.policies[0], place))
+        contenders, remarks = contenders_of(options.links, place)
+        two = stack.enter_context(pair(options.policies[0], place))
         load = stack.enter_context(cpu_load())
-        cells = []
-        for contender in contenders:
-            tell(f"opening {contender.name}", 0.0)
+        for c in contenders:
+            show(f"opening {c.name}", 0.0)
             try:
-                compiled = two.open(contender, plan.payload)
+                compiled = two.open(c, options.payload)
             except UserError as problem:
-                remarks.append(f"{contender.name}: not measured: {problem}")
+                remarks.append(f"{c.name}: not measured: {problem}")
                 continue
-            cells += [_Cell(contender, m, w, compiled) for w in plan.loads for m in plan.modes]
+            cells += [_RoundTrips(c, m, w, compiled) for w in options.loads for m in options.modes]
 
-        def one_round(number: int, seconds: float) -> None:
-            for k, cell in enumerate(cells[:: -1 if number % 2 else 1]):
-                share = (number + k / len(cells)) / plan.rounds
-                tell(f"{cell.contender.name}, {cell.mode}, {cell.load}", max(share, 0.0))
+        def one_round(cell: _RoundTrips, seconds: float, share: float) -> NDArray[np.int64]:
+            show(f"{cell.contender.name}, {cell.mode}, {cell.load}", share)
+            with load(cell.load):
                 period = PERIOD_NS if cell.mode == "realtime" else 0
-                with load(cell.load):
-                    times = two.round(cell.contender, period, seconds)
-                time.sleep(REST * seconds)
-                if number >= 0 and len(times):
-                    cell.rounds[number] = times
-                cell.silent += not len(times)
+                times = two.round(cell.contender, period, seconds)
+            time.sleep(REST * seconds)
+            cell.silent += not len(times)
+            return times
 
-        one_round(-1, _FIRST_S)  # compile and warm up
-        for number in rounds(plan.rounds, plan.until):
-            one_round(number, plan.seconds)
+        for cell in cells:  # compile and warm up
+            one_round(cell, _FIRST_S, 0.0)
+        for number, share, cell in in_turn(cells, options.rounds, options.until):
+            times = one_round(cell, options.seconds, share)
+            if len(times):
+                cell.rounds[number] = times
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
-    results = [_result(c, by_key.get((c.contender.baseline, c.mode, c.load)), plan) for c in cells]
-    return results, remarks
+    content["results"] += [
+        _row(c, by_key.get((c.contender.limit, c.mode, c.load)), options) for c in cells
+    ]
+    content["remarks"] += remarks
 
 
-def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
-    c = cell.contender
-    both = sorted(cell.rounds.keys() & baseline.rounds.keys()) if baseline else []
+def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) -> dict[str, Any]:
+    c, of_limit = cell.contender, limit.rounds if limit else {}
     ratios = [
-        float(np.median(cell.rounds[k]) / np.median(baseline.rounds[k])) for k in both if baseline
+        float(np.median(cell.rounds[k]) / np.median(of_limit[k]))
+        for k in sorted(cell.rounds.keys() & of_limit.keys())
     ]
     return {
         "name": c.name,
@@ -104,10 +94,10 @@ def _result(cell: _Cell, baseline: _Cell | None, plan: Plan) -> dict[str, Any]:
         "code": "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python"),
         "mode": cell.mode,
         "load": cell.load,
-        "policy": plan.policies[0],
-        "payload": plan.payload,
+        "policy": options.policies[0],
+        "payload": options.payload,
         **summary(list(cell.rounds.values())),
-        "baseline": c.baseline or None,
+        "baseline": c.limit or None,
         "ratio_to_baseline_p50": round(float(np.median(ratios)), 4) if ratios else None,
         "rounds_ratio": [round(ratio, 4) for ratio in ratios],
         "silent_rounds": cell.silent,

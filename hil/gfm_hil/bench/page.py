@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import base64
-import html
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench import tables
-from gfm_hil.bench.plots import figures
-from gfm_hil.results.report import html_table
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from gfm_hil.bench import plots, tables
+from gfm_hil.results import page
+from gfm_hil.results.table import Table
 
 _STYLE = """
-body{font:15px/1.55 system-ui,sans-serif;max-width:76rem;margin:2rem auto;padding:0 1.2rem;
-color:#222;background:#fff}
-h1{font-size:1.5rem;margin:0 0 .2rem} h2{font-size:1.15rem;margin:2.4rem 0 .3rem}
-p{max-width:52rem;margin:.4rem 0} .dim{color:#666;font-size:.9rem}
-.badge{display:flex;flex-wrap:wrap;gap:.4rem;margin:1rem 0}
-.badge span{border:1px solid #d8d8d8;border-radius:.4rem;padding:.1rem .55rem;font-size:.82rem}
-.badge b{font-weight:500;color:#666;margin-right:.35rem}
-.badge .warn{border-color:#d09000;background:#fff6e0}
-.cards{display:flex;flex-wrap:wrap;gap:.8rem;margin:.8rem 0}
-.card{border:1px solid #e0e0e0;border-radius:.6rem;padding:.6rem 1rem;min-width:11rem}
-.card .v{font-size:1.45rem;font-variant-numeric:tabular-nums} .card .t{font-size:.82rem;color:#666}
-table{border-collapse:collapse;margin:.5rem 0 1.2rem;font-size:.88rem}
-caption{text-align:left;font-weight:600;padding:.2rem 0}
-th,td{padding:.18rem .9rem .18rem 0;text-align:right;border-bottom:1px solid #ececec;
-font-variant-numeric:tabular-nums;white-space:nowrap} th{font-weight:500;color:#666}
-th:first-child,td:first-child{text-align:left} td.limit{color:#888} .scroll{overflow-x:auto}
-img{max-width:100%;display:block;margin:.6rem 0} li{max-width:52rem}
+.dim{opacity:.7;font-size:.9rem}
+.badge,.cards{display:flex;flex-wrap:wrap;gap:.5rem;margin:1rem 0}
+.badge span,.card{border:1px solid var(--line);border-radius:.4rem;padding:.1rem .55rem}
+.badge{font-size:.82rem} .badge b{font-weight:500;opacity:.7;margin-right:.35rem}
+.badge .warn{border-color:var(--wrong);color:var(--wrong)}
+.card{padding:.6rem 1rem;min-width:11rem} .card .v{font-size:1.45rem} .card .t{font-size:.82rem}
+img{max-width:100%}
 """
 
 _BADGE = (
@@ -41,103 +35,136 @@ _BADGE = (
     ("libzmq", "libzmq"), ("gfmhil", "gfmhil"),
 )  # fmt: skip
 
-_SECTIONS = {
-    "latency": (
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page, of which there may be nothing in a result.
+
+    Attributes:
+        name: of its figure's file.
+        heading, text: what it shows.
+        tables, figure: made of a result.
+    """
+
+    name: str
+    heading: str
+    text: str
+    tables: Callable[[dict[str, Any]], Iterator[Table]]
+    figure: Callable[[dict[str, Any]], Figure | None]
+
+
+SECTIONS = (
+    Section(
+        "latency",
         "Round trips",
         "A message and its answer, between two processes on two processors. Solid: the "
         "links of the bench; dashed: the limit, the same exchange in C, in the same rounds. "
         "lockstep: one after the other. realtime: one every 100 µs, counted from its deadline, so "
         "that a late start is part of it. busy: another process computes on each processor.",
+        tables.latency_tables,
+        plots.latency,
     ),
-    "misses": (
+    Section(
+        "misses",
         "Real time",
         "The product at 10 kHz: ticks whose answer had not come by the next deadline, and why. The "
         "mark is what a loop that only waits for its ticks lost on the same processors right "
         "before and after the run: no link can avoid these misses.",
+        tables.realtime_tables,
+        plots.misses,
     ),
-    "jitter": (
+    Section(
+        "jitter",
         "Pacing",
         "A loop that waits for the next deadline and does nothing else, on both processors at a "
         "time. The line is the period: beyond it a whole tick is lost. The kernel stops a "
         "SCHED_FIFO thread that only spins for 5 % of each second, so the bench sleeps first and "
         "then spins.",
+        tables.jitter_tables,
+        plots.jitter,
     ),
-    "lockstep": (
+    Section(
+        "lockstep",
         "Lockstep",
         "The closed loop in simulated time, as fast as possible, and the rate that the plant's "
         "arithmetic alone allows. inproc: both sides in one compiled loop, without a link.",
+        tables.lockstep_tables,
+        plots.lockstep,
     ),
-    "kernel": (
+    Section(
+        "kernel",
         "Kernel",
         "One step of the controller for every law, each waiting for the previous one, and the "
         "same step in C, as gfmhil firmware export writes it, with the same bits as result.",
+        tables.kernel_tables,
+        plots.kernel,
     ),
-}
+)
+
+
+def all_tables(content: dict[str, Any]) -> Iterator[tuple[str, Table]]:
+    """All tables of a result, each with the name of its section."""
+    return ((section.name, table) for section in SECTIONS for table in section.tables(content))
+
+
+def figures(content: dict[str, Any]) -> dict[str, bytes]:
+    """Every figure that a result has data for: name and SVG."""
+    drawn = {section.name: section.figure(content) for section in SECTIONS}
+    return {name: _svg(figure) for name, figure in drawn.items() if figure is not None}
+
+
+def _svg(figure: Figure) -> bytes:
+    out = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # equal results give equal bytes
+        figure.savefig(out, format="svg", metadata={"Date": None})
+    return out.getvalue()
 
 
 def write_page(content: dict[str, Any], path: Path) -> None:
     """Write the page of a result, and its figures as files in the same folder."""
-    made = figures(content)
-    for name, svg in made.items():
+    images = figures(content)
+    for name, svg in images.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
-    by_section: dict[str, list[str]] = {name: [] for name in _SECTIONS}
-    for section, table in tables.tables(content):
-        by_section[section].append(html_table(table.columns, table.rows, table.heading))
-    parts = []
-    for name, (heading, text) in _SECTIONS.items():
-        if not by_section[name]:
-            continue
-        parts.append(f"<h2>{heading}</h2><p>{html.escape(text)}</p>")
-        if name in made:
-            uri = base64.b64encode(made[name]).decode()
-            parts.append(f'<img alt="{heading}" src="data:image/svg+xml;base64,{uri}">')
-        parts += by_section[name]
-    points = "".join(
-        f"<li>{html.escape(x)}</li>" for x in (*content["caveats"], *content["remarks"])
-    )
-    path.write_text(
-        f"""<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>gfmhil bench</title><style>{_STYLE}</style>
-<h1>gfmhil bench {html.escape(content["bench"])}</h1>
-<p class="dim">measured in {content["seconds"]:g} s, in interleaved rounds: p50, p90 and p99 are
-medians over them, what is beyond p99 is of all rounds together; a ratio is taken round by round</p>
-<div class="badge">{_badge(content["environment"])}</div>
-{_cards(content)}
-{"".join(parts)}
-<h2>What to keep in mind</h2><ul>{points}
-<li>Absolute times are this machine's at this moment; ratios within the run are what carries over.
-</li></ul></html>
-""",
-        encoding="utf-8",
+    page.write_page(
+        path,
+        "bench.html",
+        title=f"gfmhil bench {content['bench']}",
+        style=_STYLE,
+        seconds=content["seconds"],
+        badge=badge(content["environment"]),
+        cards=_cards(content),
+        sections=[
+            (s, s.name in images and page.inline(images[s.name], "svg+xml"), [*s.tables(content)])
+            for s in SECTIONS
+        ],
+        points=[*content["caveats"], *content["remarks"]],
     )
 
 
-def _badge(environment: dict[str, Any]) -> str:
-    bad = {
+def badge(environment: dict[str, Any]) -> Iterator[tuple[str, str, bool]]:
+    """What times depend on, as (label, text, whether it is a reason for caution)."""
+    caution = {
         "virtual_machine": lambda v: v != "no",
         "sched_fifo": lambda v: not v,
         "steal_pct": lambda v: (v or 0) > 0.1,
         "load_average": lambda v: v[0] > environment["cpus"] / 2,
     }
-    said = {True: "yes", False: "no"}
-    chips = []
     for key, label in _BADGE:
         value = environment.get(key)
         if value is None:
             continue
-        text = said.get(value, value) if isinstance(value, bool) else value
-        text = " ".join(map(str, text)) if isinstance(text, list) else str(text)
-        warn = ' class="warn"' if key in bad and bad[key](value) else ""
-        chips.append(f"<span{warn}><b>{label}</b>{html.escape(text)}</span>")
-    return "".join(chips)
+        if isinstance(value, bool):
+            text = "yes" if value else "no"
+        else:
+            text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+        yield label, text, key in caution and caution[key](value)
 
 
-def _cards(content: dict[str, Any]) -> str:
-    """The most important figures, one line per kind."""
+def _cards(content: dict[str, Any]) -> list[list[tuple[str, str]]]:
+    """The most important figures as (value, text), one line per kind."""
     loop = content.get("loop", {})
     trips = [
-        (f"{tables.micro(r['p50_us'])} µs", _compared(r))
+        (f"{tables.micro(r['p50_us'])} µs", f"{r['name']}: round trip{_compared(r)}")
         for r in content["results"]
         if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle")
     ]
@@ -155,17 +182,9 @@ def _cards(content: dict[str, Any]) -> str:
         )
         for r in loop.get("lockstep", ())
     ]
-    lines = []
-    for cards in filter(None, (trips, misses, rates)):
-        drawn = "".join(
-            f'<div class="card"><div class="v">{html.escape(value)}</div>'
-            f'<div class="t">{html.escape(text)}</div></div>'
-            for value, text in cards
-        )
-        lines.append(f'<div class="cards">{drawn}</div>')
-    return "".join(lines)
+    return [trips, misses, rates]
 
 
 def _compared(row: dict[str, Any]) -> str:
     ratio = row["ratio_to_baseline_p50"]
-    return f"{row['name']}: round trip" + (f", {tables.times(ratio)} the limit" if ratio else "")
+    return f", {tables.times(ratio)} the limit" if ratio else ""

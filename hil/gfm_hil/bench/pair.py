@@ -18,8 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.bench.contenders import CEnd, Contender
-from gfm_hil.bench.pingpong import LinkEnd
+from gfm_hil.bench.contenders import Contender
+from gfm_hil.bench.pingpong import PingPong
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
 from gfm_runtime.children import end_with_parent
@@ -27,12 +27,12 @@ from gfm_runtime.children import end_with_parent
 Policy = Literal["fifo", "other"]
 
 CAPACITY = 1 << 20  # most round trips in a round
-_START_S = 120.0
+_PATIENCE_S = 120.0
 WARM_NS = 20_000_000
 
 # state in each of the two processes
 _role: Role = "plant"
-_ends: dict[str, LinkEnd | CEnd] = {}
+_ends: dict[str, PingPong] = {}
 _took = np.zeros(0, np.int64)
 _stop = np.zeros(1, np.int64)
 
@@ -43,14 +43,14 @@ class Pair:
     def __init__(self, pools: dict[Role, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
         self._pools, self._stop = pools, stop
 
-    def call(self, role: Role, work: Any, *arguments: Any, timeout: float = 120.0) -> Any:
+    def call(self, role: Role, work: Any, *arguments: Any) -> Any:
         """Call a function in one of them and return its result."""
-        return self._wait(self._pools[role].submit(work, *arguments), timeout)
+        return _wait(self._pools[role].submit(work, *arguments))
 
-    def both(self, work: Any, *arguments: Any, timeout: float = 120.0) -> dict[Role, Any]:
+    def both(self, work: Any, *arguments: Any) -> dict[Role, Any]:
         """Call a function in both at the same time."""
         futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
-        return {s: self._wait(future, timeout) for s, future in futures.items()}
+        return {s: _wait(future) for s, future in futures.items()}
 
     def open(self, contender: Contender, payload: int) -> bool:
         """Open a contender's ends; returns whether its loops are compiled.
@@ -70,14 +70,14 @@ class Pair:
             return self.call("plant", _ping, contender.name, period_ns, int(seconds * 1e9))
         finally:
             self._stop[0] = 1
-            self._wait(answers, 30.0)
+            _wait(answers)
 
-    @staticmethod
-    def _wait(future: Future[Any], timeout: float) -> Any:
-        try:
-            return future.result(timeout)
-        except BrokenProcessPool:
-            raise RuntimeError("a process of the benchmark died") from None
+
+def _wait(future: Future[Any]) -> Any:
+    try:
+        return future.result(_PATIENCE_S)
+    except BrokenProcessPool:
+        raise RuntimeError("a process of the benchmark died") from None
 
 
 @contextmanager
@@ -94,14 +94,14 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     }
     stop = np.memmap(path, np.int64, "r+")
     two = Pair(pools, stop)
-    heard = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:  # both start now and inherit this: only the parent handles Ctrl-C
         started = [pool.submit(_started) for pool in pools.values()]
     finally:
-        signal.signal(signal.SIGINT, heard)
+        signal.signal(signal.SIGINT, handler)
     try:
         for one in started:
-            one.result(_START_S)
+            _wait(one)
         yield two
     finally:
         stop[0] = 1

@@ -1,7 +1,7 @@
 """Round trips over one link between two processes: ``ping`` sends, ``pong`` answers at once.
 
 The compiled loops call a link through its port, as the loops of a run do; a link without a port is
-called through its Python methods. ``pingpong.c`` is the same in C.
+called through its Python methods. ``contenders/pingpong.h`` is the same in C.
 
 A loop fills ``took`` (capacity,) with the ns of its round trips and returns their number, or -1 if
 the peer stopped answering. With ``period_ns`` 0 they follow each other. Else one begins every
@@ -11,14 +11,19 @@ included. ``stop`` is one number in memory that both processes share.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import time
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.links import Port
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.realtime.clock import now_ns, spin_or_yield, wait_until
 from gfm_runtime.compiled import cached
@@ -27,9 +32,10 @@ from gfm_runtime.signals import Vector, names
 SILENCE_NS = 1_000_000_000
 LONGEST = 512  # bytes
 _DIFFERENT = 256  # messages in turn, so that a link that checks the sequence accepts all
-_LOOKS = 1024  # polls between two reads of the clock
+_POLLS = 1024  # between two reads of the clock
 
 Messages = NDArray[np.uint8]
+Numbers = NDArray[np.int64]
 
 
 def frames(group: Vector) -> Messages:
@@ -42,6 +48,23 @@ def frames(group: Vector) -> Messages:
 def plain(size: int) -> Messages:
     """Messages of any other size in bytes, shape (256, size)."""
     return np.resize(np.arange(251, dtype=np.uint8), (_DIFFERENT, size))
+
+
+@dataclass(frozen=True)
+class PingPong:
+    """One end of a contender.
+
+    Attributes:
+        ping: sends requests: (stop, period_ns, duration_ns, took); see the module.
+        pong: answers until stopped: (stop).
+        close: frees all resources.
+        compiled: whether its loops are compiled.
+    """
+
+    ping: Callable[[Numbers, int, int, Numbers], int]
+    pong: Callable[[Numbers], object]
+    close: Callable[[], None]
+    compiled: bool
 
 
 @cached
@@ -61,11 +84,11 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
         for i in range(len(message)):
             message[i] = messages[n % len(messages), i]
         send(handle, message)
-        looks = 0
+        polls = 0
         while receive(handle, answer) == 0:
-            looks += 1
-            spin_or_yield(looks, spins)
-            if looks % _LOOKS == 0 and now_ns() - begin > SILENCE_NS:
+            polls += 1
+            spin_or_yield(polls, spins)
+            if polls % _POLLS == 0 and now_ns() - begin > SILENCE_NS:
                 return -1
         now = now_ns()
         took[n] = now - begin
@@ -77,97 +100,83 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
 @cached
 def pong_port(handle, send, receive, spins, messages, stop):
     """``pong`` through a port's functions, until ``stop[0]``."""
-    heard = np.empty(LONGEST, np.uint8)
+    request = np.empty(LONGEST, np.uint8)
     message = np.empty(messages.shape[1], np.uint8)
-    n = looks = 0
+    n = polls = 0
     while stop[0] == 0:
-        if receive(handle, heard) == 0:
-            looks += 1
-            spin_or_yield(looks, spins)
+        if receive(handle, request) == 0:
+            polls += 1
+            spin_or_yield(polls, spins)
             continue
         for i in range(len(message)):
             message[i] = messages[n % len(messages), i]
         send(handle, message)
         n += 1
-        looks = 0
+        polls = 0
     return n
 
 
-class Carrier(Protocol):
-    """The part of ``gfm_hil.links.Link`` that a ping-pong uses."""
-
-    @property
-    def port(self) -> Port | None:
-        """The port for compiled loops, or None."""
-
-    def send(self, message: bytes) -> bool:
-        """Send a message."""
-
-    def receive(self) -> bytes | None:
-        """The next message, or None."""
-
-    def close(self) -> None:
-        """Free all resources."""
+def over_link(link: Any, own: Messages) -> PingPong:
+    """The end of an open link: a ``gfm_hil.links.Link``, of which ``wait`` is not needed."""
+    if (port := link.port) is not None:
+        call = (port.handle, port.send, port.receive, port.spins, own)
+        return PingPong(partial(ping_port, *call), partial(pong_port, *call), link.close, True)
+    sent = [row.tobytes() for row in own]
+    return PingPong(
+        partial(_ping_python, link, sent), partial(_pong_python, link, sent), link.close, False
+    )
 
 
-class LinkEnd:
-    """One end of an open link; uses its port if it has one."""
-
-    def __init__(self, link: Carrier, messages: Messages) -> None:
-        self._link, self._messages = link, messages
-        self._bytes = [row.tobytes() for row in messages]
-
-    @property
-    def compiled(self) -> bool:
-        """Whether it has a port."""
-        return self._link.port is not None
-
-    def ping(
-        self,
-        stop: NDArray[np.int64],
-        period_ns: int,
-        duration_ns: int,
-        took: NDArray[np.int64],
-    ) -> int:
-        """Send requests; see the module."""
-        if (p := self._link.port) is not None:
-            return int(ping_port(*_call(p), self._messages, stop, period_ns, duration_ns, took))
-        while self._link.receive() is not None:
-            pass
-        begin = time.monotonic_ns()
-        end, due, n = begin + duration_ns, begin + period_ns, 0
-        while n < len(took) and begin < end:
-            if period_ns:
-                wait_until(due, 0)
-                begin, due = due, due + period_ns
-            self._link.send(self._bytes[n % _DIFFERENT])
-            while self._link.receive() is None:
-                os.sched_yield()
-                if time.monotonic_ns() - begin > SILENCE_NS:
-                    return -1
-            now = time.monotonic_ns()
-            took[n] = now - begin
-            begin = now
-            n += 1
-        return n
-
-    def pong(self, stop: NDArray[np.int64]) -> None:
-        """Answer until stopped."""
-        if (p := self._link.port) is not None:
-            pong_port(*_call(p), self._messages, stop)
-            return
-        n = 0
-        while not stop[0]:
-            if self._link.receive() is None:
-                os.sched_yield()
-                continue
-            self._link.send(self._bytes[n % _DIFFERENT])
-            n += 1
-
-    def close(self) -> None:
-        """Close the link."""
-        self._link.close()
+def _ping_python(
+    link: Any, sent: list[bytes], stop: Numbers, period_ns: int, duration_ns: int, took: Numbers
+) -> int:
+    while link.receive() is not None:
+        pass
+    begin = time.monotonic_ns()
+    end, due, n = begin + duration_ns, begin + period_ns, 0
+    while n < len(took) and begin < end:
+        if period_ns:
+            wait_until(due, 0)
+            begin, due = due, due + period_ns
+        link.send(sent[n % _DIFFERENT])
+        while link.receive() is None:
+            os.sched_yield()
+            if time.monotonic_ns() - begin > SILENCE_NS:
+                return -1
+        now = time.monotonic_ns()
+        took[n] = now - begin
+        begin = now
+        n += 1
+    return n
 
 
-def _call(port: Port) -> tuple[Any, Any, Any, int]:
-    return port.handle, port.send, port.receive, port.spins
+def _pong_python(link: Any, sent: list[bytes], stop: Numbers) -> None:
+    n = 0
+    while not stop[0]:
+        if link.receive() is None:
+            os.sched_yield()
+            continue
+        link.send(sent[n % _DIFFERENT])
+        n += 1
+
+
+def in_c(library: Path | None, opened: Sequence[int], size: int, keep: ExitStack) -> PingPong:
+    """One end of a limit in C.
+
+    Args:
+        library: a transport of ``contenders/*.c``, compiled.
+        opened: numbers and addresses that its ``open_end`` takes.
+        size: bytes that this side sends.
+        keep: resources to free at the end.
+    """
+    assert library is not None
+    c = ctypes.CDLL(str(library))  # calls release the interpreter's lock
+    number, address = ctypes.c_int64, np.ctypeslib.ndpointer(np.int64, 1)
+    c.ping.argtypes, c.ping.restype = [address, *[number] * 3, address, number], number
+    c.pong.argtypes, c.pong.restype = [address, number, address], None
+    numbers = np.array(opened, np.int64)
+
+    def ping(stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
+        return int(c.ping(numbers, size, period_ns, duration_ns, took, len(took)))
+
+    return PingPong(ping, lambda stop: c.pong(numbers, size, stop), keep.close, True)

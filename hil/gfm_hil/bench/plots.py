@@ -1,12 +1,10 @@
-"""Figures of a result as SVG: percentiles in HdrHistogram's style, misses, lockstep, kernel."""
+"""Figures of a result: percentiles in HdrHistogram's style, misses, lockstep, kernel."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,33 +13,20 @@ from numpy.typing import NDArray
 from gfm_hil.bench.attribution import CAUSES
 from gfm_hil.bench.histogram import dense, lower_ends
 from gfm_hil.bench.tables import lockstep_name
+from gfm_hil.links import link_names
 from gfm_hil.results.figures import COLOURS, dress
 
 _GREY = "#888888"
 _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
 _CAUSE_COLOURS = dict(zip(CAUSES, (_BLUE, _ORANGE, _SKY, "#b8b8b8"), strict=True))
-_LINK_COLOURS = {"shm": _BLUE, "zmq": _RED, "can": _GREEN, "udp": _GREEN}
-_OTHERS = (_PINK, _ORANGE, _SKY)
+
+Rows = list[dict[str, Any]]
 
 
-def figures(content: dict[str, Any]) -> dict[str, bytes]:
-    """Every figure that a result has data for: name and SVG."""
-    loop = content.get("loop", {})
-    made: list[tuple[str, Any, Callable[[Any], Figure]]] = [
-        ("latency", [r for r in content["results"] if r["n"]], _latency),
-        ("jitter", content.get("jitter"), _jitter),
-        ("misses", loop.get("realtime"), _misses),
-        ("lockstep", loop.get("lockstep"), _lockstep),
-        ("kernel", content.get("kernel"), _kernel),
-    ]
-    return {name: _svg(draw(data)) for name, data, draw in made if data}
-
-
-def _svg(figure: Figure) -> bytes:
-    out = io.BytesIO()
-    with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # equal results give equal bytes
-        figure.savefig(out, format="svg", metadata={"Date": None})
-    return out.getvalue()
+def _colours(names: list[str]) -> dict[str, str]:
+    """The colour of each link, the same in every figure, and then of each other name."""
+    every = dict.fromkeys([*link_names(), *names])
+    return {name: COLOURS[k % (len(COLOURS) - 1)] for k, name in enumerate(every)}
 
 
 def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -68,10 +53,7 @@ def _percentile_axis(axes: Axes, nines: int) -> None:
 
 
 def _panels(
-    rows: list[dict[str, Any]],
-    keys: tuple[str, str],
-    draw: Callable[[Axes, dict[str, Any], int], None],
-    heading: Callable[[str, str], str],
+    rows: Rows, keys: tuple[str, str], label: str, draw: Callable[[Axes, dict[str, Any]], None]
 ) -> Figure:
     """One panel for each value of the first key (rows) and of the second (columns)."""
     down, across = ([*dict.fromkeys(r[key] for r in rows)] for key in keys)
@@ -81,54 +63,61 @@ def _panels(
     nines = int(np.log10(max(r["n"] for r in rows)))
     for i, first in enumerate(down):
         for j, second in enumerate(across):
-            some = [r for r in rows if (r[keys[0]], r[keys[1]]) == (first, second)]
-            for k, row in enumerate(some):
-                draw(grid[i][j], row, k)
-            dress(grid[i][j], heading(first, second))
+            for row in rows:
+                if (row[keys[0]], row[keys[1]]) == (first, second):
+                    draw(grid[i][j], row)
+            dress(grid[i][j], f"{first}, {second}")
             _percentile_axis(grid[i][j], nines)
             if i + 1 < len(down):
                 grid[i][j].set_xlabel("")
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8.5, frameon=False)
+    figure.supylabel(label, fontsize=9)
     return figure
 
 
-def _latency(rows: list[dict[str, Any]]) -> Figure:
-    names = [*dict.fromkeys(r["name"] for r in rows if r["peer"] != "C")]
-    seen: dict[str, int] = {}
-    shade = {}
-    for row in (next(r for r in rows if r["name"] == name) for name in names):
-        seen[row["link"]] = seen.get(row["link"], 0) + 1
-        shade[row["name"]] = 1.0 - 0.3 * (seen[row["link"]] - 1)
-    limits = {r["baseline"]: shade[r["name"]] for r in reversed(rows) if r["peer"] != "C"}
+def latency(content: dict[str, Any]) -> Figure | None:
+    """Percentiles of the round trips: a link's contenders in shades of one colour, limits dashed
+    in the colour of the first contender that is compared with them."""
+    rows = [r for r in content["results"] if r["n"]]
+    contenders = list({r["name"]: r for r in rows if r["peer"] != "C"}.values())
+    colours = _colours([r["link"] for r in contenders])
+    look: dict[str, tuple[str, float]] = {}
+    for k, row in enumerate(contenders):
+        same = sum(other["link"] == row["link"] for other in contenders[:k])
+        look[row["name"]] = colours[row["link"]], max(1.0 - 0.3 * same, 0.3)
+    limits = {r["baseline"]: look[r["name"]] for r in reversed(contenders)}
 
-    def draw(axes: Axes, row: dict[str, Any], k: int) -> None:
-        colour = _LINK_COLOURS.get(row["link"], _OTHERS[k % len(_OTHERS)])
+    def draw(axes: Axes, row: dict[str, Any]) -> None:
         limit = row["peer"] == "C"
+        colour, alpha = (limits if limit else look).get(row["name"], (_GREY, 1.0))
         axes.plot(
-            *_curve(row), color=colour, lw=1.1 if limit else 1.7, ls=(0, (3, 2)) if limit else "-",
-            alpha=max((limits if limit else shade).get(row["name"], 1.0), 0.3), label=row["name"],
+            *_curve(row), color=colour, alpha=alpha, label=row["name"],
+            lw=1.1 if limit else 1.7, ls=(0, (3, 2)) if limit else "-",
         )  # fmt: skip
 
-    figure = _panels(rows, ("mode", "load"), draw, lambda mode, load: f"{mode}, {load}")
-    figure.supylabel("round trip [µs]", fontsize=9)
-    return figure
+    return _panels(rows, ("mode", "load"), "round trip [µs]", draw) if rows else None
 
 
-def _jitter(rows: list[dict[str, Any]]) -> Figure:
-    waits = [*dict.fromkeys(r["wait"] for r in rows)]
+def jitter(content: dict[str, Any]) -> Figure | None:
+    """Percentiles of the lateness, and the period."""
+    rows = content.get("jitter")
+    if not rows:
+        return None
+    colours = dict(zip(dict.fromkeys(r["wait"] for r in rows), COLOURS, strict=False))
 
-    def draw(axes: Axes, row: dict[str, Any], k: int) -> None:
-        colour = COLOURS[waits.index(row["wait"])]
-        axes.plot(*_curve(row), color=colour, lw=1.5, label=row["wait"])
+    def draw(axes: Axes, row: dict[str, Any]) -> None:
+        axes.plot(*_curve(row), color=colours[row["wait"]], lw=1.5, label=row["wait"])
         axes.axhline(row["period_us"], color=_GREY, lw=0.8, ls=(0, (4, 3)))
 
-    figure = _panels(rows, ("policy", "load"), draw, lambda policy, load: f"{policy}, {load}")
-    figure.supylabel("later than its deadline [µs]", fontsize=9)
-    return figure
+    return _panels(rows, ("policy", "load"), "later than its deadline [µs]", draw)
 
 
-def _misses(rows: list[dict[str, Any]]) -> Figure:
+def misses(content: dict[str, Any]) -> Figure | None:
+    """Missed ticks by cause, with those of the host alone, and their bursts."""
+    rows = content.get("loop", {}).get("realtime")
+    if not rows:
+        return None
     figure = Figure(figsize=(11.8, 1.6 + 0.42 * len(rows)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     labels = [f"{r['link']}, {r['load']}" for r in rows]
@@ -144,13 +133,13 @@ def _misses(rows: list[dict[str, Any]]) -> Figure:
     left.set_xlim(left=0)
     dress(left, "ticks without a fresh u [%], by cause")
     left.legend(fontsize=8, frameon=False, loc="best")
-    for k, row in enumerate(rows):
+    colours = _colours([r["link"] for r in rows])
+    for label, row in zip(labels, rows, strict=True):
         if row["bursts"]:
             length, count = np.array(row["bursts"]).T
-            right.scatter(
-                length, count, s=22, color=_LINK_COLOURS.get(row["link"], _PINK),
-                marker="o" if row["load"] == "idle" else "x", label=labels[k],
-            )  # fmt: skip
+            marker = "o" if row["load"] == "idle" else "x"
+            colour = colours[row["link"]]
+            right.scatter(length, count, s=22, color=colour, marker=marker, label=label)
     right.set_xscale("log")
     right.set_yscale("log")
     for axis in (right.xaxis, right.yaxis):
@@ -162,27 +151,25 @@ def _misses(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, labels: Sequence[str], values: Sequence[float], texts: Sequence[str]) -> None:
-    y = np.arange(len(labels))[::-1]
-    axes.barh(y, values, 0.6, color=[_LINK_COLOURS.get(label, _GREY) for label in labels])
-    axes.set_yticks(y, labels)
-    for at, value, text in zip(y, values, texts, strict=True):
-        axes.annotate(
-            text, (value, at), (4, 0), textcoords="offset points", va="center", fontsize=8,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
-        )  # fmt: skip
-
-
-def _lockstep(rows: list[dict[str, Any]]) -> Figure:
+def lockstep(content: dict[str, Any]) -> Figure | None:
+    """Times real time over each link."""
+    rows = content.get("loop", {}).get("lockstep")
+    if not rows:
+        return None
     figure = Figure(figsize=(8.2, 0.9 + 0.42 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    rates = [r["times_real_time"]["median"] for r in rows]
-    texts = [
-        f"{rate:.3g} × ({r['share_of_plant_alone']['median']:.0%} of the plant alone)"
-        for r, rate in zip(rows, rates, strict=True)
-    ]
     dress(axes, "closed loop in lockstep, times real time at 10 kHz")
-    _bars(axes, [lockstep_name(r) for r in rows], rates, texts)
+    colours = _colours([])
+    rates = [r["times_real_time"]["median"] for r in rows]
+    y = np.arange(len(rows))[::-1]
+    axes.barh(y, rates, 0.6, color=[colours.get(r["link"], _GREY) for r in rows])
+    axes.set_yticks(y, [lockstep_name(r) for r in rows])
+    for at, rate, row in zip(y, rates, rows, strict=True):
+        axes.annotate(
+            f"{rate:.3g} × ({row['share_of_plant_alone']['median']:.0%} of the plant alone)",
+            (rate, at), (4, 0), textcoords="offset points", va="center", fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+        )  # fmt: skip
     axes.axvline(1.0, color=_BLACK, lw=0.9, ls=(0, (4, 3)))
     axes.set_xscale("log")
     axes.set_xlim(min(0.5, min(rates) / 2), max(rates) * 12)
@@ -190,13 +177,17 @@ def _lockstep(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _kernel(rows: list[dict[str, Any]]) -> Figure:
-    rows = [r for r in rows if r["real"] == rows[0]["real"]]
-    rows = sorted(rows, key=lambda r: float(r["numba_ns"]["median"]))
+def kernel(content: dict[str, Any]) -> Figure | None:
+    """ns per step of every law, in the first real type."""
+    rows = content.get("kernel")
+    if not rows:
+        return None
+    real = rows[0]["real"]
+    rows = sorted((r for r in rows if r["real"] == real), key=lambda r: r["numba_ns"]["median"])
     figure = Figure(figsize=(8.2, 1.0 + 0.19 * len(rows)), layout="constrained")
     axes = figure.subplots()
     y = np.arange(len(rows))
-    dress(axes, f"one step of the kernel [ns], {rows[0]['real']}")
+    dress(axes, f"one step of the kernel [ns], {real}")
     axes.scatter([r["numba_ns"]["median"] for r in rows], y, s=26, color=_BLUE, label="numba")
     if rows[0]["c_ns"]:
         limits = [r["c_ns"]["median"] for r in rows]

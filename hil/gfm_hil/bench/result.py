@@ -1,9 +1,15 @@
-"""The result of a benchmark as plain data, and its file."""
+"""The result of a benchmark as plain data, and its file.
+
+It has ``results`` (rows of `latency`), ``jitter``, ``kernel`` and ``loop`` (those that were
+requested), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
+"""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,30 +19,17 @@ from gfm_hil.realtime.environment import StealTime, caveats, environment
 FORMAT = 1
 
 
-class Recorder:
-    """Collects the results of one benchmark run.
-
-    ``content`` has ``results`` (rows of `latency`), ``jitter``, ``kernel`` and ``loop`` (those that
-    were requested), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
-    """
-
-    def __init__(self, what: str) -> None:
-        self._begin, self._steal = time.monotonic(), StealTime()
-        self.content: dict[str, Any] = {
-            "format": FORMAT,
-            "bench": what,
-            "results": [],
-            "remarks": [],
-            "environment": environment(),
-        }
-
-    def close(self) -> dict[str, Any]:
-        """The whole content, with the duration."""
-        badge = self.content["environment"]
-        badge["steal_pct"] = self._steal.percent()
-        self.content["caveats"] = caveats(badge)
-        self.content["seconds"] = round(time.monotonic() - self._begin, 1)
-        return self.content
+@contextmanager
+def new_result(kind: str) -> Iterator[dict[str, Any]]:
+    """A result without measurements; it is complete when the context ends."""
+    begin, steal = time.monotonic(), StealTime()
+    badge = environment()
+    content: dict[str, Any] = {"format": FORMAT, "bench": kind, "results": [], "remarks": []}
+    content["environment"] = badge
+    yield content
+    badge["steal_pct"] = steal.percent()
+    content["caveats"] = caveats(badge)
+    content["seconds"] = round(time.monotonic() - begin, 1)
 
 
 def write_result(content: dict[str, Any], path: Path) -> None:

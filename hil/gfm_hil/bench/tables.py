@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from gfm_hil.bench.histogram import SHARES
+from gfm_hil.results.table import Table
 
-PERCENTILES = tuple(SHARES)
-
-
-@dataclass(frozen=True)
-class Table:
-    """One table; the first column is text, the others are numbers."""
-
-    heading: str
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+Row = dict[str, Any]
+#: a column of a table: the key of what it shows as it is, or a function that makes a cell of a row
+Column = str | Callable[[Row], str]
 
 
-def title(percentile: str) -> str:
-    """The usual notation of a percentile: p99.9."""
-    return percentile.replace("_", ".")
+def _table(heading: str, rows: list[Row], columns: Mapping[str, Column]) -> Table:
+    def cell(row: Row, column: Column) -> str:
+        return str(row[column]) if isinstance(column, str) else column(row)
+
+    cells = [[cell(row, column) for column in columns.values()] for row in rows]
+    return Table([*columns], cells, heading)
 
 
 def micro(value: float | None) -> str:
@@ -44,146 +40,129 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def tables(content: dict[str, Any]) -> Iterator[tuple[str, Table]]:
-    """All tables of a result, each with its section of the page."""
-    for table in latency_tables(content["results"]):
-        yield "latency", table
-    loop = content.get("loop", {})
-    if "realtime" in loop:
-        yield "misses", realtime_table(loop["realtime"])
-        yield "misses", causes_table(loop["realtime"])
-    if "jitter" in content:
-        yield "jitter", jitter_table(content["jitter"])
-    if "lockstep" in loop:
-        yield "lockstep", lockstep_table(loop["lockstep"])
-        yield "lockstep", laws_table(loop["laws"])
-    if "kernel" in content:
-        yield "kernel", kernel_table(content["kernel"])
+def _percent(key: str) -> Column:
+    return lambda row: percent(row[key])
 
 
-def latency_tables(rows: list[dict[str, Any]]) -> Iterator[Table]:
+def _micro(key: str) -> Column:
+    return lambda row: micro(row[key])
+
+
+def _number(key: str, form: str = ",") -> Column:
+    return lambda row: format(row[key], form)
+
+
+def _median(key: str, form: str, unit: str = "") -> Column:
+    """Of a ``rounds.spread``; – for none."""
+    return lambda row: format(row[key]["median"], form) + unit if row[key] else "–"
+
+
+_PERCENTILES = {name.replace("_", "."): _micro(f"{name}_us") for name in SHARES}
+
+
+def latency_tables(content: Row) -> Iterator[Table]:
     """Round trips, one table per mode and load."""
+    rows = content["results"]
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
         some = [r for r in rows if (r["mode"], r["load"]) == (mode, load)]
-        yield Table(
+        yield _table(
             f"Round trip, {mode}, {load} [µs] ({some[0]['policy']}, {some[0]['payload']} B)",
-            ("", "code", *map(title, PERCENTILES), "n", "p50 : limit"),
-            [
-                (
-                    r["name"], r["code"], *(micro(r[f"{p}_us"]) for p in PERCENTILES),
-                    f"{r['n']:,}",
-                    times(r["ratio_to_baseline_p50"]) if r["peer"] != "C" else "limit",
-                )
-                for r in some
-            ],
-        )  # fmt: skip
+            some,
+            {"": "name", "code": "code", **_PERCENTILES, "n": _number("n"), "p50 : limit": _limit},
+        )
 
 
-def jitter_table(rows: list[dict[str, Any]]) -> Table:
+def _limit(row: Row) -> str:
+    return "limit" if row["peer"] == "C" else times(row["ratio_to_baseline_p50"])
+
+
+def jitter_tables(content: Row) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
-    return Table(
-        "A loop that only paces, every 100 µs: late by [µs]",
-        ("", "load", "wait", *map(title, PERCENTILES), "ticks lost"),
-        [
-            (
-                r["policy"], r["load"], r["wait"], *(micro(r[f"{p}_us"]) for p in PERCENTILES),
-                percent(r["lost_pct"]),
-            )
-            for r in rows
-        ],
-    )  # fmt: skip
+    if "jitter" in content:
+        columns = {"": "policy", "load": "load", "wait": "wait", **_PERCENTILES}
+        heading = "A loop that only paces, every 100 µs: late by [µs]"
+        yield _table(heading, content["jitter"], columns | {"ticks lost": _percent("lost_pct")})
 
 
-def realtime_table(rows: list[dict[str, Any]]) -> Table:
-    """Misses in real time."""
-    return Table(
+def realtime_tables(content: Row) -> Iterator[Table]:
+    """Misses in real time, and why ticks were missed."""
+    rows = content.get("loop", {}).get("realtime")
+    if rows is None:
+        return
+    columns: dict[str, Column] = {"": "link", "load": "load"}
+    yield _table(
         "The product in real time, 10 kHz",
-        (
-            "", "load", "ticks", "missed", "the host's own", "beyond it, median", "by work or link",
-            "trip p50 [µs]", "p99 [µs]",
-        ),
-        [
-            (
-                r["link"], r["load"], f"{r['ticks']:,}", percent(r["missed_pct"]),
-                percent(r["host_pct"]), percent(r["beyond_host_pct"]),
-                percent(r["by_work_or_link_pct"]), micro(r["p50_us"]), micro(r["p99_us"]),
-            )
-            for r in rows
-        ],
-    )  # fmt: skip
+        rows,
+        columns
+        | {
+            "ticks": _number("ticks"),
+            "missed": _percent("missed_pct"),
+            "the host's own": _percent("host_pct"),
+            "beyond it, median": _percent("beyond_host_pct"),
+            "by work or link": _percent("by_work_or_link_pct"),
+            "trip p50 [µs]": _PERCENTILES["p50"],
+            "p99 [µs]": _PERCENTILES["p99"],
+        },
+    )
+    causes = {cause: _cause(cause) for cause in (rows[0]["causes"] if rows else ())}
+    columns |= causes | {"longest burst": _longest_burst}
+    yield _table("Missed ticks by cause", rows, columns)
 
 
-def causes_table(rows: list[dict[str, Any]]) -> Table:
-    """Why ticks were missed."""
-    causes = tuple(rows[0]["causes"]) if rows else ()
-    return Table(
-        "Missed ticks by cause",
-        ("", "load", *causes, "longest burst"),
-        [
-            (
-                r["link"], r["load"], *(f"{r['causes'][c]:,}" for c in causes),
-                str(max((length for length, _ in r["bursts"]), default=0)),
-            )
-            for r in rows
-        ],
-    )  # fmt: skip
+def _cause(cause: str) -> Column:
+    return lambda row: format(row["causes"][cause], ",")
 
 
-def lockstep_name(row: dict[str, Any]) -> str:
+def _longest_burst(row: Row) -> str:
+    return str(max((length for length, _ in row["bursts"]), default=0))
+
+
+def lockstep_name(row: Row) -> str:
     """Name of a run in lockstep: its link and its loop delay."""
     return f"{row['link']}, a sample late" if row["delay_samples"] else str(row["link"])
 
 
-def lockstep_table(rows: list[dict[str, Any]]) -> Table:
-    """The closed loop as fast as possible."""
-    return Table(
+def lockstep_tables(content: Row) -> Iterator[Table]:
+    """The closed loop as fast as possible, over links and, by law, in one process."""
+    loop = content.get("loop", {})
+    if "lockstep" not in loop:
+        return
+    yield _table(
         "The product in lockstep",
-        ("", "ticks a second", "× real time", "of what the plant alone allows"),
-        [
-            (
-                lockstep_name(r), f"{r['ticks_per_s']['median']:,.0f}",
-                f"{r['times_real_time']['median']:.1f}",
-                f"{r['share_of_plant_alone']['median']:.0%}",
-            )
-            for r in rows
-        ],
-    )  # fmt: skip
-
-
-def laws_table(rows: list[dict[str, Any]]) -> Table:
-    """The loop in one process, by law."""
-    parts = ("whole", "plant", "controller", "recording")
-    return Table(
-        "The loop in one process: ns a tick",
-        ("", *parts, "× real time", "allocations"),
-        [
-            (
-                r["law"], *(f"{r[f'{part}_ns']['median']:.0f}" for part in parts),
-                f"{r['times_real_time']['median']:.0f}", f"{r['allocations_per_tick']:g}",
-            )
-            for r in rows
-        ],
-    )  # fmt: skip
-
-
-def kernel_table(rows: list[dict[str, Any]]) -> Table:
-    """ns per step of every law."""
-    reals = list(dict.fromkeys(r["real"] for r in rows))
-    by = {(r["law"], r["real"]): r for r in rows}
-
-    def cells(law: str) -> Iterator[str]:
-        for real in reals:
-            r = by[law, real]
-            yield f"{r['numba_ns']['median']:.1f}"
-            yield f"{r['c_ns']['median']:.1f}" if r["c_ns"] else "–"
-            yield times(r["ratio"]["median"]) if r["ratio"] else "–"
-
-    columns = [f"{what}, {real}" for real in reals for what in ("numba", "C", "ratio")]
-    return Table(
-        "One step of the kernel [ns]",
-        ("", "states", *columns),
-        [
-            (law, str(by[law, reals[0]]["states"]), *cells(law))
-            for law in dict.fromkeys(r["law"] for r in rows)
-        ],
+        loop["lockstep"],
+        {
+            "": lockstep_name,
+            "ticks a second": _median("ticks_per_s", ",.0f"),
+            "× real time": _median("times_real_time", ".1f"),
+            "of what the plant alone allows": _median("share_of_plant_alone", ".0%"),
+        },
     )
+    parts = ("whole", "plant", "controller", "recording")
+    yield _table(
+        "The loop in one process: ns a tick",
+        loop["laws"],
+        {
+            "": "law",
+            **{part: _median(f"{part}_ns", ".0f") for part in parts},
+            "× real time": _median("times_real_time", ".0f"),
+            "allocations": _number("allocations_per_tick", "g"),
+        },
+    )
+
+
+def kernel_tables(content: Row) -> Iterator[Table]:
+    """ns per step of every law."""
+    by_law: dict[str, Row] = {}
+    reals = list(dict.fromkeys(r["real"] for r in content.get("kernel", ())))
+    for r in content.get("kernel", ()):
+        law = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]})
+        law |= {f"{key} {r['real']}": r[key] for key in ("numba_ns", "c_ns", "ratio")}
+    columns: dict[str, Column] = {"": "law", "states": "states"}
+    for real in reals:
+        columns |= {
+            f"numba, {real}": _median(f"numba_ns {real}", ".1f"),
+            f"C, {real}": _median(f"c_ns {real}", ".1f"),
+            f"ratio, {real}": _median(f"ratio {real}", ".2f", " ×"),
+        }
+    if by_law:
+        yield _table("One step of the kernel [ns]", list(by_law.values()), columns)

@@ -13,14 +13,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn
 
 from gfm_hil.cli.common import new_folder, progress
-from gfm_hil.core.terminal import numbers, terminal
+from gfm_hil.core.terminal import terminal
 from gfm_hil.links import link_names
 from gfm_hil.run.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
-
-Tell = Callable[[str, float], None]
-
 
 #: options of several kinds of benchmark, as argparse takes them
 _OPTIONS: dict[str, dict[str, Any]] = {
@@ -111,25 +108,22 @@ def _add_compare(kinds: Any) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry a measuring command out; returns the exit code."""
-    from gfm_hil.bench.page import write_page
-    from gfm_hil.bench.plans import steps_of
-    from gfm_hil.bench.result import Recorder, write_result
-    from gfm_hil.bench.tables import tables
+    from gfm_hil.bench.options import measurements
+    from gfm_hil.bench.page import all_tables, write_page
+    from gfm_hil.bench.result import new_result, write_result
 
-    steps = steps_of(options)
+    parts = measurements(options)
     folder = new_folder(options.out, f"bench-{options.kind}")
     check_free(folder, 0)
-    recorder = Recorder(options.kind)
-    with _bar(options.quiet) as tell:
-        for step in steps:
-            step(recorder.content, tell)
-    content = recorder.close()
+    with new_result(options.kind) as content, _bar(options.quiet) as show:
+        for measure in parts:
+            measure(content, show)
     write_result(content, folder / "bench.json")
     write_page(content, folder / "bench.html")
     if options.json:
         print(json.dumps(content, indent=1))
         return 0
-    _print([table for _, table in tables(content)], (*content["remarks"], *content["caveats"]))
+    _print([table for _, table in all_tables(content)], (*content["remarks"], *content["caveats"]))
     print(f"{content['seconds']:g} s · {folder / 'bench.html'}")
     return 0
 
@@ -150,8 +144,8 @@ def compare_call(options: argparse.Namespace) -> int:
     else:
         folder = new_folder(options.out, "bench-compare")
         check_free(folder, 0)
-        with _bar(options.quiet) as tell:
-            a, b = interleave(options.a, options.b, options.interleave, options.what, folder, tell)
+        with _bar(options.quiet) as show:
+            a, b = interleave(options.a, options.b, options.interleave, options.what, folder, show)
     rows = compare(a, b, by_limit=options.interleave is None)
     if options.json:
         print(json.dumps({"results": rows, "remarks": remarks}, indent=1))
@@ -164,16 +158,13 @@ def _print(tables: Iterable[Any], remarks: Iterable[str]) -> None:
     console = terminal()
     console.width = max(console.width, _WIDTH)
     for table in tables:
-        drawn = numbers(*map(escape, table.columns), title=escape(table.heading))
-        for row in table.rows:
-            drawn.add_row(*map(escape, row))
-        console.print(drawn, end="\n\n")
+        console.print(table, end="\n\n")
     for remark in remarks:
         console.print(f"• {escape(remark)}", highlight=False)
 
 
 @contextmanager
-def _bar(quiet: bool) -> Iterator[Tell]:
+def _bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     with progress(BarColumn(), TaskProgressColumn(), "{task.description}", quiet=quiet) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda text, share: bar.update(task, description=escape(text), completed=share)

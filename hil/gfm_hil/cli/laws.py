@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ def call(options: argparse.Namespace) -> int:
                     for k in sorted({*file.phi, *file.psi})
                 },
                 "stages": len(laws.laws),
-                "home_grid": asdict(first.home_grid),
+                "home_grid": first.home_grid.model_dump(),
                 "source": " ".join(first.source.split()),
             }
         )  # fmt: skip
@@ -146,7 +145,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
             for n, p in law.parameters.items()
         },
         "inner": None if law.inner is None else {"type": law.inner.kind, **acting(law.inner)},
-        "home_grid": asdict(law.home_grid),
+        "home_grid": law.home_grid.model_dump(),
         "order": discrete[0].order,
         "discrete": [
             {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete

@@ -16,25 +16,24 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
-#: each command's module and what it does. A module's ``add`` gives the command's parser its
-#: options, ``call`` carries the command out and returns the exit code. Only the module of the
-#: command that is called is imported, so that the light commands load no numba.
+from gfm_hil.ports import PORTS, make_port
+
+#: each command's module (none: it is a port) and what it does. A module's ``add`` gives the
+#: command's parser its options, ``call`` carries the command out and returns the exit code. Only
+#: the module of the command that is called is imported, so that the light commands load no numba.
 COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
-    "tell": ("tell", "command a run that is going on, or print its newest tick"),
+    "command": ("command", "command a run that is going on, or print its newest tick"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
     "merge": (
         "merge",
         "join the run folders of a controller and a plant started apart",
     ),
-    "scope": ("scope", "show a run in the browser while it goes on, or afterwards"),
-    "modbus": ("modbus", "serve a run that is going on as a SunSpec device on Modbus/TCP"),
-    "xcp": ("xcp", "serve a run that is going on to a calibration tool, by XCP on UDP"),
+    **{name: ("", entry.text) for name, entry in PORTS.items()},
     "export": (
         "export",
         "write a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
     ),
-    "stream": ("stream", "stream what a run records to PlotJuggler, your own tools or Prometheus"),
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
@@ -57,9 +56,8 @@ COMMANDS = {
     "plant": ("roles", "start the plant emulator alone; it connects to the endpoint"),
 }
 
-
-#: names of earlier versions: the module of each, whose ``call`` says what it is called now
-_EARLIER = {"identify": "scan"}
+#: names of earlier versions, which go on working for one version
+_EARLIER = {"identify": "scan", "tell": "command"}
 
 
 class _Version(argparse.Action):
@@ -82,9 +80,12 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action=_Version, help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    if command in COMMANDS or command in _EARLIER:
-        name = _EARLIER.get(command) or COMMANDS[command][0]
-        module = import_module(f"gfm_hil.cli.{name}")
+    if command in COMMANDS:
+        module: Any = (
+            make_port(command)
+            if command in PORTS
+            else import_module(f"gfm_hil.cli.{COMMANDS[command][0]}")
+        )
         chosen = commands.add_parser(command)
         chosen.set_defaults(call=getattr(module, "call", None))  # some have only sub-commands
         module.add(chosen)
@@ -96,7 +97,12 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in _EARLIER:
+        now = _EARLIER[given[0]]
+        note = f"is gfmhil {now} now; this name goes with version 0.3"
+        print(f"gfmhil {given[0]}: {note}", file=sys.stderr)
+        given[0] = now
     for text in given:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
             why = "-- cannot be a value; for a file of that name write ./--"
@@ -105,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not given:
         top.print_help()
         return 0
-    if not given[0].startswith("-") and given[0] not in {**COMMANDS, **_EARLIER}:
+    if not given[0].startswith("-") and given[0] not in COMMANDS:
         return _refuse(_no_command(given[0]))
     options, unknown = top.parse_known_args(given)
     if unknown:

@@ -7,7 +7,6 @@ import contextlib
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 from gfm_hil.api.runs import run as run_one
 from gfm_hil.api.runs import run_network
@@ -21,15 +20,13 @@ from gfm_hil.cli.common import (
     resolve,
     window,
 )
-from gfm_hil.cli.companion import companion
-from gfm_hil.cli.modbus import PORT as MODBUS_PORT
-from gfm_hil.cli.scope import need_websockets
-from gfm_hil.cli.stream import PORT
 from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
+from gfm_hil.ports import PORTS
+from gfm_hil.ports.companion import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.scenario import INPROC, Scenario, find_scenario
+from gfm_hil.scenario import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -57,18 +54,11 @@ def add(command: argparse.ArgumentParser) -> None:
         "--waveforms", type=window, metavar="FROM:TO",
         help="override waveforms: the window of the figure of the three phases, s",
     )  # fmt: skip
-    command.add_argument(
-        "--scope", nargs="?", type=int, const=-1, metavar="PORT",
-        help="serve a scope of it to the browser; it stays when the run is over, until Ctrl-C",
-    )  # fmt: skip
-    command.add_argument(
-        "--stream", nargs="?", type=int, const=PORT, metavar="PORT",
-        help="stream it while it goes on, as gfmhil stream does",
-    )  # fmt: skip
-    command.add_argument(
-        "--modbus", nargs="?", type=int, const=MODBUS_PORT, metavar="PORT",
-        help="serve it as a SunSpec device while it goes on, as gfmhil modbus does",
-    )  # fmt: skip
+    for name, entry in PORTS.items():
+        command.add_argument(
+            f"--{name}", nargs="?", type=int, const=OWN_NUMBER, metavar="PORT",
+            help=f"{entry.text}, as gfmhil {name} does (port {entry.number})",
+        )  # fmt: skip
 
 
 def call(options: argparse.Namespace) -> int:
@@ -79,15 +69,18 @@ def call(options: argparse.Namespace) -> int:
     figures = not options.no_figures
     with contextlib.ExitStack() as stack:
         run: Run | NetworkRun
+        stay: dict[str, subprocess.Popen[str]] = {}
         if scenario.network is not None:
             _check_network(options)
             with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_network(
                     scenario, folder, figures=figures, progress=progress, notice=notice
                 )
-            scope = None
         else:
-            scope = _companions(stack, scenario, folder, options)
+            for name, number in _ports(options).items():
+                beside = companion(name, folder, number, scenario.link.type == INPROC)
+                if (process := stack.enter_context(beside)) is not None:
+                    stay[name] = process
             with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_one(
                     scenario, folder=folder, controller=options.controller, ports=options.map,
@@ -97,38 +90,26 @@ def call(options: argparse.Namespace) -> int:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
             print_run(run, folder, why=True)
-        if scope is not None and scope.poll() is None and run.status != "interrupted":
-            print("the scope stays open until Ctrl-C", file=sys.stderr, flush=True)
-            with contextlib.suppress(KeyboardInterrupt):
-                scope.wait()
+        for name, process in stay.items():
+            if process.poll() is None and run.status != "interrupted":
+                print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
+                with contextlib.suppress(KeyboardInterrupt):
+                    process.wait()
     return exit_code(run)
 
 
-def _companions(
-    stack: contextlib.ExitStack, scenario: Scenario, folder: Path, options: argparse.Namespace
-) -> subprocess.Popen[str] | None:
-    """Start what serves the run while it goes on; returns the scope, if it is asked for."""
-    scope = None
-    if options.scope is not None:
-        need_websockets()
-        port = None if options.scope < 0 else options.scope
-        scope = stack.enter_context(companion("scope", folder, port, ends_itself=False))
-    if options.stream is not None:
-        stack.enter_context(companion("stream", folder, options.stream, ready=2))
-    if options.modbus is not None:
-        if scenario.link.type == INPROC:
-            raise UserError("--modbus: a run in process takes no commands; choose --link")
-        stack.enter_context(companion("modbus", folder, options.modbus))
-    return scope
+def _ports(options: argparse.Namespace) -> dict[str, int]:
+    """The numbers of the ports that the options name."""
+    named = {name: getattr(options, name) for name in PORTS}
+    return {name: number for name, number in named.items() if number is not None}
 
 
 def _check_network(options: argparse.Namespace) -> None:
     """Refuse what is of one converter."""
     if options.controller is not None:
         raise UserError("--controller: controls one converter; a network runs without it")
-    for name in ("scope", "stream", "modbus"):
-        if getattr(options, name) is not None:
-            raise UserError(
-                f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
-                " folder of a converter"
-            )
+    for name in _ports(options):
+        raise UserError(
+            f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
+            " folder of a converter"
+        )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +65,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    if options.command == "identify":
-        print(
-            "gfmhil identify: is gfmhil scan now; this name goes with version 0.3", file=sys.stderr
-        )
     law, scenario = _which(options.what, options.scenario)
     folder = new_folder(options.out, f"scan-{Path(options.what).stem}")
     check_empty(folder)

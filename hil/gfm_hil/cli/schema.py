@@ -15,13 +15,13 @@ from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
 from gfm_hil.studies.conformity.model import Test
 from gfm_hil.studies.conformity.under_test import UnderTest
-from gfm_runtime.inner_file import InnerSpec
+from gfm_runtime.inner import Inner
 from gfm_runtime.lawfile import LawFile
 
 MODELS: dict[str, TypeAdapter[Any]] = {
     "scenario": TypeAdapter(Scenario),
     "law": TypeAdapter(LawFile),
-    "inner": TypeAdapter(InnerSpec),
+    "inner": TypeAdapter(Inner),
     "campaign": TypeAdapter(CampaignFile),
     "conformity": TypeAdapter(Test),
     "converter": TypeAdapter(UnderTest),

@@ -166,7 +166,7 @@ class DllController(MappedController):
         )  # fmt: skip
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         self._ticks = 0
         for states in self._states:
             states[:] = 0
@@ -183,7 +183,7 @@ class DllController(MappedController):
         return self._out.read()
 
     def close(self) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         if hasattr(self._of, "Model_Terminate"):
             self._of.Model_Terminate(c.byref(self._now))
 

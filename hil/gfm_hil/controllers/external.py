@@ -37,7 +37,7 @@ class ControllerError(Exception):
     """A controller fails while it runs; the message names it and says what it said."""
 
 
-class ExternalController(Protocol):
+class ControllerProtocol(Protocol):
     """A controller that is not ours.
 
     Attributes:
@@ -82,7 +82,7 @@ class MappedController:
     def tick(
         self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
     ) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         if self._ticks % self._every == 0:
             outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
             if blocks >= 0 and outputs[blocks] != 0:

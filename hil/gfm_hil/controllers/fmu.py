@@ -87,7 +87,7 @@ class FmuController(MappedController):
         self._said = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         self._ticks = 0
         try:
             if not self._fresh:
@@ -116,7 +116,7 @@ class FmuController(MappedController):
         return outputs
 
     def close(self) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         with contextlib.suppress(self._failed):
             self._it.terminate()
             self._it.freeInstance()

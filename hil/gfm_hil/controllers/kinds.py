@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from gfm_hil.controllers.dll import DllController
-from gfm_hil.controllers.external import BenchContext, ExternalController, refuse_source
+from gfm_hil.controllers.external import BenchContext, ControllerProtocol, refuse_source
 from gfm_hil.controllers.fmu import FmuController
 from gfm_hil.controllers.library import LibraryController
 from gfm_hil.controllers.ports import PortMap
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gfm_hil.controllers.pil import PilController
 
 PIL = "pil:"
-_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ExternalController]] = {
+_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ControllerProtocol]] = {
     "dll": DllController,
     "fmu": FmuController,
     "c": LibraryController,
@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 def open_controller(
     text: str, ports: PortMap, context: BenchContext
-) -> ExternalController | PilController:
+) -> ControllerProtocol | PilController:
     """The controller that ``text`` names.
 
     Args:

@@ -106,14 +106,14 @@ class LibraryController:
         self._ref = {name: k for k, name in enumerate(names("ref"))}
 
     def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ExternalController``; the library starts at the first tick, with measurements."""
+        """See ``ControllerProtocol``; the library starts at the first tick, with measurements."""
         self._ticks, self._speed = 0, float(u[1])
         self._now(complex(u[2], u[3]), float(u[0]))
 
     def tick(
         self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
     ) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         if self._ticks % self._every == 0:
             self._measure(ref, y)
             if self._ticks == 0:
@@ -127,7 +127,7 @@ class LibraryController:
         self._ticks += 1
 
     def close(self) -> None:
-        """See ``ExternalController``."""
+        """See ``ControllerProtocol``."""
         self._of.gfmhil_free(self._self)
 
     def _angle(self, ticks: float) -> float:

@@ -15,8 +15,8 @@ class Identity(BaseModel):
     peer.
 
     Attributes:
-        through: what passes the command on: scope, modbus, xcp, tell or python.
-        name: of the token (scope), of the local user (tell, python), or ``timer`` if the Modbus
+        through: what passes the command on: scope, modbus, xcp, command or python.
+        name: of the token (scope), of the local user (command, python), or ``timer`` if the Modbus
             server itself reverts a set-point.
         peer: address and port of the other end.
         certificate: subject of the client's TLS certificate.

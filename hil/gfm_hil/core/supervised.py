@@ -21,7 +21,7 @@ async def supervised(name: str, work: Callable[[], Awaitable[None]]) -> None:
         try:
             return await work()
         except Exception as problem:
-            _report(name, problem)
+            report(name, problem)
         await asyncio.sleep(PAUSE_S)
 
 
@@ -30,11 +30,11 @@ def attempt(name: str, work: Callable[[], None]) -> None:
     try:
         work()
     except Exception as problem:
-        _report(name, problem)
+        report(name, problem)
         time.sleep(PAUSE_S)
 
 
-def _report(name: str, problem: Exception) -> None:
+def report(name: str, problem: Exception) -> None:
     """Log one line for an error of the machine, a traceback for what must be a bug of ours."""
     trace = None if isinstance(problem, (OSError, UserError)) else problem
     text = f"{name}: {problem or type(problem).__name__}; tried again in {PAUSE_S:g} s"

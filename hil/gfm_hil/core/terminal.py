@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.table import Column, Table
 
 _ANY = 100_000  # columns; more than any table takes
 
@@ -21,12 +20,6 @@ def terminal(**options: Any) -> Console:
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _ANY
     return console
-
-
-def numbers(first: str, *others: str, title: str = "") -> Table:
-    """An empty table without lines: the first column is text, the others are numbers."""
-    columns = (Column(head, justify="right", no_wrap=" " not in head) for head in others)
-    return Table(first, *columns, title=title, title_justify="left", box=None, pad_edge=False)
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

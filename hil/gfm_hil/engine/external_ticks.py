@@ -15,7 +15,7 @@ import numpy as np
 from numba import typeof, types
 from numpy.typing import NDArray
 
-from gfm_hil.controllers import ControllerError, ExternalController
+from gfm_hil.controllers import ControllerError, ControllerProtocol
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import plant_tripped, receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
@@ -55,7 +55,7 @@ class SteppedController:
 
     def __init__(
         self,
-        external: ExternalController | PilController,
+        external: ControllerProtocol | PilController,
         controller: Controller,
         u: NDArray[np.float64],
         changed: Sequence[Retuned] = (),
@@ -68,7 +68,7 @@ class SteppedController:
         self.abandoned = False
         self.last_words: Callable[[], None] = lambda: None
         self._u, self._start = u.copy(), u.copy()
-        self._foreign: ExternalController | None = None
+        self._foreign: ControllerProtocol | None = None
         self._ours: PilController | None = None
         if isinstance(external, PilController):
             self._ours = external

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.controllers import ControllerError, ExternalController
+from gfm_hil.controllers import ControllerError, ControllerProtocol
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
@@ -58,7 +58,7 @@ def run_role(
     folder: Path,
     endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
-    external: ExternalController | PilController | None = None,
+    external: ControllerProtocol | PilController | None = None,
 ) -> Outcome:
     """Run one side of a scenario at its endpoints; record to ``folder``.
 
@@ -95,7 +95,7 @@ def run_role(
         return _run(role, sides, notice, interrupt)
 
 
-def _stepped(external: ExternalController | PilController, bench: Bench) -> SteppedController:
+def _stepped(external: ControllerProtocol | PilController, bench: Bench) -> SteppedController:
     """An external controller ready for tick 0 at the operating point.
 
     Raises:

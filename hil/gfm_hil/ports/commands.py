@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ class Operator:
         """Close the sockets."""
         self._context.destroy(linger=0)
 
-    def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
+    def command(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
         """Have the run carry out a scenario event, given without its time, at once.
 
         Args:
@@ -69,6 +70,11 @@ class Operator:
         if not isinstance(kind, str):
             raise UserError(f"type = {str(kind)[:60]}: must be the name of an event")
         return self._ask(EVENTS[kind].side if kind in EVENTS else "plant", event, by)
+
+    def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
+        """The former name of ``command``, for one version."""
+        warnings.warn("Operator.tell is now Operator.command", DeprecationWarning, stacklevel=2)
+        return self.command(event, by)
 
     def stop(self, by: Identity | None = None) -> None:
         """Stop the run as Ctrl-C does; with a converter of a network, all of it.

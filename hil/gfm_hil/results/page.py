@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.core.files import write_text
-from gfm_hil.results.table import Table, shown
+from gfm_hil.results.table import shown
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -34,12 +34,6 @@ def render(template: str, **values: Any) -> str:
 
     values["style"] = Markup(values.get("style", ""))
     return _environment().get_template(template).render(values)
-
-
-def fragment(table: Table) -> str:
-    """A table as HTML, for a page that is put together of parts."""
-    macros: Any = _environment().get_template("macros.html").module
-    return str(macros.table(table))
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.page import fragment, inline, write_page
+from gfm_hil.results.page import inline, write_page
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.summary import END_METRICS
@@ -180,8 +180,3 @@ def events_table(events: Sequence[dict[str, Any]]) -> Table:
     rows = [row for row in event_rows(events) if row[0] not in ("label", "t")]
     cells = [[title, *(event.get(name) for event in events)] for name, title in rows]
     return Table(["", *heads], cells)
-
-
-def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """A table in HTML, which may be wider than the page."""
-    return fragment(Table(heads, [*rows], caption))

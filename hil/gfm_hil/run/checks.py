@@ -49,7 +49,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Violation:
     """A failed check.
 
     Attributes:
@@ -79,7 +79,7 @@ def _away(w: Window, to: float) -> Vector:
     return np.nan_to_num(np.abs(w.x - to), nan=np.inf)
 
 
-def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | None:
+def settles(w: Window, to: float, within: float, tolerance: float) -> Violation | None:
     """The signal is within ``to`` ± ``tolerance`` from ``within`` s after the step to the end."""
     begin = w.since + within
     late = w.t >= begin - 1e-9
@@ -101,10 +101,10 @@ def settles(w: Window, to: float, within: float, tolerance: float) -> Finding | 
     nothing = np.full(len(w.t), np.nan)
     low, high = nothing.copy(), nothing.copy()
     low[late], high[late] = to - tolerance, to + tolerance
-    return Finding(text, float(w.t[worst]), w.t, low, high)
+    return Violation(text, float(w.t[worst]), w.t, low, high)
 
 
-def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
+def overshoot(w: Window, percent: float, to: float | None) -> Violation | None:
     """The signal exceeds ``to`` (or its final value) by at most ``percent`` of the step."""
     final = float(np.mean(w.x[-max(1, round(_TAIL * len(w.x))) :])) if to is None else to
     step = final - w.before
@@ -122,7 +122,7 @@ def overshoot(w: Window, percent: float, to: float | None) -> Finding | None:
         f"{beyond[worst]:.3g} %."
     )
     low, high = (none, limit) if step > 0 else (limit, none)
-    return Finding(text, float(w.t[worst]), w.t, low, high)
+    return Violation(text, float(w.t[worst]), w.t, low, high)
 
 
 def longest_beyond(w: Window, low: Vector, high: Vector) -> float:
@@ -139,7 +139,7 @@ def _beyond(w: Window, low: Vector, high: Vector) -> Vector:
     return beyond
 
 
-def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Finding | None:
+def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Violation | None:
     """The signal stays between ``low`` and ``high``, each of shape (n,), but for at most
     ``longest`` s in one piece; NaN: no limit there."""
     beyond = _beyond(w, low, high)
@@ -152,10 +152,10 @@ def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Find
         f"was {w.show(w.x[worst])} at t = {w.t[worst]:.4f} s, {beyond[worst]:.3g} {side} the limit "
         f"of {limit[worst]:.4g}."
     )
-    return Finding(text, float(w.t[worst]), w.t, low, high)
+    return Violation(text, float(w.t[worst]), w.t, low, high)
 
 
-def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Finding | None:
+def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Violation | None:
     """The swing after the step has at least this damping ratio, and no faster oscillation grows.
 
     The line's own DC offset, an oscillation at f_n, decays with the line's R/L whatever the law
@@ -174,7 +174,7 @@ def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Finding | Non
         f"oscillation after the step, at {f:.3g} Hz, has {ratio:.3g}"
         + (": it grows." if ratio < 0 else ".")
     )
-    return Finding(text, float(w.t[np.argmax(np.abs(w.x - w.x[-1]))]), w.t, none, none)
+    return Violation(text, float(w.t[np.argmax(np.abs(w.x - w.x[-1]))]), w.t, none, none)
 
 
 def read_envelope(path: Path, t: Vector) -> tuple[Vector, Vector]:

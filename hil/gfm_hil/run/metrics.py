@@ -71,14 +71,8 @@ def event_metrics(
     peak = high if high - before > before - low else low
     way = step if stepped else peak - before
     band = _BAND * abs(step) if stepped else _BAND
-    settled, slow_low, slow_high = 0.0, math.inf, -math.inf
-    done = 0  # windows of a cycle
-    for x in cycle_means(p, start, stop, width):
-        slow_low, slow_high = min(slow_low, float(x.min())), max(slow_high, float(x.max()))
-        outside = np.flatnonzero(np.abs(x - final) > band)
-        if len(outside):
-            settled = done + int(outside[-1]) + 1 + 0.5 * (width - 1)
-        done += len(x)
+    done, settled, slow_low, slow_high = _settling(cycle_means(p, start, stop, width), final, band)
+    settled += 0.5 * (width - 1) if settled else 0.0
     # an oscillation that is still outside at the end of the window has not settled
     has_settled = done > 0 and settled < 0.95 * length and settled < done
     beyond = slow_high - final if step > 0 else final - slow_low
@@ -87,9 +81,6 @@ def event_metrics(
     has_law = "law" not in signals or not np.isnan(signals["law"][start : start + 1][0])
     tells = has_law or nadir != top
     v_low, v_high = _extremes(pieces(V, start, stop))
-    free = max(start, free)
-    first = p[free : max(free, min(stop, free + round(LONGEST / T_s)))]
-    slow, fast = swing(first, T_s, f_n), fast_mode(first, T_s, f_n)
     found: dict[str, float | None] = dict.fromkeys(METRICS)
     found |= {
         "p_before": before,
@@ -113,6 +104,29 @@ def event_metrics(
             "v_min_cycle": v_slow[0],
             "v_max_cycle": v_slow[1],
         }
+    return found | _oscillations(p, max(start, free), stop, T_s, f_n)
+
+
+def _settling(
+    means: Iterable[Vector], final: float, band: float
+) -> tuple[int, float, float, float]:
+    """How many means of a cycle there are, after how many they stay within ``final`` ± ``band``,
+    and their least and largest value."""
+    done, settled, low, high = 0, 0.0, math.inf, -math.inf
+    for x in means:
+        low, high = min(low, float(x.min())), max(high, float(x.max()))
+        outside = np.flatnonzero(np.abs(x - final) > band)
+        if len(outside):
+            settled = done + int(outside[-1]) + 1.0
+        done += len(x)
+    return done, settled, low, high
+
+
+def _oscillations(p: ColumnLike, first: int, stop: int, T_s: float, f_n: float) -> dict[str, float]:
+    """Damping and frequency of the swing and of the fast mode of p, of those that there are."""
+    x = p[first : max(first, min(stop, first + round(LONGEST / T_s)))]
+    slow, fast = swing(x, T_s, f_n), fast_mode(x, T_s, f_n)
+    found: dict[str, float] = {}
     if slow is not None:
         found |= {"damping_ratio": slow.damping, "oscillation_hz": slow.hz}
     if fast is not None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.controllers import ExternalController, PilController
+from gfm_hil.controllers import ControllerProtocol, PilController
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
@@ -62,29 +62,9 @@ def run_scenario(
     check_free(folder, scenario.ticks, scenario.has_inner)
     # here, so that two processes do not compile the same at a time
     bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
-    folder.mkdir(parents=True, exist_ok=True)
-    with in_use(folder), cut_short(folder):
-        outside: dict[str, Outcome] = {}
-        try:
-            with Interrupt() as interrupt:
-                try:
-                    write_scenario(folder, scenario)
-                except OSError as problem:
-                    raise UserError(f"{folder}: {problem.strerror}") from None
-                if scenario.in_process:
-                    began = _run_here([bench], [folder], progress, interrupt)
-                else:
-                    own = str(folder.absolute())
-                    command = tuple(x.replace("{folder}", own) for x in controller_command)
-                    both = Processes(scenario, folder, progress, notice, interrupt, command)
-                    began, outside = both.run()
-        except UserError:
-            remove_parts(folder)
-            shutil.rmtree(folder)
-            raise
-        wall_s = time.monotonic() - began
-        labels = bench.controller.labels
-        return finish(scenario, folder, labels, wall_s, report, outside.get(""))
+    own = str(folder.absolute())
+    command = tuple(word.replace("{folder}", own) for word in controller_command)
+    return _run(scenario, folder, [bench], progress, notice, report, command)[""]
 
 
 def external_command(model: str, ports: Path | None) -> list[str]:
@@ -115,37 +95,81 @@ def run_network(
     Raises:
         UserError: the folder is in use, or there is no operating point.
     """
-    names = scenario.converters
-    check_free(folder, scenario.ticks * len(names), scenario.has_inner)
-    benches = compiled_benches(scenario, notice)
-    runs: dict[str, Run] = {}
-    folder.mkdir(parents=True, exist_ok=True)
-    write_scenario(folder, scenario)
-    places = [folder / name for name in names]
+    check_free(folder, scenario.ticks * len(scenario.parts), scenario.has_inner)
+    runs = _run(scenario, folder, compiled_benches(scenario, notice), progress, notice, report)
+    return _network(scenario, runs, folder, report)
+
+
+def _run(
+    scenario: Scenario,
+    folder: Path,
+    benches: Sequence[Bench],
+    progress: Progress,
+    notice: Notice,
+    report: Report | None,
+    controller_command: tuple[str, ...] = (),
+) -> dict[str, Run]:
+    """Run both sides of each converter, and complete their run folders."""
+    places = _places(scenario, folder)
+    outside: dict[str, Outcome] = {}
+    with _in_use(folder, places.values()):
+        try:
+            with Interrupt() as interrupt:
+                try:
+                    write_scenario(folder, scenario)
+                    if scenario.parts:
+                        for place, bench in zip(places.values(), benches, strict=True):
+                            write_scenario(place, bench.scenario)
+                except OSError as problem:
+                    raise UserError(f"{folder}: {problem.strerror}") from None
+                if scenario.in_process:
+                    began = _run_here(benches, [*places.values()], progress, interrupt)
+                else:
+                    both = Processes(
+                        scenario, folder, progress, notice, interrupt, controller_command
+                    )
+                    began, outside = both.run()
+        except UserError:
+            for place in places.values():
+                remove_parts(place)
+            shutil.rmtree(folder)
+            raise
+        return _finish(benches, places, time.monotonic() - began, report, outside)
+
+
+@contextmanager
+def _in_use(folder: Path, places: Iterable[Path]) -> Iterator[None]:
+    """Make the folders of a run's converters, and keep them in use; see ``in_use``."""
     with ExitStack() as stack:
-        stack.enter_context(cut_short(folder))
-        for place, bench in zip(places, benches, strict=True):
+        for place in places:
             place.mkdir(parents=True, exist_ok=True)
             stack.enter_context(in_use(place))
-            write_scenario(place, bench.scenario)
-        interrupt = stack.enter_context(Interrupt())
-        outside: dict[str, Outcome] = {}
-        if scenario.in_process:
-            began = _run_here(benches, places, progress, interrupt)
-        else:
-            try:
-                began, outside = Processes(scenario, folder, progress, notice, interrupt).run()
-            except UserError:
-                for place in places:
-                    remove_parts(place)
-                shutil.rmtree(folder)
-                raise
-        wall_s = time.monotonic() - began
-        for name, place, bench in zip(names, places, benches, strict=True):
-            labels = bench.controller.labels
-            runs[name] = finish(bench.scenario, place, labels, wall_s, report, outside.get(name))
-        whole = NetworkRun(scenario, runs, folder)
-        whole.conclude(folder, report)
+        stack.enter_context(cut_short(folder))
+        yield
+
+
+def _finish(
+    benches: Sequence[Bench],
+    places: Mapping[str, Path],
+    wall_s: float,
+    report: Report | None,
+    outside: Mapping[str, Outcome],
+) -> dict[str, Run]:
+    """Complete the run folder of each converter."""
+    return {
+        name: finish(
+            bench.scenario, place, bench.controller.labels, wall_s, report, outside.get(name)
+        )
+        for bench, (name, place) in zip(benches, places.items(), strict=True)
+    }
+
+
+def _network(
+    scenario: Scenario, runs: dict[str, Run], folder: Path, report: Report | None
+) -> NetworkRun:
+    """The runs of a network, with what they share in its folder."""
+    whole = NetworkRun(scenario, runs, folder)
+    whole.conclude(folder, report)
     return whole
 
 
@@ -156,7 +180,7 @@ def run_side(
     endpoints: Mapping[str, str],
     notice: Notice = lambda text: None,
     report: Report | None = None,
-    external: ExternalController | PilController | None = None,
+    external: ControllerProtocol | PilController | None = None,
 ) -> Run | NetworkRun:
     """Run one side alone, whose peer another process or machine runs, and leave a run folder of
     what it recorded, or one for each converter of a network.
@@ -176,24 +200,11 @@ def run_side(
         benches = compiled_benches(scenario, notice, (role,))
     else:
         benches = [compiled_bench(scenario, notice, (role,))]
-    for place in places.values():
-        place.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    with ExitStack() as stack:
-        for place in places.values():
-            stack.enter_context(in_use(place))
-        stack.enter_context(cut_short(folder))
-        run_role(role, scenario, folder, dict(endpoints), notice, external)
-        wall_s = time.monotonic() - began
-        runs = {
-            name: finish(bench.scenario, place, bench.controller.labels, wall_s, report)
-            for bench, (name, place) in zip(benches, places.items(), strict=True)
-        }
-    if not scenario.parts:
-        return runs[""]
-    whole = NetworkRun(scenario, runs, folder)
-    whole.conclude(folder, report)
-    return whole
+    with _in_use(folder, places.values()):
+        began = time.monotonic()
+        run_role(role, scenario, folder, endpoints, notice, external)
+        runs = _finish(benches, places, time.monotonic() - began, report, {})
+    return _network(scenario, runs, folder, report) if scenario.parts else runs[""]
 
 
 def run_part(
@@ -201,13 +212,13 @@ def run_part(
     scenario: Scenario,
     folder: Path,
     endpoints: Mapping[str, str],
-    external: ExternalController | PilController | None,
+    external: ControllerProtocol | PilController | None,
 ) -> None:
     """Run one side in the folder of a run that another process has started and completes."""
     with ExitStack() as stack:
         for place in _places(scenario, folder).values():
             stack.enter_context(in_use(place))
-        run_role(role, scenario, folder, dict(endpoints), lambda text: None, external)
+        run_role(role, scenario, folder, endpoints, lambda text: None, external)
 
 
 def _places(scenario: Scenario, folder: Path) -> dict[str, Path]:

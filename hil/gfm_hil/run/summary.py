@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -102,33 +102,8 @@ def summarise(
             outcome = Outcome("oscillating", ripple.words(), outcome.tick)
     trips = _trips(log, outcome, done, scenario.T_s)
     changes = [e for e in log if e["event"] == "law-active"]
-    happened = [e for e in log if "label" in e]
-    bumps = {e["tick"]: e["bump_pu"] for e in changes}
-    starts = np.array([e["tick"] for e in happened])  # in order, as the log is
-    ends = [*np.searchsorted(starts, starts, side="right").tolist()]
-    T_s, f_n = scenario.T_s, nominal_frequency(scenario)
-    acts = acting(scenario, signals, done) if plant else []
     first = law_titles(scenario.laws())[scenario.law]
     laws = [first, *[e["law"] for e in changes]]
-    events = []
-    for k, e in enumerate(happened):
-        stop = int(starts[ends[k]]) if ends[k] < len(starts) else done
-        entry = {"t": e["t"], "tick": e["tick"], "type": e["event"], "label": e["label"]}
-        if e["event"] == "law":
-            entry["bump_pu"] = bumps.get(e["tick"])
-        if plant:
-            stop = min(stop, done)
-            trip = next((x for x in trips if x["until"] > e["tick"]), None)
-            if trip is not None and (trip["tick"] < stop or stop == done):
-                stop = min(stop, trip["tick"])
-                entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
-            free = free_from(acts, e["tick"], stop)
-            entry.update(event_metrics(signals, e["tick"], stop, T_s, f_n, free))
-            if "cut_short" in entry:
-                entry.update(dict.fromkeys(END_METRICS))
-            if e["event"] not in _STEPS:
-                entry["overshoot_pct"] = None
-        events.append(entry)
     summary = {
         "title": scenario.title,
         "status": outcome.status,
@@ -152,7 +127,7 @@ def summarise(
         "bump_pu": [e["bump_pu"] for e in changes] if ours else None,
         "ripple_pu": ripple.pu if ripple else None,
         "trips": [{k: v for k, v in trip.items() if k != "until"} for trip in trips],
-        "events": events,
+        "events": _events(scenario, signals if plant else None, log, trips, done),
         "run": met[0]["run"] if met else None,
     }
     if INSTRUCTIONS in timing:
@@ -163,6 +138,41 @@ def summarise(
     if scenario.mode == "realtime" and not all(e["one_clock"] for e in met):
         summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
     return summary
+
+
+def _events(
+    scenario: Scenario,
+    signals: Columns | None,
+    log: Sequence[dict[str, Any]],
+    trips: Sequence[dict[str, Any]],
+    done: int,
+) -> list[dict[str, Any]]:
+    """What happened, with the metrics of what followed; without them if ``signals`` is None."""
+    happened = [e for e in log if "label" in e]
+    bumps = {e["tick"]: e["bump_pu"] for e in log if e["event"] == "law-active"}
+    starts = np.array([e["tick"] for e in happened])  # in order, as the log is
+    ends = np.searchsorted(starts, starts, side="right").tolist()
+    T_s, f_n = scenario.T_s, nominal_frequency(scenario)
+    acts = acting(scenario, signals, done) if signals is not None else []
+    events = []
+    for e, end in zip(happened, ends, strict=True):
+        entry = {"t": e["t"], "tick": e["tick"], "type": e["event"], "label": e["label"]}
+        if e["event"] == "law":
+            entry["bump_pu"] = bumps.get(e["tick"])
+        if signals is not None:
+            stop = min(int(starts[end]) if end < len(starts) else done, done)
+            trip = next((x for x in trips if x["until"] > e["tick"]), None)
+            if trip is not None and (trip["tick"] < stop or stop == done):
+                stop = min(stop, trip["tick"])
+                entry["cut_short"] = f"{reason_name(trip['reason'])} at {trip['t']:g} s"
+            free = free_from(acts, e["tick"], stop)
+            entry.update(event_metrics(signals, e["tick"], stop, T_s, f_n, free))
+            if "cut_short" in entry:
+                entry.update(dict.fromkeys(END_METRICS))
+            if e["event"] not in _STEPS:
+                entry["overshoot_pct"] = None
+        events.append(entry)
+    return events
 
 
 def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:

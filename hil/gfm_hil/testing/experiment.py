@@ -155,7 +155,7 @@ class Experiment(Steps):
             signal, signals["t"][first:], x[first:], float(x[max(first - 1, 0)]), first * T_s
         )
 
-    def _judge(self, signal: str, what: str, finding: checks.Finding | None) -> None:
+    def _judge(self, signal: str, what: str, finding: checks.Violation | None) -> None:
         __tracebackhide__ = True
         if finding is not None:
             self._fail(finding.text, signal, what, finding)
@@ -165,7 +165,7 @@ class Experiment(Steps):
         text: str,
         signal: str,
         what: str,
-        finding: checks.Finding | None = None,
+        finding: checks.Violation | None = None,
         around: tuple[float, float] | None = None,
     ) -> None:
         """Draw the figure of a failure and fail with its path."""

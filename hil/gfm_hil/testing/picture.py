@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gfm_hil.recording.columns import unit_of
 from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
-from gfm_hil.run.checks import Finding
+from gfm_hil.run.checks import Violation
 from gfm_hil.scenario import Scenario
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
@@ -29,7 +29,7 @@ def draw(
     signal: str,
     signals: Mapping[str, NDArray[Any]],
     steps: Sequence[tuple[float, str]],
-    finding: Finding | None,
+    finding: Violation | None,
     around: tuple[float, float] | None = None,
 ) -> None:
     """Draw one failure.
@@ -91,7 +91,7 @@ def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:
     draw_panel(axes, f"{name} [{unit_of(name) or '1'}]", curves)
 
 
-def _band(axes: Axes, finding: Finding, x: NDArray[Any]) -> None:
+def _band(axes: Axes, finding: Violation, x: NDArray[Any]) -> None:
     """Draw the band in green; a one-sided limit is shaded up to the range of the curve."""
     low, high = finding.low, finding.high
     if not (np.isfinite(low).any() or np.isfinite(high).any()):

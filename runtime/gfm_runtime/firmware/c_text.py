@@ -53,9 +53,10 @@ def wrapped(line: str, width: int = 100) -> list[str]:
     """A line of C; a long one goes on, indented, after an operator or a comma."""
     out, indent = [], line[: len(line) - len(line.lstrip())]
     while len(line) > width:
-        signs = (" + ", " - ", " && ", " || ", " ? ", " : ", ", ")
-        at = max(line.rfind(sign, len(indent) + 16, width - 2) for sign in signs)
-        at = at if at > 0 else line.rfind(" * ", len(indent) + 16, width - 2)
+        for signs in ((" + ", " - ", " && ", " || ", " ? ", " : "), (", ",), (" * ",)):
+            at = max(line.rfind(sign, len(indent) + 16, width - 2) for sign in signs)
+            if at > 0:
+                break
         if at < 0:
             break
         at += line.startswith(", ", at)

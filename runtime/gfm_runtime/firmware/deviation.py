@@ -35,7 +35,7 @@ from gfm_runtime.firmware.fixed import (
     REF,
     REFS,
     YS,
-    Block,
+    ClampedRow,
     FixedLaw,
     M,
     Number,
@@ -103,7 +103,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
         own = [int(k) for k in np.flatnonzero(rows == i)]
         gain = float(record["loop"]) if i == OMEGA - 1 else 1.0
         c, W = gain * record["C"][i, own].astype(float), record["W"][own, i].astype(float)
-        block = Block(A[np.ix_(own, own)], c, W)
+        row = ClampedRow(A[np.ix_(own, own)], c, W)
         b = record["B_y"][own, OMEGA].astype(float)
         local = (
             _in_fixed_point(law, i, own, spans, maps)
@@ -121,7 +121,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
                 local = local._replace(
                     raw=local.raw + at_once * omega.bound, x=local.x + np.abs(b) * omega.bound
                 )
-        out[i] = _row(block, feedback, local, clamped=not near)
+        out[i] = _row(row, feedback, local, clamped=not near)
     return [out[i] for i in range(NU)]
 
 
@@ -130,22 +130,22 @@ def _unit(real: str) -> float:
     return 2.0 ** (-24 if real == "float32" else -53)
 
 
-def _row(block: Block, feedback: Vector, local: Local, clamped: bool) -> Deviation:
+def _row(row: ClampedRow, feedback: Vector, local: Local, clamped: bool) -> Deviation:
     """From what a tick adds to what it makes of the row's u; ``clamped`` if the limits may act."""
-    c = np.abs(block.c)
+    c = np.abs(row.c)
     at_once = local.raw + float(c @ local.q)
     at_once += local.offset + float(c @ local.first) + at_once  # the offset takes that of a settle
     if not len(c):
         return Deviation(at_once + local.u, 0.0)
-    pull = block.A @ block.W * clamped
+    pull = row.A @ row.W * clamped
     to_excess = at_once + local.excess * clamped
-    each = local.x + np.abs(np.eye(len(c)) - block.A) @ local.q + np.abs(feedback) * local.u
+    each = local.x + np.abs(np.eye(len(c)) - row.A) @ local.q + np.abs(feedback) * local.u
     try:
         if clamped:
-            _, total, peak, gain = sector(block, feedback)
+            _, total, peak, gain = sector(row, feedback)
             each += np.abs(pull - feedback) / 2 * to_excess
         else:
-            total, peak = powers(block.A + np.outer(feedback, block.c))
+            total, peak = powers(row.A + np.outer(feedback, row.c))
             each += np.abs(feedback) * at_once
             gain = 0.0
     except ValueError:
@@ -153,7 +153,7 @@ def _row(block: Block, feedback: Vector, local: Local, clamped: bool) -> Deviati
     if gain < 1 - 1e-6:
         raw = float(c @ (peak @ local.first + total @ each)) + to_excess
         return Deviation(raw / (1 - gain) + local.u, 0.0)
-    if len(c) > 1 or abs(block.A[0, 0] - 1) > _ON_CIRCLE or feedback.any():
+    if len(c) > 1 or abs(row.A[0, 0] - 1) > _ON_CIRCLE or feedback.any():
         return Deviation(math.inf, math.inf)
     # at a limit the state of an integrator takes over what raw has; else it keeps what it had
     state = max(float(local.first[0]), to_excess / float(c[0]) * clamped)

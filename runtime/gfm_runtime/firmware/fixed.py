@@ -12,8 +12,8 @@ every coefficient is an int32. Ranges come from the signal table, and for the st
 
 A state takes the upper bits of each increment, and keeps the others for the next tick ("fraction
 saving": error feedback of the first order), so that no dead band holds it away from its rest.
-``FixedLaw`` is the only source of the C code (``fixed_c``), of the exact reference (``Instance``)
-and of the bounds (``deviation``).
+``FixedLaw`` has the numbers; ``fixed_tick`` has the tick, for Python and for C; ``deviation`` has
+the bounds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,6 @@ from numpy.typing import NDArray
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE, LINEAR, V_MIN
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY, U_NAMES, Signal, group
-from gfm_runtime.states import BAD_Y, OK
 
 FIXED = "fixed"
 WORD = 2**31 - 1  # the largest int32
@@ -82,13 +82,6 @@ class Sum(NamedTuple):
     meant: Mapping[int, float]
     meant_start: float
 
-    def __call__(self, values: Sequence[int]) -> int:
-        """The integer, from all numbers of a tick."""
-        total = self.start
-        for coefficient, place in self.terms:
-            total += coefficient * values[place]
-        return total
-
 
 @dataclass(frozen=True)
 class FixedLaw:
@@ -124,6 +117,7 @@ class FixedLaw:
         """Bits from a sum to the number at a place."""
         return total.e - self.numbers[place].q
 
+    @cached_property
     def moving(self) -> list[tuple[Sum, int]]:
         """Of all that moves from tick to tick: its increment and its place."""
         return [
@@ -132,9 +126,9 @@ class FixedLaw:
             *((total, X + k) for k, total in enumerate(self.state)),
         ]
 
-    def halves(self) -> list[int]:
-        """The rests from which they begin: half a unit, the middle of what a rest can be."""
-        return [1 << (self.shift(total, place) - 1) for total, place in self.moving()]
+    def ratio(self, of: int, out: int, j: int) -> Ratio:
+        """What p/V^2 is computed with, from the numbers at ``of`` to that at ``out + j``."""
+        return ratio_of(self.numbers[of + j], self.numbers[of + 4], self.numbers[out + j])
 
 
 def number(text: str, low: float, high: float) -> Number:
@@ -252,7 +246,7 @@ def powers(A: Matrix) -> tuple[Matrix, Matrix]:
     raise ValueError
 
 
-class Block(NamedTuple):
+class ClampedRow(NamedTuple):
     """The states of one row: x' = A (x + W excess) + ..., raw = c x + ..."""
 
     A: Matrix
@@ -260,10 +254,10 @@ class Block(NamedTuple):
     W: Matrix
 
 
-def _one_state(block: Block, d: Span, forced: Span, low: float, high: float) -> Span | None:
+def _one_state(row: ClampedRow, d: Span, forced: Span, low: float, high: float) -> Span | None:
     """The interval that one state cannot leave from within: d and ``forced`` are what the inputs
     add to raw and to the next x. None if it has no such interval."""
-    a, c, w = float(block.A[0, 0]), float(block.c[0]), float(block.W[0])
+    a, c, w = float(row.A[0, 0]), float(row.c[0]), float(row.W[0])
     a = 1.0 if abs(a - 1.0) < 1e-12 else a
     if not (0 < a <= 1 and c > 0 and 0 <= w * c <= 1 and (a < 1 or w > 0)):
         return None
@@ -276,7 +270,7 @@ def _one_state(block: Block, d: Span, forced: Span, low: float, high: float) -> 
     return -upper(-low, -d[1], -forced[0]), upper(high, d[0], forced[1])
 
 
-def sector(block: Block, feedback: Matrix | float = 0.0) -> tuple[Matrix, Matrix, Matrix, float]:
+def sector(row: ClampedRow, feedback: Matrix | float = 0.0) -> tuple[Matrix, Matrix, Matrix, float]:
     """A clamped row as a loop about the middle of its sector.
 
     The clamp passes 1 - theta of a change of raw, 0 <= theta <= 1: what the anti-windup and an
@@ -290,7 +284,7 @@ def sector(block: Block, feedback: Matrix | float = 0.0) -> tuple[Matrix, Matrix
     Raises:
         ValueError: the powers of A do not die away.
     """
-    A, c, W = block
+    A, c, W = row
     pull = A @ W
     middle = A - np.outer(pull - feedback, c) / 2
     total, peak = powers(middle)
@@ -298,27 +292,27 @@ def sector(block: Block, feedback: Matrix | float = 0.0) -> tuple[Matrix, Matrix
     if len(A) == 1:
         gain = float(np.abs(c) @ total @ np.abs(pull + feedback)) / 2
     else:
-        row, h = c, (pull + feedback) / 2
+        along, h = c, (pull + feedback) / 2
         for _ in range(200_000):
-            gain += abs(float(row @ h))
-            row = row @ middle
-            if float(np.abs(row) @ total @ np.abs(h)) < 1e-6:
+            gain += abs(float(along @ h))
+            along = along @ middle
+            if float(np.abs(along) @ total @ np.abs(h)) < 1e-6:
                 break
-        gain += float(np.abs(row) @ total @ np.abs(h))
+        gain += float(np.abs(along) @ total @ np.abs(h))
     return middle, total, peak, gain
 
 
 def _many_states(
-    block: Block, d: Span, forced: Matrix, first: Matrix, low: float, high: float
+    row: ClampedRow, d: Span, forced: Matrix, first: Matrix, low: float, high: float
 ) -> Matrix | None:
     """The largest |x| of a row's states from |x| <= ``first`` on, whatever its clamp does."""
     try:
-        _, total, peak, gain = sector(block)
+        _, total, peak, gain = sector(row)
     except ValueError:
         return None
     if gain >= 1 - 1e-6:
         return None
-    c, pull = np.abs(block.c), np.abs(block.A @ block.W)
+    c, pull = np.abs(row.c), np.abs(row.A @ row.W)
     aside = most((d[0] - (low + high) / 2, d[1] - (low + high) / 2))  # raw - middle without x
     inputs = forced + pull * aside / 2
     raw = (c @ (peak @ first + total @ inputs) + aside) / (1 - gain)
@@ -353,7 +347,7 @@ def _mapped(code: int) -> dict[int, Number] | None:
 
 
 class Ratio(NamedTuple):
-    """What p/V^2 is computed with: the least V, the shifts before the two divisions, and where the
+    """What p/V^2 is computed with: the least V, the factors before the two divisions, and where the
     first quotient saturates, so that the second numerator fits."""
 
     least: int
@@ -365,7 +359,8 @@ class Ratio(NamedTuple):
 def ratio_of(p: Number, V: Number, out: Number) -> Ratio:
     """Of the numbers p and V, for the number p/V^2."""
     most = math.ceil(math.ldexp(V.span[1] * G_MOST, QUOTIENT))
-    return Ratio(round(math.ldexp(V_MIN, V.q)), QUOTIENT + V.q - p.q, most, V.q + out.q - QUOTIENT)
+    first, second = 1 << (QUOTIENT + V.q - p.q), 1 << (V.q + out.q - QUOTIENT)
+    return Ratio(round(math.ldexp(V_MIN, V.q)), first, most, second)
 
 
 class Across(NamedTuple):
@@ -375,68 +370,12 @@ class Across(NamedTuple):
     X: int
 
 
-def across(parameters: Sequence[float], p: Number, V: Number) -> Across:
+def across(parameters: Matrix, p: Number, V: Number) -> Across:
     """For the numbers p (and q) and V."""
     return Across(*(round(math.ldexp(float(one), 2 * V.q - p.q)) for one in parameters))
 
 
-def _direction(x: int, y: int) -> tuple[int, int]:
-    """A vector's direction as two integers up to 2^30, the larger at least 2^29; or (0, 0)."""
-    if x or y:
-        for bits in (32, 16, 8, 4, 2, 1):
-            if max(abs(x), abs(y)) < 1 << (62 - bits):
-                x, y = x << bits, y << bits
-    return x >> 32, y >> 32
-
-
 ONE = 1 << 30  # of sines and cosines
-
-
-def sine_of_half(x_a: int, y_a: int, x_b: int, y_b: int) -> int:
-    """As ``error_maps``, from vectors at any exponent: sin((a - b)/2) 2^30."""
-    a_below, b_below = y_a < 0, y_b < 0
-    (x_a, y_a), (x_b, y_b) = _direction(x_a, y_a), _direction(x_b, y_b)
-    if not (x_a or y_a) or not (x_b or y_b):
-        return 0
-    dot, cross = x_a * x_b + y_a * y_b, y_a * x_b - x_a * y_b
-    d, c = map(abs, _direction(dot, cross))
-    length = max(math.isqrt(d * d + c * c), ONE // 2)
-    larger = max(math.isqrt((ONE + min(d * ONE // length, ONE)) * (ONE // 2)), ONE // 2)
-    sine = min(c * ONE // length, ONE) * (ONE // 2) // larger if dot >= 0 else larger
-    return -sine if (cross < 0 if a_below == b_below else a_below) else sine
-
-
-def divided(a: int, b: int) -> int:
-    """a/b towards 0, as C divides; b > 0."""
-    return a // b if a >= 0 else -(-a // b)
-
-
-def map_integers(
-    law: FixedLaw, ref: Sequence[int], y: Sequence[int]
-) -> tuple[Sequence[int], Sequence[int]]:
-    """References and measurements after the error map."""
-    if law.error_map == LINEAR:
-        return ref, y
-    out = []
-    for values, many, place in ((ref, REFS, R), (y, YS, M)):
-        now = list(values)
-        if law.error_map == DC_ENERGY:
-            now[0] = rounded(now[0] * now[0], 2 * many[0].q + 1 - law.numbers[place].q)
-        if law.error_map == DVOC:
-            for j in (1, 3):
-                one = law.numbers[place + j]
-                of = ratio_of(many[j], many[4], one)
-                V = max(values[4], of.least)
-                quotient = divided(values[j] << of.first, V)
-                quotient = min(max(quotient, -of.most), of.most)
-                now[j] = between(divided(quotient << of.second, V), one)
-        out.append(now)
-    if law.error_map == HYBRID_ANGLE:
-        vectors: list[int] = []
-        for (_, p, _, q, V), (R_pu, X_pu) in zip((ref, y), law.across, strict=True):
-            vectors += [V * V - (R_pu * p + X_pu * q), X_pu * p - R_pu * q]
-        out[0][1] = sine_of_half(*vectors)
-    return out[0], out[1]
 
 
 # --- a law ---
@@ -464,157 +403,176 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
     Raises:
         LawError: what fixed point does not cover, or ranges that it cannot hold.
     """
-    where = f"law {name!r} in fixed point"
-    n, code = int(record["n"]), int(record["error_map"])
-    mapped = _mapped(code)
-    if mapped is None:
-        raise LawError(where, "its error map is not covered")
-    f: dict[str, Matrix] = {
-        key: np.asarray(record[key], np.float64)
-        for key in ("B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "low", "high", "W", "E_r",
-                    "E_y", "F", "G")
-    }  # fmt: skip
-    A, rows = np.asarray(record["A"][:n, :n], np.float64), record["row"][:n]
-    loop = float(record["loop"])
-    r, m = (R, M) if mapped else (REF, Y)  # places of the mapped inputs
-    numbers: dict[int, Number] = {}
-    fade, follow = 1.0 - float(record["decay"]), float(record["follow"])
-    for place, many in ((REF, REFS), (Y, YS), (U, US), (TREND, trends(follow))):
-        numbers |= {place + k: one for k, one in enumerate(many)}
-    if mapped:
-        numbers |= {R + j: one for j, one in enumerate(REFS)} | {
-            M + j: one for j, one in enumerate(YS)
+    law = _Builder(f"law {name!r} in fixed point", record).law()
+    _check(f"law {name!r} in fixed point", law)
+    return law
+
+
+class _Builder:
+    """A law's numbers, one group after the other: each range follows from those before it.
+
+    Attributes:
+        numbers: those that are known, by place.
+        seen: the same as the sums of a step see them: u within the law's limits.
+    """
+
+    def __init__(self, where: str, record: np.void) -> None:
+        self.where, self.error_map, self.n = where, int(record["error_map"]), int(record["n"])
+        self.f: dict[str, Matrix] = {
+            key: np.asarray(record[key], np.float64)
+            for key in ("B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "low", "high", "W", "E_r",
+                        "E_y", "F", "G")
+        }  # fmt: skip
+        self.A = np.asarray(record["A"][: self.n, : self.n], np.float64)
+        self.rows, self.loop = record["row"][: self.n], float(record["loop"])
+        self.fade, self.follow = 1.0 - float(record["decay"]), float(record["follow"])
+        self.numbers: dict[int, Number] = {}
+        for place, many in ((REF, REFS), (Y, YS), (U, US), (TREND, trends(self.follow))):
+            self.numbers |= {place + k: one for k, one in enumerate(many)}
+        self._map_inputs(record["error_parameters"])
+        self.numbers |= {
+            LAST + i: Number(f"s->u[{i}]", one.q, one.low, one.high) for i, one in enumerate(US)
         }
-        numbers |= mapped
-    impedances: tuple[Across, ...] = ()
-    if code == HYBRID_ANGLE:
-        impedances = tuple(
-            across(record["error_parameters"], many[1], many[4]) for many in (REFS, YS)
+        ends = [self._limits(i) for i in range(NU)]
+        self.low, self.high = (tuple(end[k] for end in ends) for k in range(2))
+        self.limited = {U + i: Number(one.text, one.q, *ends[i]) for i, one in enumerate(US)}
+
+    @property
+    def seen(self) -> dict[int, Number]:
+        return self.numbers | self.limited
+
+    def law(self) -> FixedLaw:
+        """All of it."""
+        outputs = tuple(self._row(i) for i in range(NU))
+        numbers = self.numbers
+        moves = [({OFFSET + i: -self.fade}, OFFSET + i) for i in range(NU)] + [
+            ({TREND + i: -self.follow, U + i: self.follow, LAST + i: -self.follow}, TREND + i)
+            for i in range(NU)
+        ]
+        decay_follow = tuple(
+            make_sum(meant, numbers, most_e=numbers[place].q + MOST_SHIFT) for meant, place in moves
         )
-        for impedance, many in zip(impedances, (REFS, YS), strict=True):
-            size = abs(impedance.R) + abs(impedance.X)
+        return FixedLaw(
+            self.n,
+            tuple(numbers.get(place, Number("", 0, 0, 0)) for place in range(X + self.n)),
+            self.low,
+            self.high,
+            outputs,
+            tuple(self._state(k) for k in range(self.n)),
+            decay_follow[:NU],
+            decay_follow[NU:],
+            tuple(make_sum(*self._settling(k)) for k in range(self.n)),
+            tuple(make_sum({U + i: 1.0, TREND + i: -1.0}, numbers) for i in range(NU)),
+            self.error_map,
+            self.across,
+        )
+
+    def _map_inputs(self, impedance: Matrix) -> None:
+        """The numbers of the inputs after the error map; ``r`` and ``m`` are their places."""
+        mapped = _mapped(self.error_map)
+        if mapped is None:
+            raise LawError(self.where, "its error map is not covered")
+        self.r, self.m = (R, M) if mapped else (REF, Y)
+        if mapped:
+            self.numbers |= {R + j: one for j, one in enumerate(REFS)}
+            self.numbers |= {M + j: one for j, one in enumerate(YS)} | mapped
+        self.across: tuple[Across, ...] = ()
+        if self.error_map != HYBRID_ANGLE:
+            return
+        self.across = tuple(across(impedance, many[1], many[4]) for many in (REFS, YS))
+        for line, many in zip(self.across, (REFS, YS), strict=True):
+            size = abs(line.R) + abs(line.X)
             if size > WORD or many[4].high ** 2 + size * many[1].high >= SUM:
-                raise LawError(where, "R and X of its error map must be less than 1 p.u. in all")
+                why = "R and X of its error map must be less than 1 p.u. in all"
+                raise LawError(self.where, why)
         for key in ("B_y", "D_y", "E_y"):  # the map has the difference in r
-            f[key] = f[key] * [1, 0, 1, 1, 1]
-    numbers |= {
-        LAST + i: Number(f"s->u[{i}]", one.q, one.low, one.high) for i, one in enumerate(US)
-    }
-    lows, highs = [], []
-    for i, one in enumerate(US):
-        low, high = f["low"][i], f["high"][i]
+            self.f[key] = self.f[key] * [1, 0, 1, 1, 1]
+
+    def _limits(self, i: int) -> tuple[int, int]:
+        """Of u_i, as integers."""
+        one, low, high = US[i], self.f["low"][i], self.f["high"][i]
         if not one.span[0] - 1e-9 <= low < high <= one.span[1] + 1e-9:
             raise LawError(
-                where,
+                self.where,
                 f"limits.{U_NAMES[i]} = [{low:g}, {high:g}] must lie in the signal table's range, "
                 f"{one.span[0]:.3g} to {one.span[1]:.3g} p.u.",
             )
-        lows.append(max(one.low, math.ceil(math.ldexp(low, one.q))))
-        highs.append(min(one.high, math.floor(math.ldexp(high, one.q))))
-    limited = {
-        U + i: Number(one.text, one.q, lows[i], highs[i]) for i, one in enumerate(US)
-    }  # as the sums of a step see u
-    outputs: list[Sum] = []
-    for i in range(NU):
-        gain = loop if i == OMEGA - 1 else 1.0
-        own = [int(k) for k in np.flatnonzero(rows == i)]
+        return (
+            max(one.low, math.ceil(math.ldexp(low, one.q))),
+            min(one.high, math.floor(math.ldexp(high, one.q))),
+        )
+
+    def _row(self, i: int) -> Sum:
+        """u_i before its limits; and the numbers of the row's offset, states and excess."""
+        f, gain = self.f, self.loop if i == OMEGA - 1 else 1.0
+        own = [int(k) for k in np.flatnonzero(self.rows == i)]
         on_d = _merged(
             _row_of(gain * f["D_u0"][i], REF),
-            _row_of(gain * f["D_r"][i], r),
-            _row_of(gain * f["D_y"][i], m, OMEGA),
+            _row_of(gain * f["D_r"][i], self.r),
+            _row_of(gain * f["D_y"][i], self.m, OMEGA),
             {U + OMEGA - 1: float(f["D_y"][i, OMEGA])} if i != OMEGA - 1 else {},
         )
         on_d = {place: c for place, c in on_d.items() if c != 0.0}
         start = gain * float(f["u_0"][i])
-        d = span_of(on_d, numbers | limited, start)
-        room = SMALL if len(own) else most(d) + most(US[i].span)
-        numbers[OFFSET + i] = number(f"s->offset[{i}]", -room, room)
-        d = d[0] - room, d[1] + room
-        block = Block(A[np.ix_(own, own)], gain * f["C"][i, own], f["W"][own, i])
-        forced = [
-            span_of(
-                _merged(_row_of(f["B_r"][k], r), _row_of(f["B_y"][k], m, OMEGA),
-                        {U + OMEGA - 1: float(f["B_y"][k, OMEGA])}),
-                numbers | limited,
-            )
-            for k in own
-        ]  # fmt: skip
-        first = [span_of(*_settling(f, k, r, m, numbers)) for k in own]
-        for k, span in zip(own, _ranges(block, d, forced, first, f, i), strict=True):
+        d = span_of(on_d, self.seen, start)
+        room = SMALL if own else most(d) + most(US[i].span)
+        self.numbers[OFFSET + i] = number(f"s->offset[{i}]", -room, room)
+        row = ClampedRow(self.A[np.ix_(own, own)], gain * f["C"][i, own], f["W"][own, i])
+        self._state_numbers(i, own, row, (d[0] - room, d[1] + room))
+        on_x = {X + k: float(gain * f["C"][i, k]) for k in own}
+        on_raw = _merged({OFFSET + i: 1.0}, on_x, on_d)
+        total = make_sum(on_raw, self.seen, start, beside=most(US[i].span))
+        raw, (low, high) = span_of(on_raw, self.seen, start), self.limited[U + i].span
+        self.numbers[EXCESS + i] = number(
+            f"t->excess[{i}]", min(0.0, high - raw[1]), max(0.0, low - raw[0])
+        )
+        return total
+
+    def _state_numbers(self, i: int, own: Sequence[int], row: ClampedRow, d: Span) -> None:
+        """The numbers of the states of row i; d is what the inputs add to its output."""
+        forced = [span_of(self._forced(k), self.seen) for k in own]
+        first = [span_of(*self._settling(k)) for k in own]
+        for k, span in zip(own, _ranges(row, d, forced, first, self.f, i), strict=True):
             if span is None:
                 raise LawError(
-                    where,
+                    self.where,
                     f"the row of {U_NAMES[i]} has an integrator beside other states, or none that "
                     "the anti-windup holds: its states have no bound that is proven",
                 )
-            numbers[X + k] = number(f"s->x[{k}]", *span)
-        on_raw = _merged({OFFSET + i: 1.0}, {X + k: float(gain * f["C"][i, k]) for k in own}, on_d)
-        total = make_sum(on_raw, numbers | limited, start, beside=most(US[i].span))
-        outputs.append(total)
-        raw = span_of(on_raw, numbers | limited, start)
-        low, high = limited[U + i].span
-        numbers[EXCESS + i] = number(
-            f"t->excess[{i}]", min(0.0, high - raw[1]), max(0.0, low - raw[0])
-        )
-    seen = numbers | limited
-    states = []
-    for k in range(n):
-        i = int(rows[k])
-        pull = float((A @ f["W"][:n])[k, i])
-        meant = _merged(
-            {X + j: float(A[k, j] - (j == k)) for j in range(n)},
-            {EXCESS + i: pull},
-            _row_of(f["B_r"][k], r),
-            _row_of(f["B_y"][k], m, OMEGA),
+            self.numbers[X + k] = number(f"s->x[{k}]", *span)
+
+    def _forced(self, k: int) -> dict[int, float]:
+        """What the inputs add to the next x_k."""
+        f = self.f
+        return _merged(
+            _row_of(f["B_r"][k], self.r),
+            _row_of(f["B_y"][k], self.m, OMEGA),
             {U + OMEGA - 1: float(f["B_y"][k, OMEGA])},
         )
-        states.append(make_sum(meant, seen, most_e=numbers[X + k].q + MOST_SHIFT))
-    law = FixedLaw(
-        n,
-        tuple(numbers.get(place, Number("", 0, 0, 0)) for place in range(X + n)),
-        tuple(lows),
-        tuple(highs),
-        tuple(outputs),
-        tuple(states),
-        tuple(
-            make_sum({OFFSET + i: -fade}, numbers, most_e=numbers[OFFSET + i].q + MOST_SHIFT)
-            for i in range(NU)
-        ),
-        tuple(
-            make_sum(
-                {TREND + i: -follow, U + i: follow, LAST + i: -follow},
-                numbers,
-                most_e=numbers[TREND + i].q + MOST_SHIFT,
-            )
-            for i in range(NU)
-        ),
-        tuple(make_sum(*_settling(f, k, r, m, numbers)) for k in range(n)),
-        tuple(make_sum({U + i: 1.0, TREND + i: -1.0}, numbers) for i in range(NU)),
-        code,
-        impedances,
-    )
-    _check(where, law)
-    return law
 
+    def _state(self, k: int) -> Sum:
+        """The increment of x_k."""
+        pull = float((self.A @ self.f["W"][: self.n])[k, int(self.rows[k])])
+        own = {X + j: float(self.A[k, j] - (j == k)) for j in range(self.n)}
+        meant = _merged(own, {EXCESS + int(self.rows[k]): pull}, self._forced(k))
+        return make_sum(meant, self.seen, most_e=self.numbers[X + k].q + MOST_SHIFT)
 
-def _settling(
-    f: Mapping[str, Matrix], k: int, r: int, m: int, numbers: Mapping[int, Number]
-) -> tuple[dict[int, float], Mapping[int, Number], float]:
-    """The arguments of the sum that sets state k at a bumpless change."""
-    F = f["F"][k]
-    meant = _merged(
-        _row_of(f["E_r"][k], r),
-        _row_of(f["E_y"][k], m, OMEGA),
-        {U + OMEGA - 1: float(f["E_y"][k, OMEGA])},
-        _row_of(F, U),
-        _row_of(-F @ f["D_u0"], REF),
-        _row_of(f["G"][k], TREND),
-    )
-    return meant, numbers, -float(F @ f["u_0"])
+    def _settling(self, k: int) -> tuple[dict[int, float], Mapping[int, Number], float]:
+        """The arguments of the sum that sets x_k at a bumpless change."""
+        f, F = self.f, self.f["F"][k]
+        meant = _merged(
+            _row_of(f["E_r"][k], self.r),
+            _row_of(f["E_y"][k], self.m, OMEGA),
+            {U + OMEGA - 1: float(f["E_y"][k, OMEGA])},
+            _row_of(F, U),
+            _row_of(-F @ f["D_u0"], REF),
+            _row_of(f["G"][k], TREND),
+        )
+        return meant, self.numbers, -float(F @ f["u_0"])
 
 
 def _ranges(
-    block: Block,
+    row: ClampedRow,
     d: Span,
     forced: Sequence[Span],
     first: Sequence[Span],
@@ -626,11 +584,11 @@ def _ranges(
         return []
     low, high = float(f["low"][i]), float(f["high"][i])
     if len(forced) == 1:
-        kept = _one_state(block, d, forced[0], low, high)
+        kept = _one_state(row, d, forced[0], low, high)
         if kept is not None:
             return [(min(0.0, kept[0], first[0][0]), max(0.0, kept[1], first[0][1]))]
     sizes = _many_states(
-        block, d, np.array(list(map(most, forced))), np.array(list(map(most, first))), low, high
+        row, d, np.array(list(map(most, forced))), np.array(list(map(most, first))), low, high
     )
     return [None] * len(forced) if sizes is None else [(-float(x), float(x)) for x in sizes]
 
@@ -646,122 +604,3 @@ def _check(where: str, law: FixedLaw) -> None:
                 raise LawError(
                     where, f"{law.numbers[place + k].text} has a range that no exponent fits"
                 )
-
-
-# --- the exact reference ---
-
-
-def rounded(total: int, shift: int) -> int:
-    """total 2^-shift, rounded to the nearest, halves up."""
-    return (total + (1 << shift >> 1)) >> shift
-
-
-def between(value: int, one: Number) -> int:
-    """The value in a number's range."""
-    return min(max(value, one.low), one.high)
-
-
-class Instance:
-    """An instance of a law in Python's integers, as the C code has it.
-
-    Attributes:
-        law: its numbers and sums.
-        x, offset, u, trend: as the C struct's.
-        rest: what the increments left below the offset, the trend and x.
-        raw: u before its limits in the last output, at each row's exponent.
-    """
-
-    def __init__(self, law: FixedLaw) -> None:
-        self.law = law
-        self.u = [
-            round(math.ldexp(s.default, one.q)) for s, one in zip(group("u"), US, strict=True)
-        ]
-        self.raw = [0] * NU
-        self.reset()
-
-    def reset(self) -> None:
-        """States 0; the last u stays."""
-        self.x, self.offset, self.trend = [0] * self.law.n, [0] * NU, [0] * NU
-        self.rest = self.law.halves()
-
-    def _values(self, ref: Sequence[int], y: Sequence[int], u: Sequence[int]) -> list[int]:
-        r, m = map_integers(self.law, ref, y)
-        state = (*self.u, *self.trend, *self.offset, *self.x)
-        return [*ref, *y, *r, *m, *u, 0, 0, 0, *state]
-
-    def output(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
-        """All numbers of a tick up to u and the excess."""
-        law, v = self.law, self._values(ref, y, (0, 0, 0))
-        for i in (1, 0, 2):
-            total, one = law.output[i], law.numbers[U + i]
-            raw = self.raw[i] = total(v)
-            shift = total.e - one.q
-            to_excess = law.shift(total, EXCESS + i)
-            low, high = law.low[i] << shift, law.high[i] << shift
-            if raw > high:
-                v[U + i], v[EXCESS + i] = law.high[i], rounded(high - raw, to_excess)
-            elif raw < low:
-                v[U + i], v[EXCESS + i] = law.low[i], rounded(low - raw, to_excess)
-            else:
-                v[U + i] = rounded(raw, shift)
-        return v
-
-    def step(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
-        """One tick; u."""
-        law, v = self.law, self.output(ref, y)
-        moved = []
-        for k, (total, place) in enumerate(law.moving()):
-            shift = law.shift(total, place)
-            now = self.rest[k] + total(v)
-            moved.append(between(v[place] + (now >> shift), law.numbers[place]))
-            self.rest[k] = now & ((1 << shift) - 1)
-        self.offset, self.trend, self.x = moved[:NU], moved[NU : 2 * NU], moved[2 * NU :]
-        self.u = v[U : U + NU]
-        return self.u
-
-    def settle(
-        self, ref: Sequence[int], y: Sequence[int], u: Sequence[int], trend: Sequence[int]
-    ) -> list[int]:
-        """Set the state so that u comes out and goes on with the trend; what comes out."""
-        law = self.law
-        wanted = [between(value, one) for value, one in zip(u, US, strict=True)]
-        self.reset()
-        self.trend = [
-            between(value, one)
-            for value, one in zip(trend, self.law.numbers[TREND : TREND + NU], strict=True)
-        ]
-        v = self._values(ref, y, wanted)
-        self.u = [
-            between(rounded(s(v), law.shift(s, U + i)), US[i]) for i, s in enumerate(law.last)
-        ]
-        self.x = [
-            between(rounded(s(v), law.shift(s, X + k)), law.numbers[X + k])
-            for k, s in enumerate(law.settle)
-        ]
-        for rows in ((1,), (0, 2), ()):  # omega_u first: column 3 takes it to the others
-            out = self.output(ref, y)
-            for i in rows:
-                e, one = law.output[i].e, law.numbers[OFFSET + i]
-                missing = (wanted[i] << (e - US[i].q)) - self.raw[i]
-                self.offset[i] = between(rounded(missing, e - one.q), one)
-        return out[U : U + NU]
-
-
-def bump_of(before: Sequence[int], after: Sequence[int]) -> int:
-    """The largest change of u, times 2^BUMP_Q."""
-    return max(abs(b - a) >> (one.q - BUMP_Q) for a, b, one in zip(before, after, US, strict=True))
-
-
-def refusal(ref: Sequence[int], y: Sequence[int], bad_ref: int) -> int:
-    """OK, or why a step refuses references and measurements."""
-    if any(not one.low <= value <= one.high for value, one in zip(y, YS, strict=True)):
-        return BAD_Y
-    if any(not one.low <= value <= one.high for value, one in zip(ref, REFS, strict=True)):
-        return bad_ref
-    return OK
-
-
-def to_integers(values: Any, numbers: Sequence[Number]) -> NDArray[np.int64]:
-    """Values (ticks, k) in p.u. as integers; NaN and what an int32 does not hold saturates."""
-    scaled = np.asarray(values, np.float64) * np.exp2([one.q for one in numbers])
-    return np.rint(np.clip(np.nan_to_num(scaled, nan=-np.inf), -WORD - 1, WORD)).astype(np.int64)

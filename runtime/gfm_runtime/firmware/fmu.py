@@ -15,7 +15,7 @@ import uuid
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import as_file, files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -31,7 +31,15 @@ from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_row
 Fmi = Literal["2", "3"]
 FMI: tuple[Fmi, ...] = get_args(Fmi)
 
-_HEADERS = files("gfm_runtime.firmware").joinpath("fmi")
+#: by FMI, what its names begin with and what they are in the one template of both
+_NAMES = {
+    "2": {"FMI": "2", "F": "fmi2", "INSTANCE": "Component", "REAL": "Real", "INTEGER": "Integer",
+          "STATE": "FMUstate", "DESERIALIZE": "DeSerialize", "NAME": ", it->name", "COUNT": "",
+          "TOO_FEW": "NULL"},
+    "3": {"FMI": "3", "F": "fmi3", "INSTANCE": "Instance", "REAL": "Float64", "INTEGER": "Int32",
+          "STATE": "FMUState", "DESERIALIZE": "Deserialize", "NAME": "", "COUNT": ", size_t n",
+          "TOO_FEW": 'n < nvr ? "fewer values than value references" : NULL'},
+}  # fmt: skip
 _MINGW = "x86_64-w64-mingw32-gcc"
 #: by FMI, folders of binaries
 _HERE = {"2": {"x86_64": "linux64"}, "3": {}}
@@ -80,7 +88,8 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
         omega_b: base frequency of the converter, rad/s, for an inner stage.
 
     Raises:
-        LawError: as ``make_modules``; there is no gcc (the apt package is named), or it fails.
+        LawError: as ``make_modules``; there is no gcc or no FMPy (the package is named), or gcc
+            fails.
     """
     m, own = one_module(laws, T_s, real, omega_b)
     code, description = _sources(m, own, T_s, fmi)
@@ -103,47 +112,64 @@ def _sources(
     follows from both."""
     u = command_rows(m.stages)
     inside = (*group("ref"), *carried_rows("y", m.stages))
-    interface = template(f"fmi{fmi}.c")
-    keys = keys_of(m) | {
-        "MADE": MADE,
-        "LAW_NAME": plain(m.name),
-        "T_S": repr(float(T_s)),
-        "U_LOW": ", ".join(repr(s.low) for s in u),
-        "U_HIGH": ", ".join(repr(s.high) for s in u),
-        "U_START": ", ".join(repr(s.default) for s in u),
-        "IN_START": ", ".join(repr(s.default) for s in inside),
-        "E_IN_USE": ", &s->u[2]" * m.stages,
-        "REFUSALS": _refusals(fmi, interface),
-        "TOKEN": "@TOKEN@",
-    }
+    keys = (
+        keys_of(m)
+        | _NAMES[fmi]
+        | {
+            "MADE": MADE,
+            "LAW_NAME": plain(m.name),
+            "T_S": repr(float(T_s)),
+            "U_LOW": ", ".join(repr(s.low) for s in u),
+            "U_HIGH": ", ".join(repr(s.high) for s in u),
+            "U_START": ", ".join(repr(s.default) for s in u),
+            "IN_START": ", ".join(repr(s.default) for s in inside),
+            "E_IN_USE": ", &s->u[2]" * m.stages,
+            "REFUSALS": "@REFUSALS@",
+            "TOKEN": "@TOKEN@",
+        }
+    )
+    interface = filled(chosen(template("fmi.c"), {"fmi2": fmi == "2"}), keys)
     code = {
         **own,
-        "fmu.h": filled(chosen(template("fmu.h"), m.choices), keys),
-        f"fmi{fmi}.c": filled(interface, keys),
+        f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
     }
     description = _description(m, T_s, fmi, code)
     said = "\n".join([*code.values(), description.decode()])
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, said)}}}"
-    code["fmu.h"] = code["fmu.h"].replace("@TOKEN@", token)
+    code[f"fmi{fmi}.c"] = code[f"fmi{fmi}.c"].replace("@TOKEN@", token)
     return code, description.replace(b"@TOKEN@", token.encode())
 
 
-def _refusals(fmi: Fmi, own: str) -> str:
+def _headers() -> Path:
+    """The folder of the C headers of FMI 2.0 and 3.0 that FMPy carries.
+
+    Raises:
+        LawError: FMPy is not installed.
+    """
+    spec = find_spec("fmpy")  # does not import it
+    if spec is None or not spec.submodule_search_locations:
+        raise LawError("an FMU", "takes the C headers of FMPy: pip install 'gfmhil[fmu]'")
+    return Path(spec.submodule_search_locations[0], "c-code")
+
+
+def _refusals(fmi: Fmi, interface: str) -> str:
     """The functions of the standard that the interface has not, as C that says so."""
-    declared = _HEADERS.joinpath(f"fmi{fmi}FunctionTypes.h").read_text(encoding="utf-8")
-    written = set(re.findall(r"\b(fmi\d\w+)\(", own))
+    declared = _headers().joinpath(f"fmi{fmi}FunctionTypes.h").read_text(encoding="utf-8")
+    written = set(re.findall(r"\b(fmi\d\w+)\(", interface))
     out = []
-    for name, text in re.findall(
-        r"typedef\s+fmi\dStatus\s+(fmi\d\w+)TYPE\s*\((.*?)\);", declared, re.DOTALL
+    for kind, name, text in re.findall(
+        r"typedef\s+(fmi\dStatus|fmi3Instance)\s+(fmi\d\w+)TYPE\s*\((.*?)\);", declared, re.DOTALL
     ):
         if name in written:
             continue
         arguments = " ".join(text.split())
         first, *others = re.findall(r"(\w+)(?:\[\])?\s*(?:,|$)", arguments)
-        lines = [f"(void){other};" for other in others]
-        lines.append(f'return lacks({first}, "{name}");')
+        answer = f'unsupported({first}, "{name}")'
+        if kind == "fmi3Instance":  # of another kind than co-simulation
+            answer, others = "NULL", [first, *others]
+        lines = [*(f"(void){other};" for other in others), f"return {answer};"]
         body = "\n".join(f"    {line}" for line in lines)
-        out.append(f"fmi{fmi}Status {name}({arguments})\n{{\n{body}\n}}\n")
+        out.append(f"{kind} {name}({arguments})\n{{\n{body}\n}}\n")
     return "\n".join(out)
 
 
@@ -280,17 +306,14 @@ def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi) -> dict[str, bytes]:
             _MINGW, "-static-libgcc", "-Wl,--no-insert-timestamp",
         ]  # fmt: skip
     out = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="gfmhil-fmu-") as work,
-        as_file(_HEADERS) as headers,
-    ):
+    with tempfile.TemporaryDirectory(prefix="gfmhil-fmu-") as work:
         for file, text in code.items():
             Path(work, file).write_text(text, encoding="utf-8")
         own = [file for file in code if file.endswith(".c")]
         for place, (compiler, *flags) in made.items():
             called(
                 [compiler, *FLAGS, OPTIMISED, *flags, "-shared", "-fvisibility=hidden",
-                 f"-I{headers}", *own, "-o", "made", *host.link],
+                 f"-I{_headers()}", *own, "-o", "made", *host.link],
                 Path(work),
             )  # fmt: skip
             library = next(Path(work).glob("made*"))

@@ -7,11 +7,9 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from gfm_runtime.catalogue import LawSet
-from gfm_runtime.error_maps import HYBRID_ANGLE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, template
 from gfm_runtime.firmware.fixed import FIXED
-from gfm_runtime.firmware.fixed_c import fixed_sources
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
 from gfm_runtime.firmware.proof import script
@@ -65,7 +63,7 @@ def export(
         choosing |= schedule_sources(one, own, T_s, omega_b, style)
     rows = golden(modules, SHIPPED)
     return {
-        **(fixed_sources(modules, T_s) if fixed else sources(modules, T_s, style)),
+        **sources(modules, T_s, style),
         **choosing,
         **selftest(modules, style),
         "golden.h": _golden_header(rows),
@@ -158,4 +156,4 @@ def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -
 
 def needs_sqrt(m: Module) -> bool:
     """Whether a law's unrolled step takes a square root."""
-    return not m.fixed and (m.stages or int(m.record["error_map"]) == HYBRID_ANGLE)
+    return not m.fixed and (m.stages or m.tick.operations()["sqrt"] > 0)

@@ -22,15 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.firmware.fixed import (
-    REFS,
-    YS,
-    Instance,
-    U,
-    bump_of,
-    refusal,
-    to_integers,
-)
+from gfm_runtime.firmware.fixed import REFS, YS
+from gfm_runtime.firmware.fixed_tick import Instance, bump_of, refusal, to_integers
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
 from gfm_runtime.kernel import (
@@ -162,7 +155,7 @@ def _fixed_rows(modules: Sequence[Module], ticks: int) -> Golden:
                 before, now = instances[old][now], 1 - now
                 instances[k][now] = fresh = Instance(instances[k][now].law)
                 if refused == OK and latched == OK:
-                    u = before.output(ref, y)[U : U + NU]
+                    u = before.look(ref, y)
                     bump = bump_of(u, fresh.settle(ref, y, u, before.trend))
             elif what == RESET:
                 latched = OK

@@ -29,9 +29,10 @@ from gfm_runtime.firmware.c_text import (
     plain,
     template,
 )
-from gfm_runtime.firmware.fixed import FIXED, FixedLaw, make_fixed
+from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
+from gfm_runtime.firmware.fixed_c import FixedTick
 from gfm_runtime.firmware.tick import SHARED, Tick
-from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, PRIORITIES
+from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import Law
@@ -53,7 +54,6 @@ MADE = "Made by gfmhil firmware export; do not edit."
 Style = Literal["unrolled", "records"]
 STYLES: tuple[Style, ...] = get_args(Style)
 REALS = ("float32", "float64")
-FIXED_CHOICES: Choices = {"stages": False, "fixed": True}
 
 #: what a step returns; the bench's scenario refuses a reference out of range before it gets here
 BAD_REF = len(REASONS)
@@ -119,12 +119,18 @@ class Module:
     @property
     def choices(self) -> Choices:
         """The choices of the templates for its unrolled step."""
-        return {"stages": self.stages, "fixed": False}
+        return {"stages": self.stages, "fixed": self.fixed is not None}
 
     @cached_property
     def tick(self) -> Tick:
-        """The functions of its step."""
+        """The functions of its step in floating point."""
         return Tick(self.record, self.real, max(1, self.n), self.stages)
+
+    @cached_property
+    def fixed_tick(self) -> FixedTick:
+        """The functions of its step in fixed point."""
+        assert self.fixed is not None
+        return FixedTick(self.fixed)
 
     @property
     def real(self) -> np.dtype[Any]:
@@ -187,7 +193,7 @@ def check_modules(modules: Sequence[Module]) -> None:
         for field, allowed in possible.items() if module.stages else ():
             if module.record[field] not in allowed:
                 raise LawError(where, f"{field} = {module.record[field]} is not possible")
-        if module.stages and not module.record["k_c"] > 0:
+        if module.stages and module.record["inner"] != NONE and not module.record["k_c"] > 0:
             raise LawError(where, f"k_c = {module.record['k_c']} is not possible")
         for field in fields(module.stages)[1]:
             if not np.isfinite(module.record[field]).all():
@@ -206,6 +212,13 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             f"{m.prefix}{end}": text
             for m in modules
             for end, text in ((".h", _header(m, T_s)), (".c", _unrolled(m)))
+        } | {
+            f"proof/{m.prefix}.c": filled(
+                template("proof.c"),
+                keys_of(m) | {"MADE": MADE, "HINTS": m.fixed_tick.hints()},
+            )
+            for m in modules
+            if m.fixed
         }
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
@@ -223,7 +236,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
         + filled(chosen(template("interface.h"), choices), common),
-        "gfm.c": _source(Tick(None, real, states, stages), choices, common),
+        "gfm.c": _source(choices, common | Tick(None, real, states, stages).keys("gfm")),
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
@@ -254,13 +267,13 @@ def _header(m: Module, T_s: float) -> str:
 
 
 def _unrolled(m: Module) -> str:
-    return _source(m.tick, m.choices, keys_of(m) | {"LAW": "", "law": ""})
+    tick = m.fixed_tick if m.fixed else m.tick
+    return _source(m.choices, keys_of(m) | {"LAW": "", "law": ""} | tick.keys(m.prefix))
 
 
-def _source(tick: Tick, choices: Choices, keys: Mapping[str, str]) -> str:
+def _source(choices: Choices, keys: Mapping[str, str]) -> str:
     """The source of a law, or of the generic step."""
-    text = chosen(template("shell_top.c"), choices) + chosen(template("shell_end.c"), choices)
-    return filled(text, {**keys, **tick.keys(keys["P"])})
+    return filled(chosen(template("shell_top.c") + template("shell_end.c"), choices), keys)
 
 
 def about(m: Module, T_s: float) -> str:
@@ -328,8 +341,10 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "GUARDS": filled(template("guards.c"), {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": _enumerators(guard),
-        "Y_CHECKS": _checks("y", y, real),
-        "REF_CHECKS": _checks("ref", ref, real),
+        "Y_CHECKS": _checks("y", y, [(literal(s.low, real), literal(s.high, real)) for s in y]),
+        "REF_CHECKS": _checks(
+            "ref", ref, [(literal(s.low, real), literal(s.high, real)) for s in ref]
+        ),
         "U_DEFAULT": literals([s.default for s in group("u")], real),
         "OMEGA_DEFAULT": literal(u[1].default, real),
         "N_ROWS": phi[0],
@@ -349,7 +364,18 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
 
 def keys_of(m: Module) -> dict[str, str]:
     """What the templates of an unrolled law ask for."""
-    return _keys(m.prefix, m.real, m.n, m.stages)
+    keys = _keys(m.prefix, m.real, m.n, m.stages)
+    if m.fixed:
+        formats = "\n".join(m.fixed_tick.formats(m.prefix.upper()))
+        keys |= {
+            **C_TYPES[FIXED],
+            "SIGNALS": f"{keys['SIGNALS']}\n{formats}",
+            "Y_CHECKS": _checks("y", group("y"), [(one.low, one.high) for one in YS]),
+            "REF_CHECKS": _checks("ref", group("ref"), [(one.low, one.high) for one in REFS]),
+            "U_DEFAULT": ", ".join(map(str, U_DEFAULT)),
+            "0": "0",
+        }
+    return keys
 
 
 def _enumerators(guard: str) -> str:
@@ -361,14 +387,14 @@ def _enumerators(guard: str) -> str:
     )
 
 
-def _checks(vector: str, signals: Sequence[Signal], real: np.dtype[Any]) -> str:
+def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, Any]]) -> str:
     """An expression up to its last colon: the first signal that is NaN or out of range."""
     lines = []
-    for j, s in enumerate(signals):
-        low, high, value = literal(s.low, real), literal(s.high, real), f"{vector}[{j}]"
+    for j, (s, (low, high)) in enumerate(zip(signals, ends, strict=True)):
+        value = f"{vector}[{j}]"
         inside = f"{value} >= {low} && {value} <= {high}"
-        if s.low == -s.high:
-            inside = f"{'fabsf' if real == np.float32 else 'fabs'}({value}) <= {high}"
+        if isinstance(high, str) and s.low == -s.high:
+            inside = f"{'fabsf' if high.endswith('f') else 'fabs'}({value}) <= {high}"
         lines.append(f"!({inside}) ? {j} /* {s.name}, {s.low:g} to {s.high:g} p.u. */")
     return "\n             : ".join(lines)
 

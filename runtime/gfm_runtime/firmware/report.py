@@ -177,7 +177,8 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     state = max(1, m.n) + 3 * NU + SIZE * m.stages
     if m.fixed:
         rests = 2 * NU + m.n
-        return {"state": 4 * state + 8 * rests, "constants": 4 * _products(m.fixed)}
+        constants = 4 * operations(m, style)["multiplications"]
+        return {"state": 4 * state + 8 * rests, "constants": constants}
     if style == "records":
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
@@ -192,36 +193,18 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 
 def operations(m: Module, style: Style) -> dict[str, int]:
     """Operations of a step in which all limits clamp, the refusal included; without shifts."""
-    if m.fixed:
-        return _integer_operations(m.fixed)
     generic = style == "records"  # it has the zeros too
-    tick = Tick(m.record, m.real, max(1, m.n), m.stages, generic) if generic else m.tick
-    count = tick.operations()
+    tick = Tick(m.record, m.real, max(1, m.n), m.stages, True) if generic else m.tick
+    count = m.fixed_tick.operations() if m.fixed else tick.operations()
     carried = (*carried_rows("y", m.stages), *group("ref"))
-    ranges = sum(1 if s.low == -s.high else 2 for s in carried)
-    finite = 2 * (NU + m.stages) - 1  # whether u is
+    ranges = sum(1 if s.low == -s.high and not m.fixed else 2 for s in carried)
+    finite = 0 if m.fixed else 2 * (NU + m.stages) - 1  # whether u is
     return {
         "multiplications": count["*"],
-        "additions": count["+"] + count["-"] + finite,
+        "additions": count["+"] + count["-"] + count["rounded"] + finite,
         "divisions": count["/"],
-        "square_roots": count["sqrt"],
-        "comparisons": count["<"] + ranges + 1,
-    }
-
-
-def _products(law: FixedLaw) -> int:
-    """Products of a step, 32 by 32 to 64 bits."""
-    return sum(len(s.terms) for s in (*law.output, *law.decay, *law.follow, *law.state))
-
-
-def _integer_operations(law: FixedLaw) -> dict[str, int]:
-    moved = 2 * NU + law.n
-    return {
-        "multiplications": _products(law),
-        "additions": _products(law) + moved + 2 * NU,
-        "divisions": 0,
-        "square_roots": 0,
-        "comparisons": 2 * (moved + NU + 2 * NY),
+        "square_roots": count["sqrt"] + count["root"],
+        "comparisons": count["<"] + 2 * count["between"] + ranges + 1,
     }
 
 

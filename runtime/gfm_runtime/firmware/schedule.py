@@ -16,7 +16,7 @@ from gfm_runtime.controller import choose
 from gfm_runtime.firmware.c_text import chosen, filled, literals, plain, template
 from gfm_runtime.firmware.module import MADE, Module, Style, keys_of, make_modules, sources
 from gfm_runtime.firmware.tick import place
-from gfm_runtime.firmware.translate import Array, Expr, Record, Text, Translator
+from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
 from gfm_runtime.impedance import estimate
 from gfm_runtime.signals import group
 
@@ -118,23 +118,23 @@ def schedule_sources(
 def _functions(prefix: str, est: np.void, ctl: np.void, n: int) -> str:
     """The estimate of the reactance and the choice of a stage, in C."""
     constant = ("T_s", "omega_b", "X_f", "forget", "settled")
-    grid = Record(
+    grid = Struct(
         {
             name: est[name] if name in constant else place(name, (), f"g->{name}")
             for name in est.dtype.names or ()
         }
     )
-    scheduled = Record(
+    scheduled = Struct(
         {"stages": n, "dwell": ctl["dwell"], "since": place("since", (), "s->since")}
     )
     ends = [Array(name, (n,)) for name in ("above", "below")]
     now, X = Expr("var", ("now",), "int"), Expr("var", ("X",))
     translate = Translator(unroll=True)
-    text = Text(
+    printer = Printer(
         est["X"].dtype, {"g": f"{prefix}_estimate_t", "s": f"{prefix}_t"}, real_type="double"
     )
     return "\n".join(
-        text.function(one)
+        printer.function(one)
         for one in (
             translate.function(estimate, [grid, *(Expr("var", (name,)) for name in "pwV")]),
             translate.function(choose, [scheduled, now, X, *ends]),

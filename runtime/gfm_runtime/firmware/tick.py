@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime import inner
 from gfm_runtime.firmware.translate import (
     Algebra,
     Array,
+    CFunction,
     Expr,
-    Function,
-    Record,
-    Text,
+    Printer,
+    Struct,
     Translator,
     constants,
     number,
@@ -26,7 +25,7 @@ from gfm_runtime.firmware.translate import (
     reached,
     without_unread,
 )
-from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE
+from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE, stage
 from gfm_runtime.kernel import (
     advance,
     advance_with_inner,
@@ -65,7 +64,7 @@ _OF_A_TICK = {
     "e_now": ("e", "the bridge's voltage"),
 }
 _PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
-assert [getattr(inner, name) for name in _PLACES] == list(range(len(_PLACES)))
+assert [getattr(stage, name) for name in _PLACES] == list(range(len(_PLACES)))
 
 
 _IN_PLACE = """\
@@ -86,7 +85,7 @@ def place(name: str, shape: tuple[int, ...], at: str) -> Expr | Array:
     return Array(at, shape, kind) if shape else Expr("var", (at,), kind)
 
 
-def _state(real: np.dtype[Any], n: int) -> Record:
+def _state(real: np.dtype[Any], n: int) -> Struct:
     of = state_dtype(real)
     inside = {name for name, *_ in INNER_STATE}
     fields = {}
@@ -94,17 +93,17 @@ def _state(real: np.dtype[Any], n: int) -> Record:
         shape = of[name].shape if not name.startswith("x_n") else (n,)
         own = f"t->{_OF_A_TICK[name][0]}" if name in _OF_A_TICK else f"s->{name}"
         fields[name] = place(name, shape, f"s->stage.{name}" if name in inside else own)
-    return Record(fields)
+    return Struct(fields)
 
 
-def _of_record(real: np.dtype[Any], stages: bool) -> Record:
+def _of_record(real: np.dtype[Any], stages: bool) -> Struct:
     """The law's constants as members of a record in C; without stages those of none."""
     of = law_dtype(real)
     fields = {name: place(name, of[name].shape, f"law->{name}") for name in of.names or ()}
     fields |= {name: number(1.0) for name in SHARED}
     if not stages:
         fields |= {name: number(0) for name, _ in INNER_NUMBERS} | {"k_pll": number(0.0)}
-    return Record(fields)
+    return Struct(fields)
 
 
 class Tick:
@@ -129,7 +128,7 @@ class Tick:
         self._n, own = n, record is not None
         law = _of_record(real, stages)
         if record is not None:
-            law = Record({name: record[name] for name in record.dtype.names or ()})
+            law = Struct({name: record[name] for name in record.dtype.names or ()})
             all_terms = all_terms or bool(np.any(np.signbit(record["u_0"]) & (record["u_0"] == 0)))
         translate = Translator(own, Algebra(all_terms))
         records = [law, _state(real, n)]
@@ -149,13 +148,13 @@ class Tick:
         without_unread(self._functions, "t->")
         self._real, self._own = real, own
 
-    def keys(self, prefix: str) -> Mapping[str, str]:
+    def keys(self, prefix: str) -> dict[str, str]:
         """What the templates ask for: the variables of a tick, the functions, and their calls."""
         roots = {} if self._own else {"law": "gfm_law_t"}
         roots |= {"s": f"{prefix}_t", "t": "tick_t"}
-        printer = Text(self._real, roots, {"t->m": _PLACES})
+        printer = Printer(self._real, roots, {"t->m": _PLACES})
 
-        def call(one: Function, **at: str) -> str:
+        def call(one: CFunction, **at: str) -> str:
             names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
             return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
 

@@ -6,6 +6,9 @@ expression such as ``s->x``, or a constant. What is known is decided when the co
 over known numbers are unrolled, branches are chosen, and local names that a loop adds to become one
 sum. Sums keep Python's order, so the bits are those of the compiled functions.
 
+Whole numbers of fixed point are ``word`` (int32_t) or ``wide`` (int64_t): sums and products are
+wide, and a place that is a word gets their lower bits.
+
 A product with the constant 0 goes. It is +0 or -0 and changes no sum except one that is -0 itself;
 the kernel makes the sums whose sign of zero could show +0 where they are -0. Factors and divisors
 of 1 go too.
@@ -29,15 +32,19 @@ import numpy as np
 
 from gfm_runtime.firmware.c_text import literal, plain, wrapped
 
-_DOES = {"+": operator.add, "-": operator.sub, "*": operator.mul, "<": operator.lt,
+_DOES = {"//": operator.floordiv, "<<": operator.lshift, ">>": operator.rshift,
+         "&": operator.and_, "+": operator.add, "-": operator.sub, "*": operator.mul,
+         "<": operator.lt,
          "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq,
          "!=": operator.ne}  # fmt: skip
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Lt: "<", ast.LtE: "<=",
-          ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}  # fmt: skip
-_BINDS = {"?:": 1, "or": 2, "and": 3, "==": 4, "!=": 4, "<": 5, "<=": 5, ">": 5, ">=": 5, "+": 6,
-          "-": 6, "*": 7, "/": 7, "neg": 8, "not": 8}  # fmt: skip
+          ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.FloorDiv: "//",
+          ast.LShift: "<<", ast.RShift: ">>", ast.BitAnd: "&"}  # fmt: skip
+_BINDS = {"?:": 1, "or": 2, "and": 3, "&": 4, "==": 5, "!=": 5, "<": 6, "<=": 6, ">": 6, ">=": 6,
+          ">>": 7, "+": 8, "-": 8, "*": 9, "/": 9, "neg": 10, "not": 10}  # fmt: skip
 _COMPARES = ("<", "<=", ">", ">=", "==", "!=")
 _MATHS = {"sqrt": "sqrt", "fabs": "fabs", "abs": "fabs"}
+_WORD = 2**31 - 1  # the largest int32_t
 _FEW = 2  # rounds of a loop that are written out even where loops stay
 
 
@@ -72,14 +79,14 @@ class Array:
 
 
 @dataclass(frozen=True)
-class Record:
+class Struct:
     """A record among the arguments: its fields as constants, ``Expr`` or ``Array``."""
 
     fields: Mapping[str, Any]
 
 
 @dataclass(eq=False)
-class Let:
+class Variable:
     """A local variable gets a value. ``sums`` is for one that may become part of where it is used,
     and ``stays`` for one that a branch or a loop changes, or a parameter."""
 
@@ -90,7 +97,7 @@ class Let:
 
 
 @dataclass(eq=False)
-class Put:
+class Assignment:
     """A place gets a value."""
 
     to: Expr
@@ -98,7 +105,7 @@ class Put:
 
 
 @dataclass(eq=False)
-class Run:
+class CallOrReturn:
     """A call, or a return with a value or without."""
 
     value: Expr | None
@@ -106,7 +113,7 @@ class Run:
 
 
 @dataclass(eq=False)
-class Block:
+class Compound:
     """``if``, ``while`` and ``for``; a loop ``for`` counts ``of`` from ``first`` to below
     ``value``."""
 
@@ -114,19 +121,19 @@ class Block:
     value: Expr
     body: list[Any]
     other: list[Any] = field(default_factory=list)
-    of: Let | None = None
+    of: Variable | None = None
     first: Expr | None = None
 
 
 @dataclass(eq=False)
-class Note:
+class Comment:
     """A comment."""
 
     text: str
 
 
 @dataclass(eq=False)
-class Function:
+class CFunction:
     """A function in C.
 
     Attributes:
@@ -139,7 +146,7 @@ class Function:
 
     name: str
     about: str
-    parameters: list[Let | Array]
+    parameters: list[Variable | Array]
     body: list[Any] = field(default_factory=list)
     kind: str = "void"
 
@@ -156,24 +163,24 @@ class Function:
     def places(self) -> Iterator[Expr]:
         """All places that it reads or writes itself."""
         yield from (e for e in self.expressions() if e.op == "var")
-        yield from (s.to for s in self.statements() if isinstance(s, Put))
+        yield from (s.to for s in self.statements() if isinstance(s, Assignment))
 
-    def calls(self) -> Iterator[Function]:
+    def calls(self) -> Iterator[CFunction]:
         """The functions that it calls, each time."""
         for e in self.expressions():
-            if e.op == "call" and isinstance(e.args[0], Function):
+            if e.op == "call" and isinstance(e.args[0], CFunction):
                 yield e.args[0]
 
     def touched(self) -> tuple[set[str], set[str]]:
         """The roots of the places that it uses, callees included, and of those it writes to."""
         uses, writes = set(), set()
         for s in self.statements():
-            if isinstance(s, Put):
+            if isinstance(s, Assignment):
                 writes.add(_root(s.to.args[0]))
         for e in self.expressions():
             if e.op == "var":
                 uses.add(_root(e.args[0]))
-            if e.op == "call" and isinstance(e.args[0], Function):
+            if e.op == "call" and isinstance(e.args[0], CFunction):
                 used, written = e.args[0].touched()
                 names = {
                     p.place: _root(a.place)
@@ -192,17 +199,21 @@ def _root(place: str) -> str:
 def _walk(statements: Iterable[Any]) -> Iterator[Any]:
     for s in statements:
         yield s
-        if isinstance(s, Block):
+        if isinstance(s, Compound):
             yield from _walk([*s.body, *s.other])
 
 
 def _own(s: Any) -> list[Expr]:
     """The expressions of a statement itself; of a target its indices."""
-    if isinstance(s, Put):
+    if isinstance(s, Assignment):
         return [*s.to.args[1:], s.value]
-    if isinstance(s, Block) and s.first is not None:
+    if isinstance(s, Compound) and s.first is not None:
         return [s.first, s.value]
-    return [s.value] if isinstance(s, Let | Run | Block) and s.value is not None else []
+    return (
+        [s.value]
+        if isinstance(s, Variable | CallOrReturn | Compound) and s.value is not None
+        else []
+    )
 
 
 def _parts(e: Any) -> Iterator[Expr]:
@@ -214,7 +225,7 @@ def _parts(e: Any) -> Iterator[Expr]:
             yield from _parts(part)
 
 
-def _local(of: Let) -> Expr:
+def _local(of: Variable) -> Expr:
     return Expr("local", (of,), of.value.kind)
 
 
@@ -223,12 +234,19 @@ def number(value: Any) -> Expr:
     if isinstance(value, bool | np.bool_):
         return Expr("num", (bool(value),), "bool")
     if isinstance(value, int | np.integer):
-        return Expr("num", (int(value),), "int")
+        return Expr("num", (int(value),), "int" if abs(int(value)) <= _WORD else "wide")
     return Expr("num", (float(value),))
 
 
 def _real(e: Expr) -> Expr:
     return replace(e, args=(float(e.args[0]),), kind="real") if e.op == "num" else e
+
+
+def wide(e: Expr) -> Expr:
+    """A whole number as one of 64 bits."""
+    if e.op == "num" or e.kind == "wide":
+        return replace(e, kind="wide")
+    return Expr("cast", (e,), "wide")
 
 
 def _is(e: Expr, value: float) -> bool:
@@ -246,6 +264,8 @@ class Algebra:
         """Of + - * / and comparisons."""
         if "real" in (a.kind, b.kind):
             a, b = _real(a), _real(b)
+        elif {"word", "wide"} & {a.kind, b.kind} and (a.number is None or b.number is None):
+            return self._whole(sign, a, b)
         kind = "bool" if sign in _COMPARES else "real" if "real" in (a.kind, b.kind) else "int"
         if kind != "real" and a.number is not None and b.number is not None:
             return number(_DOES[sign](a.number, b.number))
@@ -256,6 +276,15 @@ class Algebra:
             if short is not None:
                 return short
         return Expr(sign, (_shown(a), _shown(b)), kind)
+
+    def _whole(self, sign: str, a: Expr, b: Expr) -> Expr:
+        """Of whole numbers, one of which is no constant."""
+        if sign == "+" and a.number == 0:
+            return b
+        compares = sign in _COMPARES
+        if "wide" in (a.kind, b.kind) or not (compares or sign in ("*", ">>")):
+            a, b = (wide(e) if e.op == "num" and sign != ">>" else e for e in (a, b))
+        return Expr(sign, (a, b), "bool" if compares else "wide")
 
     def _sum(self, sign: str, a: Expr, b: Expr) -> Expr | None:
         if b.op == "zero":
@@ -324,21 +353,28 @@ class Translator:
         unroll: whether loops with known bounds are written out, and small functions become part of
             their callers.
         algebra: how expressions are joined.
+        primitives: functions that C has by itself, by name the kind of what they return.
     """
 
-    def __init__(self, unroll: bool, algebra: Algebra | None = None) -> None:
+    def __init__(
+        self,
+        unroll: bool,
+        algebra: Algebra | None = None,
+        primitives: Mapping[str, str] | None = None,
+    ) -> None:
         self.unroll, self.algebra = unroll, algebra or Algebra()
-        self._made: dict[Any, Function] = {}
+        self.primitives = primitives or {}
+        self._made: dict[Any, CFunction] = {}
 
-    def function(self, python: Any, values: Sequence[Any]) -> Function:
+    def function(self, python: Any, values: Sequence[Any]) -> CFunction:
         """A function for arguments of these kinds: records, constants and arrays are part of it,
         and numbers are its parameters."""
         tree, _, _ = _source(python)
         names, passed = [a.arg for a in tree.args.args], list(map(id, self.passed(values)))
-        bound, parameters, env = [], list[Let | Array](), dict[str, Any]()
+        bound, parameters, env = [], list[Variable | Array](), dict[str, Any]()
         for key, value in zip(names, values, strict=True):
             if isinstance(value, Expr) and id(value) in passed:
-                let = Let(key, Expr("var", (key,), value.kind), stays=True)
+                let = Variable(key, Expr("var", (key,), value.kind), stays=True)
                 parameters.append(let)
                 env[key] = _local(let)
             elif isinstance(value, Array):
@@ -347,11 +383,11 @@ class Translator:
                 env[key] = parameters[-1]
             else:
                 env[key] = value
-                bound.append(id(value) if isinstance(value, Record) else repr(value))
+                bound.append(repr(value) if isinstance(value, Expr) else id(value))
         made = (python, *bound, *(p.kind if isinstance(p, Array) else "" for p in parameters))
         if made not in self._made:
             doc = (ast.get_docstring(tree) or "").split("\n\n")[0]
-            one = Function(tree.name.lstrip("_"), plain(doc), parameters)
+            one = CFunction(tree.name.lstrip("_"), plain(doc), parameters)
             body = _Body(self, python, env, one)
             body.block(tree.body, one.body)
             tidy(one)
@@ -360,7 +396,7 @@ class Translator:
 
     def passed(self, values: Sequence[Any]) -> list[Any]:
         """The arguments that stay arguments; constants become part of a function with a record."""
-        scalar = not any(isinstance(v, Record | Array) for v in values)
+        scalar = not any(isinstance(v, Struct | Array) for v in values)
         return [
             v
             for v in values
@@ -368,13 +404,15 @@ class Translator:
             or (isinstance(v, Expr) and (scalar or not self.unroll or v.op != "num"))
         ]
 
-    def short(self, one: Function) -> bool:
+    def short(self, one: CFunction) -> bool:
         """Whether a function becomes part of its callers."""
         straight = one.kind != "void" and all(
-            isinstance(s, Let | Note) or (isinstance(s, Run) and s.returns) for s in one.body
+            isinstance(s, Variable | Comment) or (isinstance(s, CallOrReturn) and s.returns)
+            for s in one.body
         )
         records = any(e.op == "var" and "->" in e.args[0] for e in one.expressions())
-        return one.kind == "tuple" or (self.unroll and straight and records)
+        alone = not one.parameters
+        return one.kind == "tuple" or (self.unroll and straight and (records or alone))
 
 
 @dataclass
@@ -384,7 +422,7 @@ class _Body:
     of: Translator
     python: Any
     env: dict[str, Any]
-    function: Function
+    function: CFunction
     inlined: bool = False
     result: Any = None
     ended: bool = False  # by a return
@@ -408,7 +446,7 @@ class _Body:
             text = notes.get(node.lineno)
             if text and len(out) > start and (self.python, node.lineno) not in self.said:
                 self.said.add((self.python, node.lineno))
-                out.insert(start, Note(plain(text)))
+                out.insert(start, Comment(plain(text)))
 
     def statement(self, node: ast.stmt, out: list[Any]) -> None:
         match node:
@@ -430,9 +468,14 @@ class _Body:
                 self.branch(self.value(test, out), body, other, out)
             case ast.For(ast.Name() as name, iterable, body):
                 self.loop(name.id, iterable, body, out)
+            case ast.For(ast.Tuple(targets), iterable, body):
+                for values in self.value(iterable, out):
+                    for name_of, one in zip(targets, values, strict=True):
+                        self.put(self.target(name_of, out), _constant(one), out)
+                    self.block(body, out)
             case ast.While(test, body):
                 self.share(body, out)
-                block = Block("while", self.value(test, out), [])
+                block = Compound("while", self.value(test, out), [])
                 self.inner(body, block.body)
                 out.append(block)
             case ast.Return(value):
@@ -447,7 +490,7 @@ class _Body:
         elif isinstance(value, tuple):
             self.function.kind = "tuple"
         else:
-            out.append(Run(value and _shown(value), returns=True))
+            out.append(CallOrReturn(value and _shown(value), returns=True))
             if value is not None and self.function.kind != "real":
                 self.function.kind = value.kind
 
@@ -472,14 +515,15 @@ class _Body:
     def put(self, place: Any, value: Any, out: list[Any]) -> None:
         if isinstance(place, Expr):
             value = _real(_shown(value)) if place.kind == "real" else value
+            value = wide(value) if place.kind == "wide" else value
             if value != place:
-                out.append(Put(place, value))
+                out.append(Assignment(place, value))
             return
         known = not isinstance(value, Expr) or value.op in ("num", "zero")
         if place in self.shared or not known:
             tree = _source(self.python)[0]
             name = f"{tree.name.lstrip('_')}_{place}" if place in self.taken else place
-            let = Let(name, _shown(value), sums=self.inlined, stays=place in self.shared)
+            let = Variable(name, _shown(value), sums=self.inlined, stays=place in self.shared)
             out.append(let)
             value = _local(let)
         self.env[place] = value
@@ -517,15 +561,15 @@ class _Body:
             return
         shared = set(self.shared)
         self.share([*body, *other], out)
-        block = Block("if", test, [])
+        block = Compound("if", test, [])
         self.inner(body, block.body)
         self.inner(other, block.other)
         self.shared = shared
         out.append(block)
 
     def loop(self, name: str, iterable: ast.expr, body: list[ast.stmt], out: list[Any]) -> None:
-        if isinstance(iterable, ast.Tuple):
-            rounds: Iterable[Any] | None = [self.value(e, out) for e in iterable.elts]
+        if isinstance(iterable, ast.Tuple | ast.Name):
+            rounds: Iterable[Any] | None = self.value(iterable, out)
         elif isinstance(iterable, ast.Call):
             ends = [self.value(a, out) for a in iterable.args]
             first, last = ends if len(ends) == 2 else (number(0), ends[0])
@@ -541,8 +585,8 @@ class _Body:
             return
         shared = set(self.shared)
         self.share(body, out)
-        counter = Let(name, Expr("var", (name,), "int"), stays=True)
-        block = Block("for", last, [], of=counter, first=first)
+        counter = Variable(name, Expr("var", (name,), "int"), stays=True)
+        block = Compound("for", last, [], of=counter, first=first)
         self.env[name] = _local(counter)
         self.inner(body, block.body)
         self.shared = shared
@@ -563,7 +607,9 @@ class _Body:
                 return name
             case ast.Attribute(of, name):
                 record = self.value(of, out)
-                if not isinstance(record, Record) or name not in record.fields:
+                if not isinstance(record, Struct | Expr | Array):
+                    return _constant(getattr(record, name))
+                if not isinstance(record, Struct) or name not in record.fields:
                     raise self.fail(node, "is no field")
                 value = record.fields[name]
                 simple = isinstance(value, Expr | Array) or np.ndim(value)
@@ -601,7 +647,7 @@ class _Body:
     def choice(self, test: Expr, a: Expr, b: Expr) -> Expr:
         if test.op == "num":
             return a if test.args[0] else b
-        kind = "real" if "real" in (a.kind, b.kind) else a.kind
+        kind = next((k for k in ("real", "wide") if k in (a.kind, b.kind)), a.kind)
         a, b = (_real(_shown(e)) if kind == "real" else e for e in (a, b))
         return Expr("?:", (test, a, b), kind)
 
@@ -613,6 +659,8 @@ class _Body:
             return Expr("var", (of.place, *index), of.kind)
         if any(i.op != "num" for i in at):
             raise self.fail(node, "has no known index")
+        if isinstance(of, tuple | list):
+            return _constant(of[at[0].args[0]])
         value = of[tuple(i.args[0] for i in at)]
         return value if np.ndim(value) else number(value)
 
@@ -622,7 +670,8 @@ class _Body:
             case ast.Attribute(_, "type"):  # a.dtype.type(value): in the precision of a
                 return _real(values[0])
             case ast.Name("len"):
-                return number(values[0].shape[0])
+                of = values[0]
+                return number(of.shape[0] if isinstance(of, Array) else len(of))
             case ast.Name("min" | "max" as name):
                 a, b = values
                 if any(e.op not in ("num", "local", "var") for e in values):
@@ -631,14 +680,23 @@ class _Body:
                 return self.choice(test, b, a)
             case ast.Name(name) | ast.Attribute(_, name) if name in _MATHS:
                 return Expr("call", (_MATHS[name], *map(_shown, values)))
+            case ast.Name("wide"):
+                return wide(values[0])
+            case ast.Name("divided"):
+                return Expr("/", tuple(values), "wide")
+            case ast.Name(name) if name in self.of.primitives:
+                return Expr("call", (name, *values), self.of.primitives[name])
         python = self.value(node.func, out)
+        if hasattr(python, "__self__"):  # a method of a constant
+            known = (v.args[0] if isinstance(v, Expr) else v for v in values)
+            return _constant(python(*known))
         one = self.of.function(python, values)
         if self.of.short(one):
             return self.inline(python, values, out)
         passed = [_shown(v) if isinstance(v, Expr) else v for v in self.of.passed(values)]
         call = Expr("call", (one, *passed), one.kind)
         if alone and one.body:
-            out.append(Run(call))
+            out.append(CallOrReturn(call))
         return call
 
     def inline(self, python: Any, values: list[Any], out: list[Any]) -> Any:
@@ -656,10 +714,15 @@ class _Body:
         return body.result
 
 
+def _constant(value: Any) -> Any:
+    """What is known, as an expression if it is a number."""
+    return number(value) if isinstance(value, int | float | np.number) else value
+
+
 # --- what goes, and what becomes one ---
 
 
-def tidy(one: Function, unread: Sequence[Expr] = ()) -> None:
+def tidy(one: CFunction, unread: Sequence[Expr] = ()) -> None:
     """Take out variables that nothing uses and writes to the places ``unread``, and make sums of
     what was added step by step."""
     while _pruned(one.body, _uses(one), unread):
@@ -668,23 +731,23 @@ def tidy(one: Function, unread: Sequence[Expr] = ()) -> None:
     _check_names(one)
 
 
-def _uses(one: Function) -> Counter[Let]:
+def _uses(one: CFunction) -> Counter[Variable]:
     return Counter(e.args[0] for e in one.expressions() if e.op == "local")
 
 
-def _pruned(body: list[Any], uses: Counter[Let], unread: Sequence[Expr]) -> bool:
+def _pruned(body: list[Any], uses: Counter[Variable], unread: Sequence[Expr]) -> bool:
     kept: list[Any] = []
     for s in body:
-        if isinstance(s, Block) and (
+        if isinstance(s, Compound) and (
             _pruned(s.body, uses, unread) | _pruned(s.other, uses, unread)
         ):
             return True
-        idle = isinstance(s, Block) and s.word != "while" and not s.body and not s.other
-        idle = idle or (isinstance(s, Let) and not s.stays and not uses[s])
-        idle = idle or (isinstance(s, Put) and s.to in unread)
+        idle = isinstance(s, Compound) and s.word != "while" and not s.body and not s.other
+        idle = idle or (isinstance(s, Variable) and not s.stays and not uses[s])
+        idle = idle or (isinstance(s, Assignment) and s.to in unread)
         last = kept[-1] if kept else None
         if idle:
-            if isinstance(last, Note):
+            if isinstance(last, Comment):
                 kept.pop()
         else:
             kept.append(s)
@@ -693,16 +756,16 @@ def _pruned(body: list[Any], uses: Counter[Let], unread: Sequence[Expr]) -> bool
     return changed
 
 
-def _summed(body: list[Any], uses: Counter[Let]) -> None:
+def _summed(body: list[Any], uses: Counter[Variable]) -> None:
     for k, let in reversed(list(enumerate(body))):  # a sum's last part first
-        if isinstance(let, Block):
+        if isinstance(let, Compound):
             _summed(let.body, uses)
             _summed(let.other, uses)
-        if not (isinstance(let, Let) and let.sums and not let.stays and uses[let] == 1):
+        if not (isinstance(let, Variable) and let.sums and not let.stays and uses[let] == 1):
             continue
         for s in body[k + 1 :]:
             if any(e == _local(let) for own in _own(s) for e in _parts(own)):
-                if not (isinstance(s, Block) and s.word != "if"):
+                if not (isinstance(s, Compound) and s.word != "if"):
                     _substitute(s, let)
                     del body[k]
                 break
@@ -715,11 +778,11 @@ def _disturbs(s: Any, value: Expr) -> bool:
     reads = [e for e in _parts(value) if e.op == "var"]
     names = {e.args[0].name for e in _parts(value) if e.op == "local"}
     for one in _walk([s]):
-        if isinstance(one, Put) and any(_meet(one.to, e) for e in reads):
+        if isinstance(one, Assignment) and any(_meet(one.to, e) for e in reads):
             return True
-        if isinstance(one, Let) and one.name in names:
+        if isinstance(one, Variable) and one.name in names:
             return True
-        if isinstance(one, Run) and one.value and one.value.op == "call" and reads:
+        if isinstance(one, CallOrReturn) and one.value and one.value.op == "call" and reads:
             return True
     return False
 
@@ -731,7 +794,7 @@ def _meet(a: Expr, b: Expr) -> bool:
     return a.args[0] == b.args[0] and not apart
 
 
-def _substitute(s: Any, let: Let) -> None:
+def _substitute(s: Any, let: Variable) -> None:
     def new(e: Any) -> Any:
         if not isinstance(e, Expr):
             return e
@@ -746,13 +809,13 @@ def _substitute(s: Any, let: Let) -> None:
         return replace(e, args=args)
 
     s.value = new(s.value)
-    if isinstance(s, Put):
+    if isinstance(s, Assignment):
         s.to = new(s.to)
 
 
-def _check_names(one: Function) -> None:
+def _check_names(one: CFunction) -> None:
     """A name that is used again must not be read at its old value."""
-    now: dict[str, Let] = {}
+    now: dict[str, Variable] = {}
 
     def visit(body: Iterable[Any]) -> None:
         for s in body:
@@ -761,20 +824,20 @@ def _check_names(one: Function) -> None:
                     let = e.args[0] if e.op == "local" else None
                     if let and not let.stays and now.get(let.name, let) is not let:
                         raise Untranslatable(f"{one.name}: {let.name} needs another name")
-            if isinstance(s, Let):
+            if isinstance(s, Variable):
                 now[s.name] = s
-            if isinstance(s, Block):
+            if isinstance(s, Compound):
                 visit(s.body)
                 visit(s.other)
 
     visit(one.body)
 
 
-def reached(entries: Iterable[Function]) -> list[Function]:
+def reached(entries: Iterable[CFunction]) -> list[CFunction]:
     """These functions and those that they call, callees first."""
-    out: list[Function] = []
+    out: list[CFunction] = []
 
-    def visit(one: Function) -> None:
+    def visit(one: CFunction) -> None:
         for other in one.calls():
             visit(other)
         if one not in out:
@@ -785,11 +848,11 @@ def reached(entries: Iterable[Function]) -> list[Function]:
     return out
 
 
-def without_unread(functions: Sequence[Function], prefix: str) -> None:
+def without_unread(functions: Sequence[CFunction], prefix: str) -> None:
     """Take out what is written to places that begin with ``prefix`` and that nothing reads."""
     while True:
         reads = [e for f in functions for e in f.expressions() if e.op == "var"]
-        writes = [s.to for f in functions for s in f.statements() if isinstance(s, Put)]
+        writes = [s.to for f in functions for s in f.statements() if isinstance(s, Assignment)]
         unread = [
             to
             for to in writes
@@ -804,22 +867,22 @@ def without_unread(functions: Sequence[Function], prefix: str) -> None:
 # --- operations ---
 
 
-def operations(entry: Function) -> Counter[str]:
-    """How often each operator on real numbers stands in a call of ``entry``, all branches
-    included; the comparisons together, and sqrt."""
+def operations(entry: CFunction) -> Counter[str]:
+    """How often each operator on numbers of the signals' kind stands in a call of ``entry``, all
+    branches included; the comparisons together, and sqrt."""
     out: Counter[str] = Counter()
     for e in entry.expressions():
         if e.op == "call":
             what = e.args[0]
-            out += operations(what) if isinstance(what, Function) else Counter([what])
-        elif e.op in _COMPARES and e.args[0].kind == "real":
+            out += operations(what) if isinstance(what, CFunction) else Counter([what])
+        elif e.op in _COMPARES and e.args[0].kind in ("real", "word", "wide"):
             out["<"] += 1
-        elif e.kind == "real" and e.op in ("+", "-", "*", "/"):
+        elif e.kind in ("real", "wide") and e.op in ("+", "-", "*", "/"):
             out[e.op] += 1
     return out
 
 
-def constants(entry: Function) -> set[float]:
+def constants(entry: CFunction) -> set[float]:
     """The different numbers in a call of ``entry`` but 0 and 1."""
     return {
         e.args[0]
@@ -832,7 +895,7 @@ def constants(entry: Function) -> set[float]:
 # --- text ---
 
 
-class Text:
+class Printer:
     """How functions look in C.
 
     Args:
@@ -850,14 +913,15 @@ class Text:
         real_type: str = "real",
     ) -> None:
         self.real, self.roots = real, roots
-        self._types = {"real": real_type, "int": "int", "bool": "bool", "void": "void"}
+        self._types = {"real": real_type, "word": "int32_t", "wide": "int64_t"}
+        self._types |= {name: name for name in ("int", "bool", "void")}
         self.indices = indices or {}
         self.end = "f" if real == np.float32 else ""
 
-    def function(self, one: Function) -> str:
+    def function(self, one: CFunction) -> str:
         """A function with its comment."""
         uses, writes = one.touched()
-        self._often = Counter(s.name for s in one.statements() if isinstance(s, Let))
+        self._often = Counter(s.name for s in one.statements() if isinstance(s, Variable))
         given = [
             f"{'' if root in writes else 'const '}{kind} *{root}"
             for root, kind in self.roots.items()
@@ -881,9 +945,9 @@ class Text:
         lines, names = list[str](), set(names)
         for s in body:
             match s:
-                case Note(text):
+                case Comment(text):
                     lines.append(f"{indent}/* {text} */")
-                case Let(name, value):
+                case Variable(name, value):
                     if name in names:
                         lines += wrapped(indent + self._put(name, _local(s), value))
                     else:
@@ -891,16 +955,16 @@ class Text:
                         what = f"{'const ' * once}{self._types[value.kind]} {name}"
                         lines += wrapped(f"{indent}{what} = {self.expression(value)};")
                         names.add(name)
-                case Put(to, value):
+                case Assignment(to, value):
                     lines += wrapped(indent + self._put(self.expression(to), to, value))
-                case Run(value, returns):
+                case CallOrReturn(value, returns):
                     text = self.expression(value) if value else ""
                     lines += wrapped(f"{indent}{'return ' * returns}{text}".rstrip() + ";")
-                case Block():
+                case Compound():
                     lines += self._inner(s, names, indent)
         return lines
 
-    def _inner(self, s: Block, names: set[str], indent: str, word: str = "") -> list[str]:
+    def _inner(self, s: Compound, names: set[str], indent: str, word: str = "") -> list[str]:
         test = self.expression(s.value)
         if s.of is not None and s.first is not None:
             i = s.of.name
@@ -910,8 +974,8 @@ class Text:
             head = f"{s.word} ({test})"
         lines = wrapped(f"{indent}{word}{head} {{")
         lines += self._block(s.body, names, indent + "    ")
-        more = [one for one in s.other if not isinstance(one, Note)]
-        if len(more) == 1 and isinstance(more[0], Block) and more[0].word == "if":
+        more = [one for one in s.other if not isinstance(one, Comment)]
+        if len(more) == 1 and isinstance(more[0], Compound) and more[0].word == "if":
             return lines + self._inner(more[0], names, indent, "} else ")
         if s.other:
             lines += [f"{indent}}} else {{", *self._block(s.other, names, indent + "    ")]
@@ -920,6 +984,8 @@ class Text:
         return [*lines, f"{indent}}}"]
 
     def _put(self, to: str, place: Expr, value: Expr) -> str:
+        if place.kind == "word" and value.kind == "wide":
+            return f"{to} = (int32_t){self.expression(value, _BINDS['neg'])};"
         same = value.op in ("+", "-", "*", "/") and (
             value.args[0] == place
             or (value.args[0].op == place.op == "local" and value.args[0].args[0].name == to)
@@ -942,6 +1008,13 @@ class Text:
                 return place + "".join(f"[{self._index(place, i)}]" for i in index)
             case "call":
                 return self._call(e)
+        if e.op == "cast":
+            return f"(int64_t){self.expression(e.args[0], _BINDS['neg'])}"
+        if e.kind == "wide" and not any(a.kind == "wide" for a in e.args) and e.op in "+-*":
+            a, b = e.args
+            if e.op == "*":
+                return f"product({self.expression(a)}, {self.expression(b)})"
+            e = replace(e, args=(wide(a), b))
         binds = _BINDS[e.op]
         if e.op in ("neg", "not"):
             text = ("-" if e.op == "neg" else "!") + self.expression(e.args[0], binds)
@@ -959,11 +1032,11 @@ class Text:
     def _call(self, e: Expr) -> str:
         what, *given = e.args
         arguments = [self.expression(a) for a in given]
-        if isinstance(what, Function):
+        if isinstance(what, CFunction):
             return self.call(what, arguments)
         return f"{what}{self.end}({', '.join(arguments)})"
 
-    def call(self, one: Function, arguments: Sequence[str], at: Mapping[str, str] = {}) -> str:
+    def call(self, one: CFunction, arguments: Sequence[str], at: Mapping[str, str] = {}) -> str:
         """A call of a function; ``at`` says what stands for a pointer if not its name."""
         uses, _ = one.touched()
         roots = [at.get(root, root) for root in self.roots if root in uses]
@@ -980,5 +1053,5 @@ class Text:
             small = value in (0.0, 1.0) and not np.signbit(value)
             text = f"{value:.1f}{self.end}" if small else literal(value, self.real)
         else:
-            text = str(value).lower()
+            text = f"INT64_C({value})" if e.kind == "wide" else str(value).lower()
         return f"{text} /* {e.label} */" if e.label else text

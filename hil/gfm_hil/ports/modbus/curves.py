@@ -19,10 +19,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gfm_hil.ports.modbus.droops import Gains
+from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import Value
-from gfm_hil.ports.modbus.plan import Plan
-from gfm_hil.ports.modbus.view import View
+from gfm_hil.ports.modbus.run_state import RunState
+from gfm_hil.ports.modbus.writes import Effect
 from gfm_hil.scenario.events.reference import check_reference
 
 COMPLETED, FAILED = 1, 2
@@ -58,7 +58,7 @@ class Curves(ABC):
     curve: str
     stored: tuple[str, ...]
 
-    def __init__(self, gains: Gains) -> None:
+    def __init__(self, gains: LawDroops) -> None:
         self._gains = gains
         self._head, self._adopt = str(self.model), f"{self.model}.Adpt{self.curve}"
         self._curve = f"{self.model}.{self.curve}"
@@ -76,14 +76,14 @@ class Curves(ABC):
         """The stored values of a meaning."""
 
     @abstractmethod
-    def in_force(self, view: View) -> Meaning:
+    def in_force(self, run: RunState) -> Meaning:
         """The meaning now in force."""
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         prefix = f"{self._curve}{_MINE}."
         stored = {p.removeprefix(prefix): v for p, v in written.items() if p.startswith(prefix)}
         stored = {**self._stored, **stored}
-        whole = {**self.write(self.in_force(view)), **stored}
+        whole = {**self.write(self.in_force(run)), **stored}
         new = old = self.state
         events: tuple[dict[str, Any], ...] = ()
 
@@ -97,7 +97,7 @@ class Curves(ABC):
                 raise ValueError(f"{self._adopt}Req: must be {_MINE}, the one that can be written")
             try:
                 meaning = self.read(whole)
-                self._events(meaning, view)
+                self._events(meaning, run)
             except ValueError:
                 fail()
                 raise
@@ -105,23 +105,23 @@ class Curves(ABC):
         if f"{self._head}.Ena" in written:
             new = replace(new, enabled=bool(written[f"{self._head}.Ena"]))
         if new.enabled and not old.enabled:
-            new = replace(new, before=self.in_force(view), law=view.law)
+            new = replace(new, before=self.in_force(run), law=run.law)
         if new.enabled and new.meaning and (adopts or not old.enabled):
-            events = self._events(new.meaning, view)
+            events = self._events(new.meaning, run)
         elif old.enabled and not new.enabled:
-            events = self._events(self._back(old, view), view) if old.meaning else ()
+            events = self._events(self._back(old, run), run) if old.meaning else ()
             new = replace(new, meaning=None, before=None)
 
         def keep() -> None:
             self.state, self._stored = new, stored
 
-        return Plan(events, keep, fail)
+        return Effect(events, keep, fail)
 
     def forget(self) -> None:
         self.state, self._stored = Adopted(), {}
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
-        s, there = self.state, self.write(self.in_force(view))
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
+        s, there = self.state, self.write(self.in_force(run))
         return {
             f"{self._head}.Ena": float(s.enabled),
             f"{self._adopt}Req": float(s.request),
@@ -130,19 +130,19 @@ class Curves(ABC):
             **{f"{self._curve}{_MINE}.{n}": v for n, v in {**there, **self._stored}.items()},
         }
 
-    def _back(self, s: Adopted, view: View) -> Meaning:
+    def _back(self, s: Adopted, run: RunState) -> Meaning:
         """The values in force before; if the law has changed since, it keeps its own droops."""
         before = s.before or {}
-        if view.law == s.law:
+        if run.law == s.law:
             return before
         return {name: value for name, value in before.items() if name == "V_ref"}
 
-    def _events(self, meaning: Meaning, view: View) -> tuple[dict[str, Any], ...]:
+    def _events(self, meaning: Meaning, run: RunState) -> tuple[dict[str, Any], ...]:
         """The commands for a meaning; gains first, since the run may refuse them."""
         events: list[dict[str, Any]] = []
         droops = {name: value for name, value in meaning.items() if name != "V_ref"}
         if droops:
-            events.append(self._gains.event(view.law, view.gains, droops))
+            events.append(self._gains.event(run.law, run.gains, droops))
         if "V_ref" in meaning:
             events.append({"type": "reference", "V_ref": meaning["V_ref"]})
         return tuple(events)
@@ -154,9 +154,9 @@ class VoltVar(Curves):
     model, curve = 705, "Crv"
     stored = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
 
-    def in_force(self, view: View) -> Meaning:
-        D_q = self._gains.droops(view.law, view.gains).D_q
-        return {"V_ref": view.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
+    def in_force(self, run: RunState) -> Meaning:
+        D_q = self._gains.droops(run.law, run.gains).D_q
+        return {"V_ref": run.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
 
     def read(self, stored: Mapping[str, Value]) -> Meaning:
         v_ref = _number(stored, "VRef") / 100.0
@@ -192,8 +192,8 @@ class Droop(Curves):
     model, curve = 711, "Ctl"
     stored = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
 
-    def in_force(self, view: View) -> Meaning:
-        D_p = self._gains.droops(view.law, view.gains).D_p
+    def in_force(self, run: RunState) -> Meaning:
+        D_p = self._gains.droops(run.law, run.gains).D_p
         return {} if D_p is None else {"D_p": D_p}
 
     def read(self, stored: Mapping[str, Value]) -> Meaning:

@@ -16,18 +16,19 @@ from pymodbus.constants import ExcCodes
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.modbus.connection import CLIENT
 from gfm_hil.ports.modbus.curves import Droop, VoltVar
-from gfm_hil.ports.modbus.droops import Gains
-from gfm_hil.ports.modbus.image import VENDOR, Image, Point, Value
+from gfm_hil.ports.modbus.droops import LawDroops
+from gfm_hil.ports.modbus.image import VENDOR, Image, SunSpecPoint, Value
 from gfm_hil.ports.modbus.measures import Measures
 from gfm_hil.ports.modbus.operation import Direct, Heartbeat, Operation
-from gfm_hil.ports.modbus.plan import Function, Plan, Refused
+from gfm_hil.ports.modbus.run_state import RunState, Slack
 from gfm_hil.ports.modbus.setpoints import SetPoint
-from gfm_hil.ports.modbus.view import Slack, View
+from gfm_hil.ports.modbus.writes import Effect, PointGroup
+from gfm_hil.ports.port import Refusal
 from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 
 #: carries out a command, or raises UserError
-Tell = Callable[[dict[str, Any]], object]
+Command = Callable[[dict[str, Any]], object]
 
 _READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
 
@@ -42,7 +43,7 @@ class Device:
         scenario: of the run.
         laws: names of the laws that are ready.
         look: returns the newest tick.
-        tell: sends a command to the run; called in a separate thread.
+        command: sends a command to the run; called in a separate thread.
         heartbeat_ms: timeout of a client's heartbeat, 0: none.
         elapsed_s: time since the device was started, s.
     """
@@ -51,13 +52,13 @@ class Device:
         self,
         scenario: Scenario,
         laws: Sequence[str],
-        look: Callable[[], View | None],
-        tell: Tell,
+        look: Callable[[], RunState | None],
+        command: Command,
         heartbeat_ms: int,
         elapsed_s: Callable[[], float],
     ) -> None:
-        self._look, self._tell, self._elapsed_s = look, tell, elapsed_s
-        self._gains = Gains(laws)
+        self._look, self._command, self._elapsed_s = look, command, elapsed_s
+        self._gains = LawDroops(laws)
         self._measures = Measures(scenario)
         rating = load_converter(scenario.plant.converter).bases.S_n
         self._set_points = (
@@ -65,7 +66,7 @@ class Device:
             SetPoint("VarSet", "Q_ref", rating, absolute=4, percent=(0, 1, 3)),
         )
         self._heart = Heartbeat(heartbeat_ms)
-        self._functions: tuple[Function, ...] = (
+        self._functions: tuple[PointGroup, ...] = (
             *self._set_points,
             VoltVar(self._gains),
             Droop(self._gains),
@@ -78,7 +79,7 @@ class Device:
         for path, value in self._measures.plate(laws).items():
             self.image.set(path, value)
         self._lock = asyncio.Lock()
-        self._view: View | None = None
+        self._run: RunState | None = None
         self._was_safe = False
         self._beats, self._seen, self._second = 0, -1, 0
         self._fresh = -1  # the device's tick at the last refresh
@@ -86,23 +87,23 @@ class Device:
         self.local = False
         self.refresh()
 
-    def writable(self, point: Point) -> bool:
+    def writable(self, point: SunSpecPoint) -> bool:
         """Whether clients may write a point."""
         return point.path in self._owner
 
     def refresh(self) -> None:
         """Update every register to the newest tick."""
-        view = self._look()
+        run = self._look()
         now = self._elapsed_s()
         self._fresh = int(now / TICK_S)
-        if view is None:
+        if run is None:
             return
-        if self._was_safe and not view.safe:  # the run was reset
+        if self._was_safe and not run.safe:  # the run was reset
             self._forget()
-        self._view, self._was_safe = view, view.safe
-        values = self._measures.now(view, self.slack, self._beats, self._heart.missing, self.local)
+        self._run, self._was_safe = run, run.safe
+        values = self._measures.now(run, self.slack, self._beats, self._heart.missing, self.local)
         for function in self._functions:
-            values.update(function.show(view, now))
+            values.update(function.show(run, now))
         for path, value in values.items():
             self.image.set(path, value)
 
@@ -126,11 +127,11 @@ class Device:
                 set_point.end(now)
         for set_point in [s for s in self._set_points if s.expire(now)]:
             async with self._lock:
-                view = self._look()
-                if view is None or not set_point.expire(now):  # a client has just written it
+                run = self._look()
+                if run is None or not set_point.expire(now):  # a client has just written it
                     continue
                 try:
-                    await self._carry_out([set_point.revert(view, now)], view)
+                    await self._carry_out([set_point.revert(run, now)], run)
                 except UserError as problem:  # retried at the next tick
                     self.image.set(f"{VENDOR}.Refd", str(problem))
                 else:
@@ -151,34 +152,36 @@ class Device:
             return None
         try:
             await self._write(address, [int(r) for r in written])
-        except Refused as problem:
+        except Refusal as problem:
             self.image.set(f"{VENDOR}.Refd", str(problem))
-            return problem.code
+            return ExcCodes(problem.code)
         return None
 
     async def _write(self, address: int, registers: list[int]) -> None:
         cut = self.image.cut(address, registers)
         if cut is None:
-            raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{address}: no whole points")
+            raise Refusal(ExcCodes.ILLEGAL_ADDRESS, f"{address}: no whole points")
         for point, _ in cut:
             if not self.writable(point):
-                raise Refused(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
+                raise Refusal(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
         if self.local and any(point.path != "715.ControllerHb" for point, _ in cut):
-            raise Refused(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
+            raise Refusal(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
         async with self._lock:
-            view = self._look()
-            if view is None:
-                raise Refused(ExcCodes.DEVICE_FAILURE, "the run has not begun")
-            plans = self._plans(cut, view)
+            run = self._look()
+            if run is None:
+                raise Refusal(ExcCodes.DEVICE_FAILURE, "the run has not begun")
+            plans = self._plans(cut, run)
             _count(plans)
             try:
-                await self._carry_out(plans, view)
+                await self._carry_out(plans, run)
             except UserError as problem:
-                raise Refused(ExcCodes.DEVICE_FAILURE, str(problem)) from None
+                raise Refusal(ExcCodes.DEVICE_FAILURE, str(problem)) from None
         self.refresh()
 
-    def _plans(self, cut: Sequence[tuple[Point, Sequence[int]]], view: View) -> list[Plan]:
-        by_function: dict[int, tuple[Function, dict[str, Value]]] = {}
+    def _plans(
+        self, cut: Sequence[tuple[SunSpecPoint, Sequence[int]]], run: RunState
+    ) -> list[Effect]:
+        by_function: dict[int, tuple[PointGroup, dict[str, Value]]] = {}
         try:
             for point, part in cut:
                 value = point.decode(part)
@@ -188,11 +191,11 @@ class Device:
                 function = self._owner[point.path]
                 by_function.setdefault(id(function), (function, {}))[1][point.path] = value
             now = self._elapsed_s()
-            return [f.plan(values, view, now) for f, values in by_function.values()]
+            return [f.plan(values, run, now) for f, values in by_function.values()]
         except ValueError as problem:
-            raise Refused(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
+            raise Refusal(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
 
-    async def _carry_out(self, plans: Sequence[Plan], view: View) -> None:
+    async def _carry_out(self, plans: Sequence[Effect], run: RunState) -> None:
         """Send the run every command, then store the new state.
 
         Raises:
@@ -201,7 +204,7 @@ class Device:
         try:
             for plan in plans:
                 for event in plan.events:
-                    await asyncio.to_thread(self._tell, event)
+                    await asyncio.to_thread(self._command, event)
                     if event["type"] == "reset":
                         self._forget()
         except UserError:
@@ -217,12 +220,12 @@ class Device:
 
     def _count_beat(self) -> None:
         """Count DERHb only while the run advances: a device of a stalled run must look dead."""
-        view = self._look()
-        if view is not None and view.tick != self._seen:
-            self._beats, self._seen = self._beats + 1, view.tick
+        run = self._look()
+        if run is not None and run.tick != self._seen:
+            self._beats, self._seen = self._beats + 1, run.tick
 
 
-def _count(plans: Sequence[Plan]) -> None:
+def _count(plans: Sequence[Effect]) -> None:
     """Apply the client's rate limit to a request that causes commands; a stop always passes."""
     client = CLIENT.get()
     kinds = [event["type"] for plan in plans for event in plan.events]
@@ -231,4 +234,4 @@ def _count(plans: Sequence[Plan]) -> None:
     try:
         client.rate.take()
     except UserError as problem:
-        raise Refused(ExcCodes.DEVICE_BUSY, str(problem)) from None
+        raise Refusal(ExcCodes.DEVICE_BUSY, str(problem)) from None

@@ -56,8 +56,8 @@ def _ratio(law: Law) -> complex:
     return law.element("phi", (2, 3))(_NEARLY_DC) / below if below else 0.0
 
 
-class Gains:
-    """Gains of the laws that are ready."""
+class LawDroops:
+    """LawDroops of the laws that are ready."""
 
     def __init__(self, laws: Sequence[str]) -> None:
         self._files = {name: law_file(name) for name in laws}

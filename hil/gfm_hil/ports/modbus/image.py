@@ -24,7 +24,7 @@ Value = float | str | None
 
 
 @dataclass(frozen=True)
-class Point:
+class SunSpecPoint:
     """One point of a model.
 
     Attributes:
@@ -114,7 +114,7 @@ class Image:
     """
 
     def __init__(self, models: Mapping[int, Mapping[str, Any]]) -> None:
-        self.points: dict[str, Point] = {}
+        self.points: dict[str, SunSpecPoint] = {}
         self._set: dict[str, object] = {}
         self.registers: list[int] = [*struct.unpack(">2H", b"SunS")]
         for number, content in models.items():
@@ -126,7 +126,7 @@ class Image:
             data = model.get_mb()
             self.registers += struct.unpack(f">{len(data) // 2}H", data)
             for path, point in _walk(model, str(number)):
-                self.points[path] = Point(
+                self.points[path] = SunSpecPoint(
                     path, start + point.offset, int(point.len), point.pdef, _exponent(point, model)
                 )
         self.registers += [0xFFFF, 0]
@@ -154,7 +154,7 @@ class Image:
 
     def cut(
         self, address: int, registers: Sequence[int]
-    ) -> list[tuple[Point, Sequence[int]]] | None:
+    ) -> list[tuple[SunSpecPoint, Sequence[int]]] | None:
         """The points that these registers make up, or None if they contain a point in part."""
         found, at = [], 0
         while at < len(registers):

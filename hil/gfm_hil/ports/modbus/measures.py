@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.ports.modbus.image import VENDOR, Value
-from gfm_hil.ports.modbus.view import Slack, View
+from gfm_hil.ports.modbus.run_state import RunState, Slack
 from gfm_hil.scenario import Scenario
 from gfm_plant import Bases, load_converter
 from gfm_plant.names import TRIPS
@@ -112,7 +112,7 @@ class Measures:
         return found
 
     def now(
-        self, view: View, slack: Slack, beats: int, heart_lost: bool, local: bool
+        self, run: RunState, slack: Slack, beats: int, heart_lost: bool, local: bool
     ) -> dict[str, Value]:
         """The points that change with the run.
 
@@ -121,15 +121,15 @@ class Measures:
             heart_lost: the client's heartbeat is missing.
             local: remote control is refused.
         """
-        b, y = self._bases, view.row
+        b, y = self._bases, run.row
         p, q, V = y["y_p"], y["y_q"], y["y_V"]
         s = math.hypot(p, q)
         i_dc = y["u_i_u"] if self._scenario.plant.dc_source.mode == "controlled" else math.nan
-        info = view.reason or ("heartbeat of the client lost" if heart_lost else "")
+        info = run.reason or ("heartbeat of the client lost" if heart_lost else "")
         return {
-            "701.St": float(not view.safe),
-            "701.InvSt": float(6 if view.safe else _STATES[view.state]),
-            "701.ConnSt": float(not view.safe),
+            "701.St": float(not run.safe),
+            "701.InvSt": float(6 if run.safe else _STATES[run.state]),
+            "701.ConnSt": float(not run.safe),
             "701.Alrm": float(_alarms(int(y["true_trip"]), bool(info))),
             "701.MnAlrmInfo": info,
             "701.W": p * b.S_n,
@@ -145,19 +145,19 @@ class Measures:
             "714.DCW": i_dc * y["y_v_dc"] * b.S_n,
             "714.Prt1.DCW": i_dc * y["y_v_dc"] * b.S_n,
             "714.Prt1.DCV": y["y_v_dc"] * b.V_dcref,
-            "714.Prt1.DCSta": 3.0 if view.safe else 1.0,
+            "714.Prt1.DCSta": 3.0 if run.safe else 1.0,
             "715.LocRemCtl": float(local),
             "715.DERHb": float(beats),
-            f"{VENDOR}.St": float(view.state),
-            f"{VENDOR}.PRef": view.references["P_ref"],
-            f"{VENDOR}.QRef": view.references["Q_ref"],
-            f"{VENDOR}.Tick": float(view.tick),
-            f"{VENDOR}.Miss": float(view.misses),
+            f"{VENDOR}.St": float(run.state),
+            f"{VENDOR}.PRef": run.references["P_ref"],
+            f"{VENDOR}.QRef": run.references["Q_ref"],
+            f"{VENDOR}.Tick": float(run.tick),
+            f"{VENDOR}.Miss": float(run.misses),
             f"{VENDOR}.SlkP50": slack.p50,
             f"{VENDOR}.SlkP1": slack.p1,
             f"{VENDOR}.SlkP01": slack.p01,
             f"{VENDOR}.SlkMin": slack.least,
-            f"{VENDOR}.Why": view.reason,
+            f"{VENDOR}.Why": run.reason,
         }
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gfm_hil.ports.modbus.droops import Gains
+from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import VENDOR, Value
-from gfm_hil.ports.modbus.plan import Function, Plan
-from gfm_hil.ports.modbus.view import View
+from gfm_hil.ports.modbus.run_state import RunState
+from gfm_hil.ports.modbus.writes import Effect, PointGroup
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime.states import RUNNING
 
@@ -32,7 +32,7 @@ class Heartbeat:
         self._late: float | None = None  # ms
         self.missing = False
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         timeout, value = written.get(f"{VENDOR}.HbTms"), written.get("715.ControllerHb")
         if timeout and not _SHORTEST_MS <= float(timeout) <= _LONGEST_MS:
             raise ValueError(
@@ -45,7 +45,7 @@ class Heartbeat:
             if isinstance(value, (int, float)) and value != self._value:
                 self._value, self._last, self.missing = value, now, False
 
-        return Plan(keep=keep)
+        return Effect(keep=keep)
 
     def expire(self, now: float) -> bool:
         """Whether it has just been lost; true once per loss."""
@@ -61,7 +61,7 @@ class Heartbeat:
         """Expect no heartbeat until a client writes it again."""
         self._last, self.missing = None, False
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
         return {
             "715.ControllerHb": self._value or 0.0,
             f"{VENDOR}.HbTms": float(self._timeout_ms),
@@ -70,12 +70,12 @@ class Heartbeat:
         }
 
 
-class Operation(Function):
+class Operation(PointGroup):
     """OpCtl and AlarmReset."""
 
     writable = ("715.AlarmReset", "715.OpCtl")
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         reset, control = written.get("715.AlarmReset", 0), written.get("715.OpCtl")
         if reset not in (0, 1):
             raise ValueError(f"AlarmReset = {reset}: must be 1, to reset")
@@ -84,25 +84,25 @@ class Operation(Function):
         if control == STOP:
             if reset:
                 raise ValueError("AlarmReset = 1, OpCtl = 0: one or the other")
-            return Plan(({"type": "stop"},))
-        if (reset or control == START) and view.safe:
-            return Plan(({"type": "reset"},))
-        return Plan()
+            return Effect(({"type": "stop"},))
+        if (reset or control == START) and run.safe:
+            return Effect(({"type": "reset"},))
+        return Effect()
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
-        running = view.state == RUNNING and not view.safe
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
+        running = run.state == RUNNING and not run.safe
         return {"715.AlarmReset": 0.0, "715.OpCtl": float(START if running else STOP)}
 
 
-class Direct(Function):
+class Direct(PointGroup):
     """The vendor model's points that act at once: law, voltage reference and droops."""
 
     writable = tuple(f"{VENDOR}.{name}" for name in ("Law", "VRef", "Dp", "Dq"))
 
-    def __init__(self, laws: Sequence[str], gains: Gains) -> None:
+    def __init__(self, laws: Sequence[str], gains: LawDroops) -> None:
         self._laws, self._gains = laws, gains
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         given = {
             path.partition(".")[2]: float(value)
             for path, value in written.items()
@@ -118,14 +118,14 @@ class Direct(Function):
             events.append({"type": "reference", "V_ref": given["VRef"]})
         wanted = {name: given[key] for key, name in (("Dp", "D_p"), ("Dq", "D_q")) if key in given}
         if wanted:
-            events.append(self._gains.event(view.law, view.gains, wanted))
-        return Plan(tuple(events))
+            events.append(self._gains.event(run.law, run.gains, wanted))
+        return Effect(tuple(events))
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
-        droops = self._gains.droops(view.law, view.gains)
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
+        droops = self._gains.droops(run.law, run.gains)
         return {
-            f"{VENDOR}.Law": float(self._laws.index(view.law) + 1),
-            f"{VENDOR}.VRef": view.references["V_ref"],
+            f"{VENDOR}.Law": float(self._laws.index(run.law) + 1),
+            f"{VENDOR}.VRef": run.references["V_ref"],
             f"{VENDOR}.Dp": droops.D_p,
             f"{VENDOR}.Dq": droops.D_q,
         }

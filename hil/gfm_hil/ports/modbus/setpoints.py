@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from gfm_hil.ports.modbus.image import Value
-from gfm_hil.ports.modbus.plan import Plan
-from gfm_hil.ports.modbus.view import View
+from gfm_hil.ports.modbus.run_state import RunState
+from gfm_hil.ports.modbus.writes import Effect
 from gfm_hil.scenario.events.reference import check_reference
 
 
@@ -69,7 +69,7 @@ class SetPoint:
         self.writable = tuple(self._keys)
         self.settings = Settings(mode=absolute)
 
-    def plan(self, written: Mapping[str, Value], view: View, now: float) -> Plan:
+    def plan(self, written: Mapping[str, Value], run: RunState, now: float) -> Effect:
         changes: dict[str, Any] = {self._keys[path]: value for path, value in written.items()}
         new = replace(self.settings, **changes)
         if new.mode not in self._modes:
@@ -79,7 +79,7 @@ class SetPoint:
             if number is not None:
                 check_reference(self.reference, number / self._unit(name))
         new = replace(new, enabled=bool(new.enabled), enabled_back=bool(new.enabled_back))
-        return self._plan(new, view, now, changed=True)
+        return self._plan(new, run, now, changed=True)
 
     def end(self, now: float) -> None:
         """If enabled, let the timer expire now, even if none is running."""
@@ -90,20 +90,20 @@ class SetPoint:
         """Whether the timer has expired."""
         return self.settings.until is not None and now >= self.settings.until
 
-    def revert(self, view: View, now: float) -> Plan:
+    def revert(self, run: RunState, now: float) -> Effect:
         """The effect of the timer's expiry: the set-point and enable of ``…Rvrt``."""
         s = self.settings
         name = self._in_force(s)
         new = replace(_with(s, name, self._back(s, name)), enabled=s.enabled_back)
-        return self._plan(new, view, now, changed=False)
+        return self._plan(new, run, now, changed=False)
 
     def forget(self) -> None:
         """Clear the state after a reset: the run is back at its start, without commands."""
         self.settings = Settings(mode=self._absolute)
 
-    def show(self, view: View, now: float) -> dict[str, Value]:
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
         s = self.settings
-        there = view.references[self.reference]
+        there = run.references[self.reference]
         back = s.before if s.enabled else there
         found: dict[str, Value] = {}
         for path, key in self._keys.items():
@@ -115,12 +115,12 @@ class SetPoint:
         found[f"{self._prefix}RvrtRem"] = -(-left // 1)
         return found
 
-    def _plan(self, new: Settings, view: View, now: float, changed: bool) -> Plan:
+    def _plan(self, new: Settings, run: RunState, now: float, changed: bool) -> Effect:
         old = self.settings
         target: float | None = None
         if new.enabled:
             if not old.enabled:
-                new = replace(new, before=view.references[self.reference])
+                new = replace(new, before=run.references[self.reference])
             if new.mode != old.mode:  # do not keep the old mode's value
                 left = self._in_force(old)
                 if getattr(new, left) == getattr(old, left):
@@ -138,8 +138,8 @@ class SetPoint:
             self.settings = new
 
         if target is None:
-            return Plan(keep=keep)
-        return Plan(({"type": "reference", self.reference: target},), keep)
+            return Effect(keep=keep)
+        return Effect(({"type": "reference", self.reference: target},), keep)
 
     def _in_force(self, s: Settings) -> str:
         return "value" if s.mode == self._absolute else "percent"

@@ -26,7 +26,7 @@ _LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range,
 
 
 @dataclass(frozen=True)
-class Channel:
+class ScopeChannel:
     """One quantity over time.
 
     Attributes:
@@ -60,7 +60,7 @@ class Channel:
         return self.of(columns, first, last).astype(np.float32)
 
 
-def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
+def make_channels(T_s: float, f_b: float) -> tuple[ScopeChannel, ...]:
     """All channels of a recording.
 
     Args:
@@ -78,26 +78,26 @@ def make_channels(T_s: float, f_b: float) -> tuple[Channel, ...]:
         *(_column(n, "inner", f"y_{n}", f_b) for n in names("y_inner")),
         *(_column(f"u_{n}", "inner", f"u_{n}", f_b) for n in names("u_inner")),
         *(_column(n, "inner", n, f_b) for n in CONTROLLER_INNER),
-        Channel("i_ref", "inner", "i_ref", "p.u.", "size of the current that the inner stage asks "
-                "for", _LEAST["p.u."], I_REF, _i_ref),
+        ScopeChannel("i_ref", "inner", "i_ref", "p.u.", "size of the current that the inner stage"
+                     " asks for", _LEAST["p.u."], I_REF, _i_ref),
         _duration("slack", SLACK, 10.0, T_s),
         _duration("round_trip", ROUND_TRIP, 5.0, T_s),
         _duration("late", LATE, 5.0, T_s),
-        Channel("miss", "loop", "miss", "", "ticks without a fresh u", 1.0, MISS_NEEDS, _miss),
+        ScopeChannel("miss", "loop", "miss", "", "ticks without a fresh u", 1.0, MISS_NEEDS, _miss),
     )  # fmt: skip
 
 
-def _column(name: str, group: str, column: str, f_b: float) -> Channel:
+def _column(name: str, group: str, column: str, f_b: float) -> ScopeChannel:
     row = TABLE[column]
     symbol, unit, factor = row.shown(f_b)
 
     def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
         return np.asarray(columns[column][first:last] * factor)
 
-    return Channel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), of)
+    return ScopeChannel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), of)
 
 
-def _phase(name: str, phase: str, T_s: float, f_b: float) -> Channel:
+def _phase(name: str, phase: str, T_s: float, f_b: float) -> ScopeChannel:
     """A phase of a voltage or current; the recording of a run that goes on has no column t."""
     row, needs = DERIVED[wave(name, phase, si=False)], NEEDS[1:]
 
@@ -105,7 +105,7 @@ def _phase(name: str, phase: str, T_s: float, f_b: float) -> Channel:
         part = {n: columns[n][first:last] for n in needs} | {"t": np.arange(first, last) * T_s}
         return Phase(part, name, phase, f_b)[:]
 
-    return Channel(
+    return ScopeChannel(
         row.name, "wave", row.symbol, "p.u.", row.quantity, _LEAST["p.u."], needs, of
     )  # fmt: skip
 
@@ -115,12 +115,12 @@ def _i_ref(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
     return np.hypot(d, q)
 
 
-def _duration(name: str, duration: Duration, least: float, T_s: float) -> Channel:
+def _duration(name: str, duration: Duration, least: float, T_s: float) -> ScopeChannel:
     def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
         return duration.us(columns, T_s, first, last)
 
     needs = duration.needs
-    return Channel(name, "loop", duration.name, "µs", duration.meaning, least, needs, of)
+    return ScopeChannel(name, "loop", duration.name, "µs", duration.meaning, least, needs, of)
 
 
 def _miss(columns: Columns, first: int, last: int) -> NDArray[np.float64]:

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.ports.scope.channels import Channel
-from gfm_hil.ports.scope.record import Record
+from gfm_hil.ports.scope.channels import ScopeChannel
+from gfm_hil.ports.scope.recording import Recording
 
 STEP = 8  # blocks of one level in one block of the next
 _AT_ONCE = STEP**5  # most ticks processed per update
@@ -24,7 +24,7 @@ Extremes = NDArray[np.float32]
 class Pyramid:
     """The extremes of a recording."""
 
-    def __init__(self, record: Record, channels: Sequence[Channel]) -> None:
+    def __init__(self, record: Recording, channels: Sequence[ScopeChannel]) -> None:
         self.record, self.channels = record, tuple(channels)
         self._index = {channel.name: k for k, channel in enumerate(self.channels)}
         self._levels: list[tuple[Extremes, Extremes]] = []

@@ -27,7 +27,7 @@ from gfm_hil.ports.listener import Listener
 from gfm_hil.ports.scope.access import HEADERS, Access
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.pyramid import Pyramid
-from gfm_hil.ports.scope.record import Record
+from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.session import SEND_S, Session, in_words
 from gfm_hil.scenario import INPROC
 from gfm_runtime import law_titles
@@ -70,7 +70,7 @@ def static_files() -> dict[str, tuple[str, bytes]]:
 class Scope:
     """A server for one run."""
 
-    def __init__(self, record: Record, access: Access) -> None:
+    def __init__(self, record: Recording, access: Access) -> None:
         self.record, self.access = record, access
         channels = make_channels(record.T_s, record.f_b)
         self._pyramid = Pyramid(record, channels)
@@ -147,7 +147,7 @@ class Scope:
         """Serve one page's connection to its end. A page that announces that it will control
         takes no place of the pages that look: until its token is accepted it counts as waiting,
         and the listener drops the oldest waiting connection."""
-        session = Session(connection, self._pyramid, self.access, self._tell)
+        session = Session(connection, self._pyramid, self.access, self._command)
         with contextlib.suppress(ConnectionClosed):
             request = connection.request
             if request is not None and request.path.partition("?")[2] == _CONTROL:
@@ -220,18 +220,18 @@ class Scope:
             "grid_hz": s.plant.grid.omega_g * self.record.f_b,
         }
 
-    async def _tell(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
+    async def _command(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
         async with self._commands:
-            return await asyncio.to_thread(self._tell_now, event, by)
+            return await asyncio.to_thread(self._command_now, event, by)
 
-    def _tell_now(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
+    def _command_now(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
         if not self.record.live:
             raise UserError("the run is over")
         if self._operator is None:
             if self.record.scenario.link.type == INPROC:
                 raise UserError("a run in one process (link inproc) takes no commands")
             self._operator = Operator(self.record.folder)
-        return self._operator.tell(event, by)
+        return self._operator.command(event, by)
 
 
 def _listen(host: str, ports: list[int]) -> Listener:
@@ -257,9 +257,3 @@ def _response(status: http.HTTPStatus, kind: str, content: str | bytes) -> Respo
     headers["Content-Type"], headers["Content-Length"] = kind, str(len(body))
     headers["Connection"] = "close"
     return Response(status.value, status.phrase, headers, body)
-
-
-def run_scope(scope: Scope, *where: Any) -> None:
-    """Serve until Ctrl-C."""
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(scope.serve(*where))

@@ -18,11 +18,11 @@ from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity, address
 from gfm_hil.core.rate import Rate
 from gfm_hil.ports.scope.access import Access
+from gfm_hil.ports.scope.picture import Picture, PictureRequest
 from gfm_hil.ports.scope.pyramid import Pyramid
-from gfm_hil.ports.scope.view import Look, View
 
 #: carries out an event and returns its tick; raises UserError with the reason of a refusal
-Teller = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
+Commander = Callable[[dict[str, Any], Identity], Awaitable[dict[str, Any]]]
 
 SEND_S = 5.0  # timeout of a page that does not read a message
 ANSWER_S = 1.0  # timeout of a page's answer to a ping where another page wants its place
@@ -56,16 +56,16 @@ class Play(_Message):
     speed: float = Field(0.0, ge=0, le=100)
 
 
-class Tell(_Message):
+class Command(_Message):
     """An event that the run shall carry out."""
 
-    kind: Literal["tell"]
+    kind: Literal["command", "tell"]  # the latter for one version
     id: int = Field(ge=-(2**53), le=2**53)  # integers that JavaScript represents
     event: dict[str, Any]
 
 
-_MESSAGE: TypeAdapter[Hello | Look | Play | Tell] = TypeAdapter(
-    Annotated[Hello | Look | Play | Tell, Field(discriminator="kind")]
+_MESSAGE: TypeAdapter[Hello | PictureRequest | Play | Command] = TypeAdapter(
+    Annotated[Hello | PictureRequest | Play | Command, Field(discriminator="kind")]
 )
 
 
@@ -82,12 +82,12 @@ class Session:
     """
 
     def __init__(
-        self, socket: ServerConnection, pyramid: Pyramid, access: Access, tell: Teller
+        self, socket: ServerConnection, pyramid: Pyramid, access: Access, command: Commander
     ) -> None:
-        self._socket, self._pyramid, self._access, self._tell = socket, pyramid, access, tell
+        self._socket, self._pyramid, self._access, self._command = socket, pyramid, access, command
         self.operator = ""
         self._rate = Rate("this page", PER_S, BURST)
-        self._view: View | None = None
+        self._shown: Picture | None = None
         self._played: tuple[float, float, float] | None = None  # start [ticks], speed, begin
         self._news: str | None = None
         self._picture: bytes | None = None
@@ -120,13 +120,13 @@ class Session:
         """Queue the next frame, unless there is none or the page has not read the last one yet: a
         slow page sees fewer pictures, never old ones. A page whose picture cannot be made is
         dropped."""
-        if self._view is None or self._picture is not None:
+        if self._shown is None or self._picture is not None:
             return
         try:
-            self._picture = self._view.frame(self.head())
+            self._picture = self._shown.frame(self.head())
         except Exception:
             _LOG.exception("%s: its picture cannot be made: the page is dropped", self.peer)
-            self._view = None
+            self._shown = None
             self._socket.transport.abort()
         if self._picture is not None:
             self._wake.set()
@@ -178,12 +178,12 @@ class Session:
                 case Hello():
                     self.operator = self._access.operator(message.token)
                     await self.say("control", granted=bool(self.operator))
-                case Look():
-                    self._view = View(self._pyramid, message, self.head())
+                case PictureRequest():
+                    self._shown = Picture(self._pyramid, message, self.head())
                 case Play():
                     self._play(message)
-                case Tell():
-                    await self._command(message)
+                case Command():
+                    await self._carry_out(message)
         except ValidationError as problem:
             await self.say("error", text="; ".join(lines(problem)).removeprefix(": "))
         except ValueError as problem:
@@ -195,14 +195,14 @@ class Session:
         start = message.start / self._pyramid.record.T_s
         self._played = (start, message.speed, time.monotonic()) if message.speed else None
 
-    async def _command(self, message: Tell) -> None:
+    async def _carry_out(self, message: Command) -> None:
         try:
             if not self.operator:
                 raise UserError("this page may look, not touch: open the address with the token")
             if message.event.get("type") != "stop":  # a stop always passes
                 self._rate.take()
             by = Identity(through="scope", name=self.operator, peer=self.peer)
-            done = await self._tell(message.event, by)
+            done = await self._command(message.event, by)
         except UserError as problem:
             await self.say("answer", id=message.id, ok=False, text=str(problem))
         else:

@@ -3,6 +3,6 @@
 A separate process reads the files to which the loop appends, and does not disturb the loop.
 """
 
-from gfm_hil.ports.streams.blocks import Block, BlockReader
+from gfm_hil.ports.streams.blocks import BlockReader, TickBlock
 
-__all__ = ["Block", "BlockReader"]
+__all__ = ["BlockReader", "TickBlock"]

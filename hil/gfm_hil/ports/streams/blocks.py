@@ -17,7 +17,7 @@ import zmq
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.ports.streams.follow import Rows
+from gfm_hil.ports.streams.follow import NewRows
 from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF, recorded_in, signals_of
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
@@ -28,7 +28,7 @@ ROOM = 500  # queued messages for a slow reader, at each end: 5 s of a run in re
 
 
 @dataclass(frozen=True)
-class Block:
+class TickBlock:
     """Rows of one side.
 
     Attributes:
@@ -48,7 +48,7 @@ def block_dtype(role: Role, inner: bool = False) -> np.dtype:
     )
 
 
-def messages(rows: Rows) -> list[list[bytes]]:
+def messages(rows: NewRows) -> list[list[bytes]]:
     """The messages that carry some rows."""
     columns = recorded_in(rows.role, rows.signals.shape[1])
     whole = np.empty(len(rows.signals), block_dtype(rows.role, columns != SIGNALS_OF[rows.role]))
@@ -94,10 +94,10 @@ class BlockReader:
     ) -> None:
         self._context.destroy(linger=0)
 
-    def receive(self, timeout_s: float) -> Block | None:
+    def receive(self, timeout_s: float) -> TickBlock | None:
         """The next block, or None on timeout."""
         if not self._socket.poll(round(timeout_s * 1e3)):
             return None
         topic, payload = self._socket.recv_multipart()
         rows = np.load(io.BytesIO(payload), allow_pickle=False)
-        return Block(topic.decode().removeprefix(_TOPIC), rows)
+        return TickBlock(topic.decode().removeprefix(_TOPIC), rows)

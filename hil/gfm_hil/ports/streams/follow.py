@@ -19,7 +19,7 @@ _LAST = 1  # newest rows not read yet: a tick's last time is written after it co
 
 
 @dataclass(frozen=True)
-class Rows:
+class NewRows:
     """Rows of one side, as in ``recording.parts.RolePart``.
 
     Attributes:
@@ -61,7 +61,7 @@ class Follower:
         self._next = {role: self.run.done(role) for role in ROLES}
         self.over = False
 
-    def news(self) -> list[Rows]:
+    def news(self) -> list[NewRows]:
         """Rows recorded since the last call that returned; afterwards ``over`` says whether these
         were the last.
 
@@ -73,7 +73,7 @@ class Follower:
         for role, part in self.run.parts.items():
             first, done = self._next[role], self.run.done(role) - (0 if over else _LAST)
             if done > first:
-                found.append(Rows(role, first, part.signals[first:done], part.times[first:done]))
+                found.append(NewRows(role, first, part.signals[first:done], part.times[first:done]))
         self.over = over
         self._next |= {rows.role: rows.first + len(rows.signals) for rows in found}
         return found

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import zmq
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.supervised import attempt
-from gfm_hil.ports.streams import blocks
+from gfm_hil.ports.streams.blocks import ROOM, messages
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.ports.streams.samples import Sampler
 
@@ -21,27 +20,22 @@ _LONGEST = 256  # bytes of a subscription; ours have 17
 _WAITING = 100  # queued subscription messages per subscriber
 
 
-@dataclass(frozen=True)
-class Ports:
-    """Address, and ports of samples and blocks (0: a free one)."""
-
-    host: str
-    samples: int
-    blocks: int
-
-
 class Publisher:
     """Both sockets, bound; use as a context manager.
+
+    Args:
+        host: address to listen at.
+        samples, blocks: ports, 0: a free one.
 
     Raises:
         UserError: a port cannot be bound.
     """
 
-    def __init__(self, ports: Ports) -> None:
+    def __init__(self, host: str, samples: int, blocks: int) -> None:
         self._context = zmq.Context()
         try:
-            self._samples = _bind(self._context, ports.host, ports.samples, "--port")
-            self._blocks = _bind(self._context, ports.host, ports.blocks, "--blocks")
+            self._samples = _bind(self._context, host, samples, "--port")
+            self._blocks = _bind(self._context, host, blocks, "--blocks")
         except UserError:
             self._context.destroy(linger=0)
             raise
@@ -72,7 +66,7 @@ class Publisher:
                 count[rows.role] += len(rows.signals)
                 for message in sampler.messages(rows, looked - before):
                     self._samples.send_multipart(message)
-                for message in blocks.messages(rows):
+                for message in messages(rows):
                     self._blocks.send_multipart(message)
 
         while not follower.over and not stopped():
@@ -87,7 +81,7 @@ def _bind(
     socket = context.socket(zmq.PUB)
     socket.set(zmq.MAXMSGSIZE, _LONGEST)
     socket.set(zmq.RCVHWM, _WAITING)
-    socket.set(zmq.SNDHWM, blocks.ROOM)
+    socket.set(zmq.SNDHWM, ROOM)
     where = f"tcp://{f'[{host}]' if ':' in host else host}:{port or '*'}"
     try:
         socket.set(zmq.IPV6, int(":" in host))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import Role
-from gfm_hil.ports.streams.follow import Rows
+from gfm_hil.ports.streams.follow import NewRows
 from gfm_hil.recording.columns import recorded_in
 from gfm_hil.recording.timing import SLACK, missed
 
@@ -49,7 +49,7 @@ class Sampler:
         self._misses = misses
         self._least = math.nan  # least slack since the last sample, µs
 
-    def messages(self, rows: Rows, seconds: float) -> list[list[bytes]]:
+    def messages(self, rows: NewRows, seconds: float) -> list[list[bytes]]:
         """The messages of some rows.
 
         Args:
@@ -80,7 +80,7 @@ class Sampler:
             self._least = float(np.fmin.reduce(slack[begin:], initial=self._least))
         return out
 
-    def _sample(self, rows: Rows, k: int, values: list[float]) -> dict[str, Any]:
+    def _sample(self, rows: NewRows, k: int, values: list[float]) -> dict[str, Any]:
         """One tick's numbers; JSON cannot hold NaN or infinity."""
         tick = rows.first + k
         sample: dict[str, Any] = {"timestamp": round(tick * self.T_s, 9), "tick": tick}

@@ -21,6 +21,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.ports.port import Refusal
 from gfm_hil.recording.columns import describe, signals_of
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
@@ -29,6 +30,8 @@ from gfm_runtime.firmware.c_text import identifier
 from gfm_runtime.lawfile import LawFile, build_law, tied
 from gfm_runtime.signals import SIGNALS, group
 
+#: error codes
+OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
 CELL = 8  # bytes
 _MEASURED, _REFERENCES, _LAW, _GAINS, _LAW_BYTES = 0x1000, 0x8000, 0x9000, 0x10000, 0x1000
 _A_REFERENCE, _THE_LAW = "a reference", "the law"  # no law has such a name
@@ -44,29 +47,18 @@ _SIGNALS = {
 }  # fmt: skip
 
 
-class Refused(Exception):
-    """The memory cannot be read or written so; ``code`` is one of XCP's error codes."""
-
-    def __init__(self, code: int, why: str) -> None:
-        super().__init__(why)
-        self.code = code
-
-
-OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
-
-
 class Controlled(Protocol):
     """What the memory needs of an operator (``gfm_hil.ports.commands.Operator``)."""
 
     def snapshot(self) -> dict[str, Any]:
         """The newest recorded tick."""
 
-    def tell(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
+    def command(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
         """Carry out an event at once; its tick."""
 
 
 @dataclass(frozen=True)
-class _Cell:
+class _Number:
     """One number: its description, its value in a snapshot, and the command that writes it.
 
     Attributes:
@@ -105,7 +97,7 @@ class Memory:
         self._operator, self._recorded = operator, recorded
         self._laws = list(laws)
         self._files = {name: law_file(name) for name in self._laws}
-        self._cells: dict[int, _Cell] = {}
+        self._cells: dict[int, _Number] = {}
         names = ["tick", *signals_of("plant", inner), *signals_of("controller", inner)]
         for k, name in enumerate(names):
             self._add(self._measured(name, _MEASURED + k * CELL))
@@ -114,13 +106,13 @@ class Memory:
                 s.name, f"reference: {s.description}", "FLOAT64_IEEE", _REFERENCES + k * CELL,
                 unit_of(s), s.low, s.high, calibrated=True,
             )  # fmt: skip
-            self._add(_Cell(entry, partial(_recorded, f"ref_{s.name}"), _A_REFERENCE, s.name))
+            self._add(_Number(entry, partial(_recorded, f"ref_{s.name}"), _A_REFERENCE, s.name))
         words = tuple(enumerate(self._laws))
         entry = Entry(
             "active_law", "the law in force", "FLOAT64_IEEE", _LAW, low=0.0, words=words,
             high=len(words) - 1.0, calibrated=True,
         )  # fmt: skip
-        self._add(_Cell(entry, lambda now: self._laws.index(now["active"]), _THE_LAW))
+        self._add(_Number(entry, lambda now: self._laws.index(now["active"]), _THE_LAW))
         for k, (law, file) in enumerate(self._files.items()):
             if len(file.parameters) * CELL > _LAW_BYTES:
                 raise UserError(f"law {law}: has more than {_LAW_BYTES // CELL} parameters")
@@ -131,12 +123,12 @@ class Memory:
                     _GAINS + k * _LAW_BYTES + j * CELL, spec.unit, calibrated=True,
                     fixed=file.schedule is not None,
                 )  # fmt: skip
-                self._add(_Cell(entry, partial(self._gain, law, name), law, name))
+                self._add(_Number(entry, partial(self._gain, law, name), law, name))
 
-    def _add(self, cell: _Cell) -> None:
+    def _add(self, cell: _Number) -> None:
         self._cells[cell.entry.address] = cell
 
-    def _measured(self, name: str, address: int) -> _Cell:
+    def _measured(self, name: str, address: int) -> _Number:
         row = describe(name, self._laws)
         signal = _SIGNALS.get(name)
         low, high = (signal.low, signal.high) if signal else (None, None)
@@ -147,8 +139,8 @@ class Memory:
             entry = replace(entry, text="number of the law with its gains, as recorded", words=())
         if name == "state":  # a snapshot has its word
             numbers = {word: number for number, word in row.words}
-            return _Cell(entry, lambda now: numbers[now[name]])
-        return _Cell(entry, partial(_recorded, name))
+            return _Number(entry, lambda now: numbers[now[name]])
+        return _Number(entry, partial(_recorded, name))
 
     def _gain(self, law: str, name: str, now: dict[str, Any]) -> float:
         file = self._files[law]
@@ -164,7 +156,7 @@ class Memory:
         """Bytes of the memory, all of the same tick.
 
         Raises:
-            Refused: there is no such memory, or the run has not begun.
+            Refusal: there is no such memory, or the run has not begun.
         """
         first = address - address % CELL
         cells = [self._at(at) for at in range(first, address + size, CELL)]
@@ -172,7 +164,7 @@ class Memory:
         try:
             whole = b"".join(struct.pack("<d", cell.value(now)) for cell in cells)
         except (KeyError, ValueError):
-            raise Refused(NOT_NOW, "the run has not recorded it yet") from None
+            raise Refusal(NOT_NOW, "the run has not recorded it yet") from None
         return whole[address - first : address - first + size]
 
     def write(self, address: int, data: bytes, by: Any) -> None:
@@ -181,28 +173,28 @@ class Memory:
         Args:
             address: of the first cell.
             data: of whole cells of one kind.
-            by: who writes, see ``Operator.tell``.
+            by: who writes, see ``Operator.command``.
 
         Raises:
-            Refused: no whole cells, what cannot be written, a wrong value, or the run refuses it.
+            Refusal: no whole cells, what cannot be written, a wrong value, or the run refuses it.
         """
         if not data or address % CELL or len(data) % CELL:
-            raise Refused(OUT_OF_RANGE, f"{address:#x}: numbers of {CELL} bytes are written whole")
+            raise Refusal(OUT_OF_RANGE, f"{address:#x}: numbers of {CELL} bytes are written whole")
         cells = [self._at(address + k) for k in range(0, len(data), CELL)]
         kind = cells[0].group
         if any(not cell.group or cell.entry.fixed for cell in cells):
-            raise Refused(WRITE_PROTECTED, f"{address:#x}: can only be read")
+            raise Refusal(WRITE_PROTECTED, f"{address:#x}: can only be read")
         if any(cell.group != kind for cell in cells):
-            raise Refused(OUT_OF_RANGE, f"{address:#x}: the numbers are of two commands")
+            raise Refusal(OUT_OF_RANGE, f"{address:#x}: the numbers are of two commands")
         numbers = struct.unpack(f"<{len(cells)}d", data)
         given = {cell.key: value for cell, value in zip(cells, numbers, strict=True)}
         event = self._event(kind, given)
         if event is None:
             return
         try:
-            tick = self._operator.tell(event, by)["tick"]
+            tick = self._operator.command(event, by)["tick"]
         except UserError as problem:
-            raise Refused(ACCESS_DENIED, str(problem)) from None
+            raise Refusal(ACCESS_DENIED, str(problem)) from None
         until = time.monotonic() + _RECORDED_S
         while self._recorded() <= tick and time.monotonic() < until:
             time.sleep(1e-3)  # tools read back what they have written
@@ -222,10 +214,10 @@ class Memory:
                     raise ValueError(f"law {number:g}: must be one of 0 to {len(self._laws) - 1}")
                 return {"type": "law", "law": self._laws[int(number)]}
         except ValueError as problem:
-            raise Refused(OUT_OF_RANGE, str(problem)) from None
+            raise Refusal(OUT_OF_RANGE, str(problem)) from None
         now = self._now()
         if now.get("active") != kind:
-            raise Refused(ACCESS_DENIED, f"{kind}: is not the law in force")
+            raise Refusal(ACCESS_DENIED, f"{kind}: is not the law in force")
         values = {n: v for n, v in given.items() if v != self._gain(kind, n, now)}
         self._check_gains(self._files[kind], {**now["gains"], **values})
         return {"type": "gains", "values": values} if values else None
@@ -234,16 +226,16 @@ class Memory:
         try:
             build_law(file, tied(file, changed))
         except LawError as problem:
-            raise Refused(OUT_OF_RANGE, str(problem)) from None
+            raise Refusal(OUT_OF_RANGE, str(problem)) from None
 
-    def _at(self, address: int) -> _Cell:
+    def _at(self, address: int) -> _Number:
         cell = self._cells.get(address)
         if cell is None:
-            raise Refused(OUT_OF_RANGE, f"{address:#x}: there is no such memory")
+            raise Refusal(OUT_OF_RANGE, f"{address:#x}: there is no such memory")
         return cell
 
     def _now(self) -> dict[str, Any]:
         try:
             return self._operator.snapshot()
         except UserError as problem:
-            raise Refused(NOT_NOW, str(problem)) from None
+            raise Refusal(NOT_NOW, str(problem)) from None

@@ -12,18 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 from gfm_hil.core.identity import Identity, address
-from gfm_hil.ports.xcp.memory import (
-    NOT_NOW,
-    OUT_OF_RANGE,
-    WRITE_PROTECTED,
-    Memory,
-    Refused,
-)
+from gfm_hil.ports.port import Refusal
+from gfm_hil.ports.xcp.memory import NOT_NOW, OUT_OF_RANGE, WRITE_PROTECTED, Memory
 
 MOST = 255  # bytes of a command and of a response, at most: MAX_CTO
 _HEADER = struct.Struct("<HH")  # LEN and CTR of XCP on Ethernet
 _LARGEST, _SHORT = 65507, 32  # bytes: what UDP carries, and a few short answers
-_MOST_TOLD = 1000  # lines about refusals
+_MOST_PRINTED = 1000  # lines about refusals
 _IDLE_S = 30.0  # after so long without a command another master may connect
 
 CONNECT, DISCONNECT, GET_STATUS, SYNCH, GET_COMM_MODE_INFO, GET_ID = range(0xFF, 0xF9, -1)
@@ -50,7 +45,7 @@ class Slave:
         name: of the A2L file, and what the slave calls itself.
         a2l: the A2L file.
         writes: whether the master may write.
-        notice: gets a line for each refusal, of the first ``_MOST_TOLD``.
+        notice: gets a line for each refusal, of the first ``_MOST_PRINTED``.
         clock: monotonic time, s.
         most: bytes of a command and of a response on its line.
     """
@@ -69,7 +64,7 @@ class Slave:
         self._writes, self._notice, self._clock, self._most = writes, notice, clock, most
         self._master: Any = None
         self._heard = 0.0
-        self._counter = self._told = 0
+        self._counter = self._printed = 0
         self._at = (0, 0)  # MTA: extension and address
 
     def take(self, datagram: bytes, peer: Any) -> bytes:
@@ -109,24 +104,24 @@ class Slave:
         self._master, self._heard = peer, now
         try:
             if not packet or len(packet) < _LEAST.get(packet[0], 1):
-                raise Refused(CMD_SYNTAX, "a packet is not as its length or its command wants it")
+                raise Refusal(CMD_SYNTAX, "a packet is not as its length or its command wants it")
             return bytes([_RES]) + self._carried_out(packet, peer)
-        except Refused as problem:
+        except Refusal as problem:
             if problem.code != CMD_SYNCH:
-                self._tell(f"refused: {problem}")
+                self._print_refusal(f"refused: {problem}")
             return bytes([_ERR, problem.code])
 
-    def _tell(self, text: str) -> None:
-        self._told += 1
-        if self._told <= _MOST_TOLD:
-            last = "; further refusals are not told" if self._told == _MOST_TOLD else ""
+    def _print_refusal(self, text: str) -> None:
+        self._printed += 1
+        if self._printed <= _MOST_PRINTED:
+            last = "; further refusals are not told" if self._printed == _MOST_PRINTED else ""
             self._notice(text + last)
 
     def _carried_out(self, packet: bytes, peer: Any) -> bytes:
         """What follows the code of a positive response.
 
         Raises:
-            Refused: the response is an error.
+            Refusal: the response is an error.
         """
         command, count = packet[0], packet[1] if len(packet) > 1 else 0
         if command == CONNECT:
@@ -140,7 +135,7 @@ class Slave:
         if command == GET_STATUS:  # no session flags, nothing protected
             return bytes(5)
         if command == SYNCH:
-            raise Refused(CMD_SYNCH, "")
+            raise Refusal(CMD_SYNCH, "")
         if command == GET_COMM_MODE_INFO:
             return bytes([0, 0, 0, 0, 0, 0, _DRIVER])
         if command == GET_ID:
@@ -153,10 +148,10 @@ class Slave:
         if command in (DOWNLOAD, SHORT_DOWNLOAD):
             data = packet[2 if command == DOWNLOAD else 8 :]
             if len(data) < count:
-                raise Refused(CMD_SYNTAX, "a command is too short")
+                raise Refusal(CMD_SYNTAX, "a command is too short")
             self._write(data[:count], peer)
         elif command != SET_MTA:
-            raise Refused(CMD_UNKNOWN, f"command {command:#x} is not there")
+            raise Refusal(CMD_UNKNOWN, f"command {command:#x} is not there")
         return b""
 
     def _identification(self, kind: int) -> bytes:
@@ -169,21 +164,21 @@ class Slave:
     def _read(self, count: int) -> bytes:
         extension, at = self._at
         if not 1 <= count < self._most:
-            raise Refused(OUT_OF_RANGE, f"{count} bytes must be 1 to {self._most - 1}")
+            raise Refusal(OUT_OF_RANGE, f"{count} bytes must be 1 to {self._most - 1}")
         if extension == _A2L:
             found = self._a2l[at : at + count]
         elif extension == 0:
             found = self._memory.read(at, count)
         else:
-            raise Refused(OUT_OF_RANGE, f"address extension {extension} is not there")
+            raise Refusal(OUT_OF_RANGE, f"address extension {extension} is not there")
         if len(found) < count:
-            raise Refused(OUT_OF_RANGE, f"{at:#x}: there is no such memory")
+            raise Refusal(OUT_OF_RANGE, f"{at:#x}: there is no such memory")
         self._at = (extension, at + count)
         return found
 
     def _write(self, data: bytes, peer: Any) -> None:
         extension, at = self._at
         if extension or not self._writes:
-            raise Refused(WRITE_PROTECTED, "is served to be read; --write lets tools write")
+            raise Refusal(WRITE_PROTECTED, "is served to be read; --write lets tools write")
         self._memory.write(at, data, Identity(through="xcp", peer=address(peer)))
         self._at = (extension, at + len(data))

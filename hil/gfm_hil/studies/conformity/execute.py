@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExternalController:
+class ControllerUnderTest:
     """A model as the controller, in place of a law.
 
     Attributes:
@@ -95,7 +95,7 @@ class Job:
     converters: Path
     folder: Path | None
     figures: bool
-    external: ExternalController | None = None
+    external: ControllerUnderTest | None = None
 
     @property
     def name(self) -> str:
@@ -148,7 +148,7 @@ class PartResult:
         return next(iter(self.wrong), None)
 
 
-def external_controller(model: str | None, ports: str | Path | None) -> ExternalController | None:
+def external_controller(model: str | None, ports: str | Path | None) -> ControllerUnderTest | None:
     """The model that a user names, checked as far as that goes without loading it.
 
     Raises:
@@ -162,11 +162,11 @@ def external_controller(model: str | None, ports: str | Path | None) -> External
         if ports is not None:
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
         precision(model)
-        return ExternalController(model)
+        return ControllerUnderTest(model)
     kind, path = controller_file(model, FORMS)
     file = None if ports is None else Path(ports).absolute()
     read_map(file)
-    return ExternalController(f"{kind}:{path}", file)
+    return ControllerUnderTest(f"{kind}:{path}", file)
 
 
 def slug(name: str) -> str:
@@ -182,7 +182,7 @@ def make_jobs(
     converters: Path,
     folder: Path | None,
     figures: bool,
-    external: ExternalController | None = None,
+    external: ControllerUnderTest | None = None,
 ) -> list[Job]:
     """A job for each part of each test under each law, and then under the model.
 
@@ -194,7 +194,7 @@ def make_jobs(
     Raises:
         UserError: the model measures currents, and its runs have no inner stage.
     """
-    each: list[tuple[str, str, ExternalController | None]] = [(*law, None) for law in laws.items()]
+    each: list[tuple[str, str, ControllerUnderTest | None]] = [(*law, None) for law in laws.items()]
     if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
         stage = law_file(start).inner if inner is None else named_inner(inner)
@@ -354,7 +354,7 @@ def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
     return place
 
 
-def _again(place: Path, external: ExternalController | None) -> str:
+def _again(place: Path, external: ControllerUnderTest | None) -> str:
     """The command that repeats the run of the scenario in a folder."""
     words = ["gfmhil", "run", str(place / "scenario.toml")]
     if external is not None:

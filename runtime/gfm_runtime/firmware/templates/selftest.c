@@ -143,8 +143,12 @@ unsigned golden_row(const golden_word row[])
 
 int golden_refusals(const golden_word row[], unsigned long elapsed[2])
 {
+/* @if fixed@ */
+    const golden_word too_large = ~(golden_word)0 >> 1;
+/* @else@ */
     const golden_word too_large = ~(golden_word)0 >> 2; /* whatever the type */
-    const int law = (int)row[1], k = 2;                 /* no row runs this instance */
+/* @end@ */
+    const int law = (int)row[1], k = 2; /* no row runs this instance */
     golden_real ref[5], y[GOLDEN_NY], u[GOLDEN_NU];
     int i, result = 0;
     memcpy(ref, &row[3], sizeof ref);

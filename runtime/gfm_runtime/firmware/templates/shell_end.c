@@ -47,6 +47,9 @@ void @P@_reset(@P@_t *s)
     }
     s->limited = 0;
 /* @end@ */
+/* @if fixed@ */
+    @RESET@;
+/* @end@ */
     s->reason = @GUARD@_OK;
     s->channel = -1;
 }
@@ -54,13 +57,23 @@ void @P@_reset(@P@_t *s)
 @IN_PLACE@int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 {
     tick_t t;
+/* @if fixed@ */
+    const real *out = t.u;
+/* @else@ */
     real out[@GUARD@_NU];
+/* @end@ */
     int i, reason = refused(s, ref, y, &s->channel);
     if (reason != @GUARD@_OK) {
         s->reason = reason;
         return reason;
     }
+/* @if fixed@ */
+    t.ref = ref;
+    t.y = y;
+/* @end@ */
     @OUTPUT@;
+/* @if fixed@ */
+/* @else@ */
 /* @if stages@ */
     if (!((out[0] - out[0]) + (out[1] - out[1]) + (out[2] - out[2]) + (out[3] - out[3]) == @0@)) {
 /* @else@ */
@@ -78,6 +91,7 @@ void @P@_reset(@P@_t *s)
         s->reason = @GUARD@_BAD_U;
         return s->reason;
     }
+/* @end@ */
     @ADVANCE@;
     for (i = 0; i < @GUARD@_NU; i++) {
         u[i] = out[i];
@@ -90,6 +104,10 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
     tick_t t;
     int channel, reason = refused(s, ref, y, &channel);
     if (reason == @GUARD@_OK) {
+/* @if fixed@ */
+        t.ref = ref;
+        t.y = y;
+/* @end@ */
         @LOOK@;
     }
     return reason;
@@ -98,6 +116,9 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
 int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[]@E@)
 {
     tick_t t;
+/* @if fixed@ */
+    int channel, reason = refused(s, ref, y, &channel);
+/* @else@ */
     real rest = @0@;
     int i, channel, reason = refused(s, ref, y, &channel);
     for (i = 0; i < @N_ROWS@; i++) {
@@ -109,7 +130,12 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
     if (reason == @GUARD@_OK && !(rest == @0@)) {
         reason = @GUARD@_BAD_U;
     }
+/* @end@ */
     if (reason == @GUARD@_OK) {
+/* @if fixed@ */
+        t.ref = ref;
+        t.y = y;
+/* @end@ */
         @SETTLE@;
     }
     return reason;
@@ -118,16 +144,24 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
 int @P@_switch(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const real trend[]@E@,
     real *bump)
 {
+/* @if fixed@ */
+    real old[@N_ROWS@];
+/* @else@ */
     real old[@N_ROWS@], change;
+/* @end@ */
     int i, reason;
     for (i = 0; i < @N_ROWS@; i++) {
         old[i] = u[i];
     }
     reason = @P@_settle(@law@s, ref, y, u, trend@e@);
+/* @if fixed@ */
+    *bump = @BUMP@;
+/* @else@ */
     *bump = @0@;
     for (i = 0; i < @N_ROWS@; i++) {
         change = u[i] < old[i] ? old[i] - u[i] : u[i] - old[i];
         *bump = change > *bump ? change : *bump;
     }
+/* @end@ */
     return reason;
 }

@@ -67,7 +67,7 @@ export class Link {
         return;
       }
       this.waiting.set(id, done);
-      this.say({ kind: "tell", id, event });
+      this.say({ kind: "command", id, event });
     });
   }
 }

@@ -1,0 +1,107 @@
+"""What a contender is: plain data that goes to the two processes, each of which opens its end."""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.pingpong import Messages, PingPong, frames, over_link, plain
+from gfm_hil.core.roles import Role
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.frame import wire_dtype
+from gfm_runtime.signals import NY
+
+FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One way to send a message there and back.
+
+    Attributes:
+        name: in tables, unique.
+        link: name of the link, or of the transport of C or of another package.
+        endpoint: where both sides meet.
+        end: opens one end that sends these messages; a function of a module. The controller opens
+            its end first.
+        peer: ``ours``, ``C`` or the name of another package.
+        options: of the link.
+        limit: name of the contender in C that it is compared with; its own name for one in C.
+        source: C source of a limit.
+        library: ``source``, compiled.
+    """
+
+    name: str
+    link: str
+    endpoint: str
+    end: Callable[[Contender, Role, Messages], PingPong]
+    peer: str = "ours"
+    options: dict[str, Any] = field(default_factory=dict)
+    limit: str = ""
+    source: Path | None = None
+    library: Path | None = None
+
+    def open(self, role: Role, payload: int) -> PingPong:
+        """Open one end, for requests of ``payload`` bytes.
+
+        Raises:
+            UserError: it cannot be opened here.
+        """
+        return self.end(self, role, messages(role, payload))
+
+
+def messages(role: Role, payload: int) -> Messages:
+    """The messages of a side: the bench's frames if the payload has their size."""
+    if payload == FRAME:
+        return frames("y" if role == "plant" else "u")
+    return plain(payload)
+
+
+def of_link(name: str, link: str, endpoint: str, limit: str, **options: Any) -> Contender:
+    """A link of the bench with these options."""
+    return Contender(name, link, endpoint, _open_link, options=options, limit=limit)
+
+
+def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(open_link(c.link, role, c.endpoint, c.options), own)
+
+
+def limit(
+    name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong]
+) -> Contender:
+    """A limit in C.
+
+    Args:
+        name: in tables.
+        file: path of the Python file beside which the C source of the same name is.
+        endpoint: where both sides meet.
+        end: opens one end, by ``pingpong.in_c``.
+    """
+    source = Path(file).with_suffix(".c")
+    return Contender(name, source.stem, endpoint, end, "C", limit=name, source=source)
+
+
+def fresh(link: str, place: Path) -> str:
+    """A new endpoint of a link."""
+    folder = place / link
+    folder.mkdir()
+    return link_kind(link).fresh(folder)
+
+
+def free_port() -> int:
+    """A port of the loopback interface that is free for TCP, and most likely for UDP."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def memory_folder(stack: ExitStack) -> Path:
+    """A folder with a short path that goes with the stack; in memory if /dev/shm exists."""
+    memory = Path("/dev/shm")
+    place = str(memory) if memory.is_dir() else None
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-", dir=place)))

@@ -1,0 +1,80 @@
+"""iceoryx2, a package from PyPI for shared memory, beside the link ``shm`` if it is installed."""
+
+from __future__ import annotations
+
+import ctypes
+import secrets
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.contenders import shm
+from gfm_hil.bench.contenders.base import Contender
+from gfm_hil.bench.pingpong import LONGEST, Messages, PingPong, over_link
+from gfm_hil.core.roles import Role
+from gfm_hil.links.port import Port
+
+_ROOM = 64  # messages, as in the links
+
+
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    """Its Python binding, which does not install flatbuffers by itself."""
+    if "shm" in links and find_spec("iceoryx2") and find_spec("flatbuffers"):
+        name = f"gfmhil-{secrets.token_hex(8)}"
+        yield Contender("iceoryx2", "iceoryx2", name, _open, "iceoryx2", limit=shm.LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(Iceoryx2(role, c.endpoint), own)
+
+
+class Iceoryx2:
+    """One end over its publish-subscribe, driven from Python.
+
+    Args:
+        role: of the bench.
+        name: of the two services, unique on this machine.
+    """
+
+    port: Port | None = None
+
+    def __init__(self, role: Role, name: str) -> None:
+        import iceoryx2 as iox2
+
+        iox2.set_log_level(iox2.LogLevel.Fatal)
+        node = iox2.NodeBuilder.new().create(iox2.ServiceType.Ipc)
+
+        def service(way: str) -> Any:
+            return (
+                node.service_builder(iox2.ServiceName.new(f"{name}/{way}"))
+                .publish_subscribe(iox2.Slice[ctypes.c_uint8])
+                .subscriber_max_buffer_size(_ROOM)
+                .open_or_create()
+            )
+
+        ways = ("u", "y") if role == "controller" else ("y", "u")
+        out, into = (service(way) for way in ways)
+        self._publisher = out.publisher_builder().initial_max_slice_len(LONGEST).create()
+        self._subscriber = into.subscriber_builder().create()
+        self._keep: list[Any] = [node, out, into]
+
+    def send(self, message: bytes) -> bool:
+        """Publish a message."""
+        sample = self._publisher.loan_slice_uninit(len(message))
+        ctypes.memmove(sample.payload().as_ptr(), message, len(message))
+        return bool(sample.assume_init().send())
+
+    def receive(self) -> bytes | None:
+        """The next message, or None."""
+        sample = self._subscriber.receive()
+        if sample is None:
+            return None
+        payload = sample.payload()
+        return ctypes.string_at(payload.as_ptr(), payload.len())
+
+    def close(self) -> None:
+        """Free the shared memory."""
+        self._publisher.delete()
+        self._subscriber.delete()
+        self._keep.clear()

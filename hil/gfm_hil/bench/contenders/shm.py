@@ -1,0 +1,33 @@
+"""The link ``shm``, and its limit in C: shared memory, a file that both sides map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from gfm_hil.bench.contenders.base import Contender, fresh, limit, of_link
+from gfm_hil.bench.pingpong import Messages, PingPong, in_c
+from gfm_hil.core.roles import Role
+
+_SLOTS = 2 * 1024  # bytes, two slot_t
+LIMIT = "C shm"
+
+
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    """The link and its limit."""
+    if "shm" in links:
+        yield limit(LIMIT, __file__, str(place / "slots"), _open)
+        yield of_link("shm", "shm", fresh("shm", place), LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    if role == "controller":
+        Path(c.endpoint).write_bytes(bytes(_SLOTS))
+    slots = np.memmap(c.endpoint, np.uint8, "r+")
+    keep = ExitStack()
+    keep.callback(slots.flush)  # keeps the mapping alive with the end
+    opened = [slots.ctypes.data, int(role == "controller")]
+    return in_c(c.library, opened, own.shape[1], keep)

@@ -1,0 +1,35 @@
+"""Every link that has no file of its own, and their limit: UDP in C on the loopback interface."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from gfm_hil.bench.contenders.base import Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.contenders.registry import FILES
+from gfm_hil.bench.pingpong import Messages, PingPong, in_c
+from gfm_hil.core.roles import Role
+
+LIMIT = "C udp"
+
+
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    """The links and their limit."""
+    others = [link for link in links if link not in FILES or link == "udp"]
+    if others:
+        yield limit(LIMIT, __file__, f"{free_port()},{free_port()}", _open)
+    for link in others:
+        yield of_link(link, link, fresh(link, place), LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    """The endpoint has the ports of the controller and of the plant."""
+    keep = ExitStack()
+    end = keep.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    ports = [int(port) for port in c.endpoint.split(",")]
+    mine, peer = ports if role == "controller" else ports[::-1]
+    end.bind(("127.0.0.1", mine))
+    end.connect(("127.0.0.1", peer))
+    return in_c(c.library, [end.fileno()], own.shape[1], keep)

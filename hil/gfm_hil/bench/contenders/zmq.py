@@ -1,0 +1,56 @@
+"""The link ``zmq`` over ipc and tcp and without its port, and its limits: C on the same libzmq."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.contenders.base import Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.pingpong import Messages, PingPong, in_c
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+
+
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    """The link's transports, each after its limit."""
+    if "zmq" not in links:
+        return
+    ipc, tcp = fresh("zmq", place), "tcp://127.0.0.1"
+    yield limit("C zmq ipc", __file__, f"{ipc}-c", _open)
+    yield of_link("zmq ipc", "zmq", ipc, "C zmq ipc")
+    yield of_link("zmq ipc, portable", "zmq", f"{ipc}-portable", "C zmq ipc", portable=True)
+    yield limit("C zmq tcp", __file__, f"{tcp}:{free_port()}", _open)
+    yield of_link("zmq tcp", "zmq", f"{tcp}:{free_port()}", "C zmq tcp")
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    """A socket with the link's options, of the library that pyzmq has loaded.
+
+    Raises:
+        UserError: its functions cannot be found.
+    """
+    import zmq
+    from zmq.backend.cython import _zmq
+
+    from gfm_hil.links.zeromq.link import pair_socket
+
+    libzmq = ctypes.CDLL(_zmq.__file__)  # resolves the library that it is linked to
+    try:
+        call = [_address(libzmq[name]) for name in ("zmq_send", "zmq_recv")]
+    except AttributeError:
+        raise UserError("pyzmq hides its libzmq: nothing for C to call") from None
+    keep = ExitStack()
+    end = keep.enter_context(pair_socket(keep.enter_context(zmq.Context())))
+    end.set(zmq.LINGER, 0)
+    if role == "controller":
+        end.bind(c.endpoint)
+    else:
+        end.connect(c.endpoint)
+    return in_c(c.library, [end.underlying, *call], own.shape[1], keep)
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0

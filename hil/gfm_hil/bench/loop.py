@@ -1,0 +1,260 @@
+"""The closed loop over every link, with the product itself: two processes, a complete run.
+
+Lockstep: ticks per second, compared with the limit of the plant's arithmetic alone. Real time:
+ticks without a fresh u, their causes, and how many ticks a loop that only paces lost on the same
+machine right before and after.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.bench.attribution import OURS, attribute, bursts, counts, missed_ticks
+from gfm_hil.bench.contenders import memory_folder
+from gfm_hil.bench.cpu_load import cpu_load
+from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.inproc_loop import InprocLoop, measure_laws
+from gfm_hil.bench.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.bench.options import BenchOptions
+from gfm_hil.bench.pair import pair
+from gfm_hil.bench.rounds import RUNS, ShowProgress, in_turn, quickest, spread
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import ROLES
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.run.runner import run_scenario
+from gfm_hil.scenario import INPROC, Scenario, check_scenario
+
+LAW = "mimo-gfm"
+T_S = 1e-4  # s
+_T_NS = round(T_S * 1e9)
+_SETTLE = 1_000  # ticks left out after the start of the CPU load
+_PATIENCE_S = 5.0  # peer timeout: a busy machine must not end a run
+_SHORT = 2_000  # ticks of one of the short runs in process
+
+Times = NDArray[np.int64]
+Beside = Callable[[], AbstractContextManager[None]]
+
+
+@dataclass
+class _Run:
+    """A run, and in real time the bare loop before and after it.
+
+    Attributes:
+        timing: columns of timing.npz, without the ticks before the CPU load has settled.
+        scheduling: of the two sides.
+        early: why it ended early; empty if it did not.
+        late: of the bare loop, (2, ticks), ns.
+    """
+
+    timing: dict[str, Times]
+    scheduling: list[str]
+    early: str
+    late: Times | None = None
+
+
+def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
+    """Add rows to ``lockstep``, ``laws`` and ``realtime`` of ``loop``, those of the modes."""
+    loop: dict[str, Any] = content.setdefault("loop", {})
+    remarks: list[str] = []
+    show("trying the links", 0.0)
+    links = [link for link in options.links if _works(link, remarks)]
+    if "lockstep" in options.modes:
+        with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
+            loop["laws"] = list(measure_laws(options.laws, options.rounds, Path(place), show))
+        loop["lockstep"] = _lockstep(links, options, show, remarks)
+    if "realtime" in options.modes:
+        loop["realtime"] = _realtime(links, options, show, remarks)
+    content["remarks"] += [one for one in remarks if one not in content["remarks"]]
+
+
+def _works(link: str, remarks: list[str]) -> bool:
+    """Whether a link works here at ``T_S``; a remark if it does not."""
+    try:
+        scenario = _scenario(link, "lockstep", T_S)
+        with ExitStack() as stack:
+            endpoint = link_kind(link).fresh(memory_folder(stack))
+            open_link(link, "controller", endpoint, scenario.link.options).close()
+    except UserError as problem:
+        remarks.append(f"{link}, closed loop: not measured: {problem}")
+        return False
+    return True
+
+
+def _lockstep(
+    links: Sequence[str], options: BenchOptions, show: ShowProgress, remarks: list[str]
+) -> list[dict[str, Any]]:
+    """Ticks per second over every link and in process; simulated, so as fast as possible.
+
+    Over a link it measures with and without one sample of loop delay: with it, as in a real loop,
+    the plant continues while u[k] is on its way. The share of the limit of the plant's half alone
+    compares the fastest stretches of both. The half is timed right before and after, in at least
+    as many stretches, so that neither a stop of the machine nor a change of its speed counts.
+    """
+    loops = [(INPROC, 0), *product(links, (0, 1))]
+    rates: dict[tuple[str, int], list[float]] = {loop: [] for loop in loops}
+    shares: dict[tuple[str, int], list[float]] = {loop: [] for loop in loops}
+    ticks = round(options.seconds / T_S)
+    with ExitStack() as stack:
+        place = memory_folder(stack)
+        alone = InprocLoop("pref_step", LAW, _SHORT, place / "inproc")
+        half = partial(quickest, alone.plants_half, max(RUNS, ticks // _SHORT))
+        for _, share, (link, delay) in in_turn(loops, options.rounds, options.until):
+            before_ns = half()
+            show(f"lockstep, {link}", share)
+            if link == INPROC:
+                stretches = [alone.whole() for _ in range(RUNS)]
+                tick_ns = fmean(stretches)
+            else:
+                run = _run(_scenario(link, "lockstep", options.seconds, delay), place)
+                if run.early:
+                    remarks.append(f"{link}, lockstep: a run ended early: {run.early}")
+                    continue
+                tick_ns, stretches = _pace(run.timing["plant_sent"])
+            rates[link, delay].append(1e9 / tick_ns)
+            shares[link, delay].append(min(before_ns, half()) / min(stretches))
+    return [
+        {
+            "link": link,
+            "delay_samples": delay,
+            "mode": "lockstep",
+            "ticks_per_s": spread(rate),
+            "times_real_time": spread([each * T_S for each in rate]),
+            "share_of_plant_alone": spread(shares[link, delay]),
+        }
+        for (link, delay), rate in rates.items()
+        if rate
+    ]
+
+
+def _pace(sent: Times) -> tuple[float, list[float]]:
+    """ns per tick, of the whole run and of each stretch of ``_SHORT`` ticks."""
+    marks = sent[:: min(_SHORT, len(sent) - 1)]
+    whole = float(sent[-1] - sent[0]) / (len(sent) - 1)
+    return whole, (np.diff(marks) / min(_SHORT, len(sent) - 1)).tolist()
+
+
+def _realtime(
+    links: Sequence[str], options: BenchOptions, show: ShowProgress, remarks: list[str]
+) -> list[dict[str, Any]]:
+    """Misses at 10 kHz in real time over every link under every load."""
+    cells = list(product(links, options.loads))
+    runs: dict[tuple[str, str], list[_Run]] = {cell: [] for cell in cells}
+    with ExitStack() as stack:
+        place = memory_folder(stack)
+        load_is = stack.enter_context(cpu_load())
+        two = stack.enter_context(pair(options.policies[0], place))
+        two.both(pace_here, 0, 1, HYBRID, 1)
+        for _, share, (link, load) in in_turn(cells, options.rounds, options.until):
+            show(f"real time, {link}, {load}", share)
+            # one half before and one after, so that a slow change of the host's load affects both
+            half = options.seconds / 2
+            with load_is(load):
+                before = pace_both(two, _T_NS, HYBRID, half)
+            beside = partial(load_is, load) if load != "idle" else nullcontext
+            run = _run(_scenario(link, "realtime", options.seconds), place, beside)
+            with load_is(load):
+                run.late = np.concatenate([before, pace_both(two, _T_NS, HYBRID, half)], axis=1)
+            if run.early:
+                remarks.append(f"{link}, real time, {load}: a run ended early: {run.early}")
+            if "plant_received" in run.timing:
+                runs[link, load].append(run)
+    return [_row(*cell, some) for cell, some in runs.items() if some]
+
+
+def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
+    trips: list[Times] = []
+    missed: list[Times] = []
+    ticks = host = host_ticks = 0
+    beyond: list[float] = []
+    causes = Counter[str]()
+    for run in runs:
+        assert run.late is not None
+        timing = run.timing
+        there = timing["plant_received"] >= 0
+        trip = (timing["plant_received"] - timing["plant_sent"])[there]
+        trips.append(trip)
+        missed.append(missed_ticks(timing))
+        ticks += len(there)
+        causes.update(counts(attribute(timing, _T_NS)))
+        allowed = _T_NS - (float(np.median(trip)) if len(trip) else 0.0)
+        alone = len(lost(run.late, allowed))
+        host += alone
+        host_ticks += run.late.shape[1]
+        if len(there):
+            beyond.append(100 * (len(missed[-1]) / len(there) - alone / run.late.shape[1]))
+    count, ours = sum(map(len, missed)), sum(causes[cause] for cause in OURS)
+    return {
+        "link": link,
+        "mode": "realtime",
+        "load": load,
+        "policy": runs[0].scheduling,
+        "T_s_us": T_S * 1e6,
+        "ticks": ticks,
+        "missed": count,
+        "missed_pct": round(100 * count / ticks, 4) if ticks else None,
+        "host_pct": round(100 * host / host_ticks, 4),
+        # the median: one long stop of the machine in a run, or in the pacing, is an outlier
+        "beyond_host_pct": round(median(beyond), 4) if beyond else None,
+        "rounds_beyond_host_pct": [round(value, 4) for value in beyond],
+        "by_work_or_link_pct": round(100 * ours / ticks, 4) if ticks else None,
+        "causes": dict(causes),
+        "bursts": bursts(missed),
+        **summary(trips),
+    }
+
+
+def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario:
+    content = {
+        "title": f"bench, {link}",
+        "duration": duration,
+        "T_s": T_S,
+        "mode": mode,
+        "law": LAW,
+        "plant": {"delay": {"samples": delay}},
+        "link": {"type": link, "peer_timeout_s": _PATIENCE_S},
+        "late_policy": {"hold": 10**9},  # count misses, never end the run
+    }
+    return check_scenario(content, "bench")
+
+
+def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
+    """Run a scenario; the context ``beside`` begins with its first ticks, not while it starts."""
+    folder, begin = place / f"run-{time.monotonic_ns()}", 0
+    with ExitStack() as during:
+
+        def progress(ticks: int, misses: int) -> None:
+            nonlocal begin
+            if ticks and not begin and beside is not nullcontext:
+                during.enter_context(beside())
+                begin = ticks + _SETTLE
+
+        run = run_scenario(scenario, folder, progress)
+    if run.status == "interrupted":  # the run has caught Ctrl-C
+        raise KeyboardInterrupt
+    timing = {name: np.array(column[begin:]) for name, column in run.timing.items()}
+    policies = [f"{e['role']}: {e['policy']}" for e in run.events if e["event"] == "scheduling"]
+    early = ""
+    if run.status != "completed":
+        lines = dict.fromkeys(filter(None, (_last_line(folder / f"{role}.log") for role in ROLES)))
+        early = f"{run.status} {' / '.join(lines) or run.summary['reason']}".strip()
+    shutil.rmtree(folder)
+    return _Run(timing, policies, early)
+
+
+def _last_line(log: Path) -> str:
+    """The last line of a failed side's log."""
+    return log.read_text("utf-8").strip().splitlines()[-1] if log.exists() else ""

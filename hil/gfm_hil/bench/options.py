@@ -1,0 +1,138 @@
+"""From the options of ``gfmhil bench`` to its measurements; checks every option first."""
+
+from __future__ import annotations
+
+import math
+import time
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from typing import Any, Literal
+
+from gfm_hil.bench.c_code import FLAGS
+from gfm_hil.bench.contenders import FRAME
+from gfm_hil.bench.cpu_load import LOADS, Load
+from gfm_hil.bench.pair import Policy
+from gfm_hil.bench.rounds import ShowProgress
+from gfm_hil.core.errors import UserError
+from gfm_hil.links import link_kind
+from gfm_hil.realtime.environment import may_sched_fifo
+from gfm_runtime import get_law
+
+Mode = Literal["lockstep", "realtime"]
+MODES: tuple[Mode, ...] = ("lockstep", "realtime")
+#: each is a module with ``measure(options, content, show)``, which adds to the result's content
+KINDS = ("latency", "jitter", "kernel", "loop")
+
+_SECONDS = {"loop": (0.1, 3600)}  # of a round, where others than the usual ones are allowed
+_FEW_LAWS = "mimo-gfm,vsg-2,droop-2"  # of the loop in `all`
+Measurement = Callable[[dict[str, Any], ShowProgress], None]
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What to measure; a benchmark uses those that concern it.
+
+    Attributes:
+        links, laws: names; no laws: the benchmark's own choice.
+        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
+        loads: idle, or busy: with a CPU load on each processor.
+        policies: scheduling of the two processes, the best one first.
+        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
+        cflags: for the C compiler.
+        seconds: of one round.
+        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
+    """
+
+    links: Sequence[str]
+    modes: Sequence[Mode]
+    loads: Sequence[Load]
+    policies: Sequence[Policy]
+    payload: int
+    laws: Sequence[str]
+    cflags: str
+    seconds: float
+    rounds: int
+    until: float
+
+
+def measurements(options: Namespace) -> list[Measurement]:
+    """The measurements that the command's options ask for, in order.
+
+    Raises:
+        UserError: an option is invalid.
+    """
+
+    def part(kind: str, **changes: Any) -> Measurement:
+        checked = _checked(
+            kind, {k: v for k, v in vars(options).items() if v is not None} | changes
+        )
+        return partial(import_module(f"gfm_hil.bench.{kind}").measure, checked)
+
+    if options.kind in KINDS:
+        return [part(options.kind)]
+    # three minutes: each part ends in time, with fewer rounds if necessary
+    now = time.monotonic()
+    return [
+        part("latency", seconds=0.1, rounds=5, until=now + 45),
+        part("jitter", seconds=0.1, rounds=5, until=now + 62),
+        part("kernel", rounds=2),
+        part("loop", mode="lockstep", seconds=3.0, rounds=5, until=now + 115, laws=_FEW_LAWS),
+        part("loop", mode="realtime", seconds=1.5, rounds=2, until=now + 150),
+    ]
+
+
+def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
+    of = options.get
+    return BenchOptions(
+        links=_links(of("links")),
+        modes=_split("--mode", of("mode"), MODES) or MODES,
+        loads=_split("--load", of("load"), LOADS) or LOADS,
+        policies=_policies(of("policy", "auto")),
+        payload=_within("--payload", of("payload", FRAME), 1, 504),
+        laws=[get_law(name).name for name in _split("--laws", of("laws"))],
+        cflags=of("cflags", FLAGS),
+        seconds=_within("--seconds", of("seconds", 0.1), *_SECONDS.get(kind, (0.01, 60))),
+        rounds=_within("--rounds", of("rounds"), 1, 1000),
+        until=of("until", math.inf),
+    )
+
+
+def _split(option: str, text: str | None, allowed: Sequence[Any] | None = None) -> list[Any]:
+    """Names from a comma-separated list, each once; none for None."""
+    if text is None:
+        return []
+    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
+    for name in names:
+        if not name or (allowed is not None and name not in allowed):
+            wanted = f"from {', '.join(allowed)}" if allowed is not None else "none empty"
+            raise UserError(f"{option} {text!r}: names separated by commas, {wanted}")
+    return names
+
+
+def _links(text: str | None) -> list[str]:
+    names = _split("--links", text)
+    for name in names:
+        try:
+            link_kind(name)
+        except ValueError as problem:
+            raise UserError(f"--links: {problem}") from None
+    return names
+
+
+def _within(option: str, value: Any, low: Any, high: Any) -> Any:
+    if not low <= value <= high:
+        raise UserError(f"{option} {value}: must be {low} to {high}")
+    return value
+
+
+def _policies(wanted: str) -> list[Policy]:
+    """The selected policies; the best one that is permitted comes first."""
+    allowed = may_sched_fifo()
+    if wanted == "fifo" and not allowed:
+        raise UserError("--policy fifo: no right to SCHED_FIFO here; use other or auto")
+    if wanted == "auto":
+        return ["fifo", "other"] if allowed else ["other"]
+    return ["fifo"] if wanted == "fifo" else ["other"]

@@ -1,0 +1,267 @@
+"""The life of every port beside a run: options, address, encryption, begin and end."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import socket
+import ssl
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.core.supervised import PAUSE_S, report
+from gfm_hil.engine.announcement import not_running, present
+from gfm_hil.links.zeromq.options import beyond_loopback
+from gfm_hil.ports import PORTS
+from gfm_hil.ports.commands import Operator
+from gfm_hil.recording.live import begun
+
+INTERRUPTED = 130
+_LOOK_S = 0.1
+_NICENESS = 5  # the loop comes first, also where it has no real-time rights
+_T = TypeVar("_T")
+
+
+class Refusal(Exception):
+    """A request that a port refuses and that changes nothing; ``code`` is its protocol's."""
+
+    def __init__(self, code: int, why: str) -> None:
+        super().__init__(why)
+        self.code = code
+
+
+class BesideRun:
+    """The run beside which a port serves; a context manager.
+
+    Args:
+        folder: of the run.
+        through: name of the port, for the log of the run.
+        patient: the run may begin later.
+        interrupt: set by Ctrl-C and SIGTERM.
+    """
+
+    def __init__(self, folder: Path, through: str, patient: bool, interrupt: Interrupt) -> None:
+        self.folder, self._through, self._patient = folder, through, patient
+        self._interrupt = interrupt
+        self._resources = contextlib.ExitStack()
+        self._gone, self._next_look = False, 0.0
+
+    def __enter__(self) -> BesideRun:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._resources.close()
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the port is to end at once."""
+        return self._interrupt.came
+
+    def over(self) -> bool:
+        """Whether neither role is alive any more, or the port is to end. What cannot be examined
+        is reported, and not over."""
+        now = time.monotonic()
+        if not self._gone and now >= self._next_look:
+            self._next_look = now + _LOOK_S
+            try:
+                self._gone = not present(self.folder)
+            except (OSError, UserError) as problem:
+                report("the look whether the run goes on", problem)
+                self._next_look = now + PAUSE_S
+        return self._gone or self.interrupted
+
+    def wait(self, commands: bool = True) -> None:
+        """With ``--wait`` wait until the run records or, if it needs them, takes ``commands``.
+
+        Raises:
+            KeyboardInterrupt: the port is to end.
+        """
+        there = present if commands else _recorded
+        while self._patient and not there(self.folder):
+            if self.interrupted:
+                raise KeyboardInterrupt
+            time.sleep(_LOOK_S)
+        with contextlib.suppress(OSError):
+            os.nice(_NICENESS)
+
+    def operator(self) -> Operator:
+        """An operator of the run.
+
+        Raises:
+            UserError: no run is in progress.
+        """
+        operator = Operator(self.folder, self._through)
+        self._resources.callback(operator.close)
+        return operator
+
+    def first(self, ask: Callable[[], _T | None]) -> _T:
+        """What ``ask`` returns once it returns something: the handshake may not be over yet.
+
+        Raises:
+            UserError: the run is over before.
+        """
+        while (found := ask()) is None:
+            if self.over():
+                raise not_running(self.folder)
+            time.sleep(_LOOK_S)
+        return found
+
+    def serve_until(
+        self, work: Coroutine[Any, Any, None], over: Callable[[], bool] | None = None
+    ) -> None:
+        """Carry out asynchronous work until the run is over, or until ``over()``."""
+        over = over or self.over
+
+        async def until() -> None:
+            task = asyncio.create_task(work)
+            while not task.done() and not over():
+                await asyncio.wait([task], timeout=_LOOK_S)
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+        asyncio.run(until())
+
+
+def _recorded(folder: Path) -> bool:
+    return (folder / "signals.npz").is_file() or begun(folder)
+
+
+class Port(ABC):
+    """A way into a run, as a command of its own and as an option of ``gfmhil run``.
+
+    Args:
+        name: in the registry.
+
+    Attributes:
+        text: what the command does, for its help.
+        risk: what may happen at an address that others reach.
+        remedy: what permits such an address, in words.
+        opens: the option by which a user permits it without encryption, and its help.
+        needs: module and package that it needs, who does, and the extra that installs it.
+        commands: it needs a run that takes commands.
+        early: how many lines it prints before the run begins.
+        stays: it goes on when the run is over, until Ctrl-C.
+        or_any: without ``--port`` it takes a free one if its own is in use.
+        socket: its kind.
+        tls: how it encrypts, once the options are checked; None: plainly.
+    """
+
+    text: str
+    risk: str
+    remedy = "--plain if it shall"
+    opens: tuple[str, str]
+    needs: tuple[str, str, str, str] | None = None
+    commands = False
+    early = 0
+    stays = False
+    or_any = False
+    socket = socket.SOCK_STREAM
+    tls: ssl.SSLContext | None = None
+
+    def __init__(self, name: str) -> None:
+        self.name, self.number = name, PORTS[name].number
+
+    def add(self, command: argparse.ArgumentParser) -> None:
+        """Add the options that every port has, then its own."""
+        command.description = self.text
+        command.add_argument("folder", type=Path, metavar="RUN", help="the run folder")
+        command.add_argument("--wait", action="store_true", help="wait for the run to begin")
+        command.add_argument(
+            "--host", default="127.0.0.1", help="address to listen at (%(default)s)"
+        )
+        number = f"{self.number} or else a free one" if self.or_any else str(self.number)
+        command.add_argument(
+            "--port", type=int, default=None if self.or_any else self.number,
+            help=f"to listen at, 0: a free one ({number} by default)",
+        )  # fmt: skip
+        option, text = self.opens
+        command.add_argument(option, action="store_true", dest="open", help=text)
+        self.options(command)
+
+    def options(self, command: argparse.ArgumentParser) -> None:  # noqa: B027
+        """Add its own options."""
+
+    def instead(self, options: argparse.Namespace) -> bool:
+        """Whether the options asked for something else than to serve, which is then done."""
+        return False
+
+    def check_needs(self) -> None:
+        """Raise UserError if what it needs is not installed."""
+        if self.needs is not None:
+            need(*self.needs)
+
+    def check(self, options: argparse.Namespace) -> None:
+        """See that the options can be, before anything starts.
+
+        Raises:
+            UserError: one cannot, or others reach the address though nobody said so.
+        """
+        check_number("--port", options.port)
+        if self.tls is None and not options.open and beyond_loopback(f"tcp://{options.host}:0"):
+            raise UserError(
+                f"--host {options.host}: goes beyond this machine, {self.risk}; {self.remedy}"
+            )
+
+    @abstractmethod
+    def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
+        """Serve until the run is over; returns the exit code.
+
+        Raises:
+            UserError: no run is in progress, or the address cannot be used.
+        """
+
+    def call(self, options: argparse.Namespace) -> int:
+        """Carry out the command; returns its exit code."""
+        if self.instead(options):
+            return 0
+        self.check_needs()
+        self.check(options)
+        with (
+            Interrupt() as interrupt,
+            BesideRun(options.folder, self.name, options.wait, interrupt) as run,
+        ):
+            return self.serve(run, options)
+
+
+def say(text: str) -> None:
+    """Print a line at once, for whoever waits for it."""
+    print(text, flush=True)
+
+
+def check_number(option: str, number: int | None) -> None:
+    """Raise UserError for what is no port."""
+    if number is not None and not 0 <= number <= 65535:
+        raise UserError(f"{option} {number}: must be 0 (any) to 65535")
+
+
+def make_tls(
+    words: str, certificate: Path, key: Path, clients: Path | None = None
+) -> ssl.SSLContext:
+    """A server's TLS context.
+
+    Args:
+        words: the options, for an error.
+        certificate, key: of the server.
+        clients: authority that signed a certificate of each client; None: clients need none.
+
+    Raises:
+        UserError: a file cannot be used.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, key)
+        if clients is not None:
+            context.verify_mode = ssl.CERT_REQUIRED
+            context.load_verify_locations(clients)
+    except (OSError, ssl.SSLError) as problem:
+        raise UserError(f"{words}: {problem}") from None
+    return context
