@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel
+from gfm_design.norms.performance import PAPER_WEIGHTS, WeightedChannel
 from gfm_design.tuning.gains import FreeGain
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
 from gfm_hil.core.terminal import markdown
@@ -21,7 +21,7 @@ _COLUMNS = (
 )
 
 
-def _channels(law: str, given: dict[str, float]) -> tuple[Channel, ...]:
+def _channels(law: str, given: dict[str, float]) -> tuple[WeightedChannel, ...]:
     file = law_file(law)
     values = tied(file, given) if given else {}
     gains = tuple(FreeGain(n, v, -np.inf, np.inf) for n, v in values.items())

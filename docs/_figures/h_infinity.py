@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from gfm_design.norms.performance import PAPER_WEIGHTS, Channel, StateSpace, Weight
+from gfm_design.norms.performance import PAPER_WEIGHTS, StateSpace, Weight, WeightedChannel
 from gfm_design.tuning.full_order import full_order
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
@@ -132,7 +132,12 @@ def _closer(
 
 
 def _peak(
-    a: Axes, loop: StateSpace, weight: Weight, norm: Channel, colour: str, beside: tuple[int, int]
+    a: Axes,
+    loop: StateSpace,
+    weight: Weight,
+    norm: WeightedChannel,
+    colour: str,
+    beside: tuple[int, int],
 ) -> None:
     """Where W T is largest: the norm, and the place on |T|."""
     omega = max(norm.omega, 1e-1)  # a norm reached at rest stands at the left

@@ -47,8 +47,8 @@ _GONE = 1e-6
 _MOST = 1e100  # p.u.; the squares of more could overflow
 
 
-class Mode(NamedTuple):
-    """An oscillation.
+class Oscillation(NamedTuple):
+    """A damped or growing sinusoid in a recording.
 
     Attributes:
         damping: ratio; negative if it grows.
@@ -119,7 +119,7 @@ def free_from(acts: Sequence[Acting], start: int, stop: int) -> int:
     return max(start, held if held < stop else min(moved, stop))
 
 
-def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
+def swing(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
     """The strongest oscillation below f_n/2 in the first 2 s of x; None without one, or if x is not
     finite there.
 
@@ -138,7 +138,7 @@ def swing(x: Vector, T_s: float, f_n: float) -> Mode | None:
     return _strongest(thin, stride * T_s, (longest, 0.5 * f_n), _LEAST, 0.0)
 
 
-def fast_mode(x: Vector, T_s: float, f_n: float) -> Mode | None:
+def fast_mode(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
     """The strongest oscillation above f_n/2 in the first 2 s of x; None without one.
 
     It is sought around the largest line of the spectrum. Args as for ``swing``.
@@ -204,7 +204,7 @@ def _filter(stride: int) -> Vector:
 
 def _strongest(
     x: Vector, h: float, band: tuple[float, float], least: float, share: float
-) -> Mode | None:
+) -> Oscillation | None:
     """The mode in a band [Hz] that contributes the most energy to x, sampled every h s; None if its
     amplitude is below ``least`` p.u. or its energy below a ``share`` of that of x,.
 
@@ -237,4 +237,4 @@ def _strongest(
     if not len(found):
         return None
     k = found[np.argmax(energy[found])]
-    return Mode(float(-s[k].real / abs(s[k])), float(hertz[k]))
+    return Oscillation(float(-s[k].real / abs(s[k])), float(hertz[k]))
