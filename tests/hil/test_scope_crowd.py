@@ -16,7 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from gfm_hil.ports.scope import server, session
 from gfm_hil.ports.scope.access import Access
-from gfm_hil.ports.scope.picture import Picture
+from gfm_hil.ports.scope.picture import ScopePicture
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.scope.server import Scope
 
@@ -82,14 +82,14 @@ def test_numbers_without_bounds_are_refused(port, more, attack_now) -> None:
     "3.2", "a page whose picture raises an exception", "the scope ends for every page"
 )
 def test_an_exception_ends_its_own_page_alone(port, monkeypatch, caplog, attack_now) -> None:
-    frame = Picture.frame
+    frame = ScopePicture.frame
 
-    def fails(self: Picture, head: int) -> bytes | None:
+    def fails(self: ScopePicture, head: int) -> bytes | None:
         if self._request.id == 13:
             raise ZeroDivisionError("of this page")
         return frame(self, head)
 
-    monkeypatch.setattr(Picture, "frame", fails)
+    monkeypatch.setattr(ScopePicture, "frame", fails)
     with connect(address(port)) as page, connect(address(port)) as other:
         say(page, **{**LOOK, "id": 13})
         assert gone(page)

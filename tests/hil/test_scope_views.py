@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.ports.scope.channels import make_channels
-from gfm_hil.ports.scope.picture import HEAD, Picture, PictureRequest
+from gfm_hil.ports.scope.picture import HEAD, PictureRequest, ScopePicture
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.trigger import ARMED, AUTO, FILLING, HELD, Acquisition, Trigger, edges
@@ -177,7 +177,7 @@ def test_frames_roll_along_and_say_what_is_the_case() -> None:
     state[12_000:] = 3.0
     pyramid = pyramid_of(Growing(p, state=state, law=np.full(TICKS, 1.0)))
     pyramid.update()
-    view = Picture(pyramid, look(watched=["p"]), 0)
+    view = ScopePicture(pyramid, look(watched=["p"]), 0)
     head, values, now = taken_apart(view.frame(10_000), watched=1)
     assert (head["start"], head["stop"], head["head"]) == (5000, 10_000, 10_000)
     assert (head["view"], head["state"], head["law"], head["live"]) == (7, 2, 1, 1)
@@ -193,7 +193,7 @@ def test_frames_roll_along_and_say_what_is_the_case() -> None:
 def test_a_held_window_is_sent_once_and_then_only_what_else_is_new() -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
-    view = Picture(pyramid, look(mode="held", start=0.1, span=0.2), 0)
+    view = ScopePicture(pyramid, look(mode="held", start=0.1, span=0.2), 0)
     head, values, _ = taken_apart(view.frame(10_000))
     assert (head["start"], head["stop"], head["same"]) == (1000, 3000, 0)
     assert values.size
@@ -205,7 +205,7 @@ def test_a_window_beyond_what_is_recorded_is_empty() -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     for start in (-5.0, 5.0):
-        view = Picture(pyramid, look(mode="held", start=start, span=0.2), 0)
+        view = ScopePicture(pyramid, look(mode="held", start=start, span=0.2), 0)
         head, _, _ = taken_apart(view.frame(10_000))
         assert head["bins"] == 0
 
@@ -214,7 +214,7 @@ def test_a_window_beyond_what_is_recorded_is_empty() -> None:
 def test_a_look_that_cannot_be_is_refused(wrong) -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     with pytest.raises(ValueError, match=r"channel = .*: unknown|trigger: missing"):
-        Picture(pyramid, look(**wrong), 0)
+        ScopePicture(pyramid, look(**wrong), 0)
 
 
 @given(
@@ -228,7 +228,9 @@ def test_no_look_is_too_odd(start, span, bins, mode, heads) -> None:
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     trigger = Trigger(channel="p", level=0.0)
-    view = Picture(pyramid, look(start=start, span=span, bins=bins, mode=mode, trigger=trigger), 0)
+    view = ScopePicture(
+        pyramid, look(start=start, span=span, bins=bins, mode=mode, trigger=trigger), 0
+    )
     for done in heads:
         frame = view.frame(done)
         if frame is not None:

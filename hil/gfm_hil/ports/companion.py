@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports import make_port
-from gfm_hil.ports.port import Port
+from gfm_hil.ports.port import OperatorPort
 from gfm_runtime.children import guarded
 
 _GRACE_S = 5.0
@@ -84,7 +84,7 @@ def _pass_on_line(process: subprocess.Popen[str]) -> str:
     return line
 
 
-def _check_free(port: Port, number: int) -> None:
+def _check_free(port: OperatorPort, number: int) -> None:
     with socket.socket(socket.AF_INET, port.socket) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -134,7 +134,7 @@ def _recorded(folder: Path) -> bool:
     return (folder / "signals.npz").is_file() or begun(folder)
 
 
-class Port(ABC):
+class OperatorPort(ABC):
     """A way into a run, as a command of its own and as an option of ``gfmhil run``.
 
     Args:

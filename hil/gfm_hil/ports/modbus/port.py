@@ -19,7 +19,7 @@ from gfm_hil.ports.modbus.connection import CLIENT, UNIT, Server
 from gfm_hil.ports.modbus.device import TICK_S, Device
 from gfm_hil.ports.modbus.image import BASE, vendor_model
 from gfm_hil.ports.modbus.run_state import Watcher
-from gfm_hil.ports.port import BesideRun, Port, make_tls, say
+from gfm_hil.ports.port import BesideRun, OperatorPort, make_tls, say
 from gfm_hil.scenario import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
@@ -28,7 +28,7 @@ _LOOKS = 10  # such polls per update of the slack
 _TIMER = Identity(through="modbus", name="timer")
 
 
-class ModbusPort(Port):
+class ModbusPort(OperatorPort):
     """The SunSpec device of ``gfmhil modbus``."""
 
     text = "Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end."

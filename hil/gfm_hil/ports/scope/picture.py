@@ -54,7 +54,7 @@ class PictureRequest(BaseModel):
     trigger: Trigger | None = None
 
 
-class Picture:
+class ScopePicture:
     """A page's look at a recording.
 
     Args:

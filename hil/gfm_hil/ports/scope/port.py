@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.ports.port import BesideRun, Port, make_tls, say
+from gfm_hil.ports.port import BesideRun, OperatorPort, make_tls, say
 
 _OPERATOR = "operator"  # who has the address with control if no names are given
 
 
-class ScopePort(Port):
+class ScopePort(OperatorPort):
     """The scope of ``gfmhil scope``."""
 
     text = (

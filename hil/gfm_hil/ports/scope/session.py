@@ -18,7 +18,7 @@ from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity, address
 from gfm_hil.core.rate import Rate
 from gfm_hil.ports.scope.access import Access
-from gfm_hil.ports.scope.picture import Picture, PictureRequest
+from gfm_hil.ports.scope.picture import PictureRequest, ScopePicture
 from gfm_hil.ports.scope.pyramid import Pyramid
 
 #: carries out an event and returns its tick; raises UserError with the reason of a refusal
@@ -87,7 +87,7 @@ class Session:
         self._socket, self._pyramid, self._access, self._command = socket, pyramid, access, command
         self.operator = ""
         self._rate = Rate("this page", PER_S, BURST)
-        self._shown: Picture | None = None
+        self._shown: ScopePicture | None = None
         self._played: tuple[float, float, float] | None = None  # start [ticks], speed, begin
         self._news: str | None = None
         self._picture: bytes | None = None
@@ -179,7 +179,7 @@ class Session:
                     self.operator = self._access.operator(message.token)
                     await self.say("control", granted=bool(self.operator))
                 case PictureRequest():
-                    self._shown = Picture(self._pyramid, message, self.head())
+                    self._shown = ScopePicture(self._pyramid, message, self.head())
                 case Play():
                     self._play(message)
                 case Command():

@@ -7,12 +7,12 @@ import contextlib
 import sys
 
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.ports.port import INTERRUPTED, BesideRun, Port, check_number, say
+from gfm_hil.ports.port import INTERRUPTED, BesideRun, OperatorPort, check_number, say
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.ports.streams.publish import Publisher
 
 
-class StreamPort(Port):
+class StreamPort(OperatorPort):
     """The streams of ``gfmhil stream``; they are open before the run begins."""
 
     text = (

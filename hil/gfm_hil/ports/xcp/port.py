@@ -9,7 +9,7 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.ports.port import BesideRun, Port, say
+from gfm_hil.ports.port import BesideRun, OperatorPort, say
 from gfm_hil.ports.xcp.memory import Memory
 from gfm_hil.ports.xcp.slave import Slave
 from gfm_hil.ports.xcp.transports import CanFd, Transport, Udp, packed
@@ -23,7 +23,7 @@ _COMMANDS = (
 )  # fmt: skip
 
 
-class XcpPort(Port):
+class XcpPort(OperatorPort):
     """The slave of ``gfmhil xcp``."""
 
     text = (
