@@ -29,11 +29,13 @@ FOLDERS = {
 }
 RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
+_FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "toml_file")
+_STAGES = ("kinds", "stage", "virtual_stator", "voltage_loop")  # their options
 BESIDE_THE_LOOP = {
-    **{key: {"pydantic"} for key in ("lawfile.py", "mistakes.py", "inner_file.py")},
-    "toml_file.py": {"pydantic", "pydantic_core"},
+    **{f"{name}.py": {"pydantic", "pydantic_core"} for name in (*_FILES, *_STAGES)},
     "elf.py": {"elftools"},  # the extra "calibration"
 }
+OF_THE_SAME_PROJECT = {"pydantic_core", "llvmlite"}  # as pydantic and numba, which pin them
 SOURCES = [
     *FOLDERS.values(),
     *(ROOT / name for name in ("tests", "benchmarks", "docs", "examples")),
@@ -85,7 +87,9 @@ def test_a_plain_install_has_all_that_the_plant_imports() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     installed = {canonicalize_name(Requirement(each).name) for each in project["dependencies"]}
     names = {n.split(".")[0] for p in files(FOLDERS["gfm_plant"], {".py"}) for n in imported(p)}
-    foreign = names - set(sys.stdlib_module_names) - {"gfm_plant", "gfm_runtime", "pydantic_core"}
+    foreign = (
+        names - set(sys.stdlib_module_names) - {"gfm_plant", "gfm_runtime", *OF_THE_SAME_PROJECT}
+    )
     assert {canonicalize_name(name) for name in foreign} <= installed
 
 

@@ -348,8 +348,8 @@ def test_the_command_refuses_what_makes_no_sense(
     file = write(tmp_path, law="vsg-2", link={"type": "inproc"})
     out = ["--out", str(tmp_path / "run")]
     for options, message in (
-        (["run", file, "--controller", "dll:x"], "a run in process has none; choose --link"),
-        (["run", file, "--map", "x"], "--map: is of a model; name it by --controller"),
+        (["run", file, "--controller", "dll:x"], "which a run in process has not; choose a link"),
+        (["run", file, "--map", "x"], "a port map is for an external controller"),
         (["run", "three_share_a_load", "--controller", "dll:x"], "controls one converter"),
         (["plant", file, "--link", "shm", "--endpoint", "shm://x", "--model", "dll:x"], "--model"),
     ):

@@ -112,13 +112,13 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
             '"virtual-statr"',
             "inner stage virtual-statr: unknown; use a .toml file or one of ['none',",
         ),
-        ("3", "inner: must be a table with type, not 3"),
+        ("3", "inner: must be a table, not 3"),
         ("{X_v = 1.0}", "inner.type: missing"),
         (
             '{type = "stator"}',
             "inner.type = 'stator': must be one of ['virtual-stator', 'cascaded',",
         ),
-        ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: 0.0 must be > 0"),
+        ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: must be > 0, not 0.0"),
         ('{type = "virtual-stator", I_thr = 1.0}', "inner.I_thr = 1.0: unknown key"),
         (
             '{type = "cascaded", priority = "e"}',
@@ -127,7 +127,7 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
         ('{type = "cascaded", I_max = "x"}', "inner.I_max: unknown parameter 'x'; known: ['D_p',"),
         (
             '{type = "cascaded", power = {P_max = 0.1, P_min = 0.2}}',
-            "inner.P_max: 0.1 must be above P_min = 0.2",
+            "inner.power: P_max = 0.1 must be above P_min = 0.2",
         ),
     ],
 )

@@ -158,7 +158,7 @@ def test_means_over_a_cycle_are_those_worked_out_one_by_one(width, monkeypatch):
         weights[-1] = part
     expected = [np.dot(x[k : k + n], weights) / width for k in range(50, 650 - n + 1)]
     for piece in (1, 100, 1 << 18):
-        monkeypatch.setattr("gfm_hil.results.cycles.PIECE", piece)
+        monkeypatch.setattr("gfm_hil.run.cycles.PIECE", piece)
         found = np.concatenate(list(cycle_means(x, 50, 650, width)))
         assert found == pytest.approx(np.array(expected), abs=1e-14)
     assert not list(cycle_means(x, 0, n - 1, width))

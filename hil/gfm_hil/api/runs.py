@@ -161,10 +161,12 @@ def _external_command(
     """
     if controller is None:
         if ports is not None:
-            raise UserError("ports: are of an external controller; name it as controller")
+            raise UserError("a port map is for an external controller; name the controller too")
         return []
     if scenario.link.type == INPROC:
-        raise UserError("controller: is a process, and a run in process has none; choose a link")
+        raise UserError(
+            "an external controller is a process, which a run in process has not; choose a link"
+        )
     real = precision(controller)
     if not controller.startswith(PIL):
         controller_file(controller, FORMS)
@@ -214,7 +216,7 @@ class Comparison(dict[str, Run]):
 
     @property
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """The summary of each run by law: the content of comparison.json."""
+        """The summary of each run by law, which comparison.json holds."""
         return {law: one.summary for law, one in self.items()}
 
     @property
