@@ -121,7 +121,8 @@ def test_a_plant_that_says_hello_and_no_more_is_not_waited_for(make, endpoint, o
 def test_a_frame_says_that_the_plant_has_started(make, endpoint, opened):
     """A frame also tells when, if START was lost; other messages do not."""
     link, controller = opened(ZmqLink("plant", endpoint)), opened(ZmqLink("controller", endpoint))
-    scenario, frames = make(link=PATIENT), FrameWriter("y")
+    of_run = {**PATIENT, "type": "zmq"}
+    scenario, frames = make(link=of_run, mode="realtime"), FrameWriter("y")
     hello = {"kind": "hello", "role": "plant", "boot": "", **handshake._what_runs(scenario)}
     k, T_ns, y = 7, 100_000, np.ones(NY)
     spoilt = bytearray(frames.pack(k, 0, 0, y))

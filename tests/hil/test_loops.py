@@ -345,6 +345,8 @@ def test_the_stop_flag_ends_both(mode, link, place, make):
 
 def test_an_event_whose_tick_was_lost_is_carried_out_with_the_next_frame(place, make):
     content = {
+        "mode": "realtime",  # in lockstep the plant asks again
+        "late_policy": {"hold": 10**6},
         "link": LIVE,
         "law": "vsg-2",
         "events": [
