@@ -245,6 +245,7 @@ def test_compare_runs_in_process_unless_told_otherwise(call):
     )  # fmt: skip
 
 
+@pytest.mark.full
 def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
     laws = [f"{law}-tuned" for law in ("mimo-gfm", "droop-5", "vsg-12", "vsg-10", "matching-1")]
     command = ("compare", scenario(duration=0.02), "--laws", ",".join(laws))

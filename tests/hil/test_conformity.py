@@ -285,6 +285,7 @@ parameters.H = {{ value = {H}, unit = "s", source = "here" }}
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("D", "H", "scr"), [(50.0, 4.0, 3.0), (20.0, 5.0, 3.0), (100.0, 8.0, 5.0)])
 def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_come_back(
     D: float, H: float, scr: float, tmp_path: Path

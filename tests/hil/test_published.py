@@ -168,6 +168,7 @@ def test_dynawo_rests_where_the_bench_rests(dynawo: Dynawo) -> None:
         assert i[:, k] == pytest.approx(dynawo.i[:, k], abs=4e-3)
 
 
+@pytest.mark.full
 def test_dynawo_differs_by_its_dvoc_and_by_its_lines(dynawo: Dynawo) -> None:
     """An angle that counts once takes Dynawo's equations as far from its points as the bench is;
     with our control they differ from the bench until the lines' currents have settled, and with

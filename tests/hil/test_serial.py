@@ -131,6 +131,7 @@ def endpoint(tmp_path: Path) -> str:
     return link_kind("serial").fresh(tmp_path)
 
 
+@pytest.mark.full
 def test_a_run_with_an_inner_stage_has_the_bits_of_the_run_in_process(
     make: Any, run: Any, tmp_path: Path
 ) -> None:
