@@ -94,7 +94,7 @@ def settles(w: Window, to: float, within: float, tolerance: float) -> Violation 
     how = "it had not at the end of the run" if took is None else f"it took {took:.4g} s"
     text = (
         f"{w.symbol} should settle at {w.show(to)} ± {tolerance:g} within {within:g} s, but {how}: "
-        f"after these {within:g} s it was as far off as {w.show(w.x[worst])} "
+        f"after these {within:g} s it was still at {w.show(w.x[worst])} "
         f"(at t = {w.t[worst]:.4f} s); the end of the run lies in "
         f"[{ending.min():.4g}, {ending.max():.4g}]."
     )
