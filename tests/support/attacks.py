@@ -57,7 +57,7 @@ def pytest_terminal_summary(
             if report.when == "call" or outcome == "error":
                 now = "; ".join(value for key, value in report.user_properties if key == _NOW)
                 now = now or "refused" if outcome == "passed" else "**the test fails**"
-                test = report.nodeid.rsplit("/", 1)[-1].split("[")[0]
+                test = report.nodeid.split("[")[0].rsplit("/", 1)[-1]
                 for key, value in report.user_properties:
                     if key == _ATTACK:
                         number, attack, before = value
