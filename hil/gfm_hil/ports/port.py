@@ -38,7 +38,7 @@ class Refusal(Exception):
 
 
 class BesideRun:
-    """The run beside which a port serves; a context manager.
+    """The run that a port serves; a context manager.
 
     Args:
         folder: of the run.
@@ -232,7 +232,7 @@ class OperatorPort(ABC):
 
 
 def say(text: str) -> None:
-    """Print a line at once, for whoever waits for it."""
+    """Print a line and flush it, so that a program that waits for it reads it at once."""
     print(text, flush=True)
 
 

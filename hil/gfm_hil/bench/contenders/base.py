@@ -78,7 +78,7 @@ def limit(
 
     Args:
         name: in tables.
-        file: path of the Python file beside which the C source of the same name is.
+        file: path of a Python file; its C source has the same name and folder.
         endpoint: where both sides meet.
         end: opens one end, by ``pingpong.in_c``.
     """
