@@ -24,11 +24,10 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.scope.access import HEADERS, Access
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
-from gfm_hil.ports.scope.session import SEND_S, Session, in_words
+from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session, in_words
 from gfm_hil.scenario import INPROC
 from gfm_runtime import law_titles
 from gfm_runtime.signals import group
