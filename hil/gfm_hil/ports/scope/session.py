@@ -93,10 +93,9 @@ class Access:
 
     def operator(self, token: str) -> str:
         """The name of the operator with this token; empty if there is none."""
-        same = (
-            n for n, t in self.tokens.items() if hmac.compare_digest(token.encode(), t.encode())
-        )
-        return next(same, "")
+        given, same = token.encode(), hmac.compare_digest
+        names = [n for n, known in self.tokens.items() if same(given, known.encode())]
+        return names[0] if names else ""
 
 
 def in_words(kind: str, **content: Any) -> str:
