@@ -102,8 +102,9 @@ class Scope:
 
             async with serve(
                 partial(self._page, listener), sock=listener, ssl=encryption,
-                process_request=self._answer, compression=None, max_size=_LARGEST, max_queue=8, server_header=None, logger=_LOG,
-                ping_interval=_PING_S, ping_timeout=_PING_S, close_timeout=SEND_S,
+                process_request=self._answer, compression=None, max_size=_LARGEST, max_queue=8,
+                server_header=None, logger=_LOG, ping_interval=_PING_S, ping_timeout=_PING_S,
+                close_timeout=SEND_S,
             ):  # fmt: skip
                 ready(listener.port)
                 await asyncio.gather(
