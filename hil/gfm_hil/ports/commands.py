@@ -126,9 +126,9 @@ class Operator:
                 socket.send_json({**event, "by": (by or self._local).plain()})
                 if not socket.poll(_ANSWER_MS):
                     raise UserError(f"{self._folder}: the {role} does not answer")
-                answer: dict[str, Any] = dict(socket.recv_json())
+                answer: Any = socket.recv_json()
         except zmq.ZMQError as problem:  # for example no descriptor for a socket
             raise UserError(f"{self._folder}: the {role} cannot be asked: {problem}") from None
         if not answer.pop("ok"):
             raise UserError(str(answer["error"]))
-        return answer
+        return dict(answer)

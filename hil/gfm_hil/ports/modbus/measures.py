@@ -75,7 +75,7 @@ class Watcher:
         self._window = max(round(_WINDOW_S / T_s), 1)
         self._said: dict[str, Any] = {}
         self._code: tuple[float, ...] = ()
-        self.forget()
+        self._asked = -math.inf
 
     def look(self) -> RunState | None:
         """The newest tick of both sides, or None before there is one."""

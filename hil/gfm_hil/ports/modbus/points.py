@@ -192,7 +192,7 @@ class SetPoint(PointGroup):
             )
         }  # fmt: skip
         self.writable = tuple(self._keys)
-        self.forget()
+        self.settings = Settings(mode=absolute)
 
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
         changes: dict[str, Any] = {self._keys[path]: value for path, value in written.items()}
@@ -315,7 +315,8 @@ class Curves(PointGroup):
         self._fixed, self._own = (f"{self.model}.{self.curve}{k}." for k in (1, _MINE))
         own = (self._own + name for name in self.stored)
         self.writable = (self._enable, self._request, *own)
-        self.forget()
+        self.state = Adopted()
+        self._stored: dict[str, Value] = {}
 
     @abstractmethod
     def read(self, stored: Written) -> Meaning:
@@ -369,8 +370,7 @@ class Curves(PointGroup):
         return Effect(events, keep, fail)
 
     def forget(self) -> None:
-        self.state = Adopted()
-        self._stored: dict[str, Value] = {}
+        self.state, self._stored = Adopted(), {}
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
         s, there = self.state, self.write(self.in_force(run))
@@ -485,7 +485,8 @@ class Heartbeat(PointGroup):
         self._timeout_ms = timeout_ms
         self._lost = 0
         self._late: float | None = None  # ms
-        self.forget()
+        self._last: float | None = None  # the device's time of the last beat, s; None: lost
+        self.missing = False
 
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
         timeout, value = written.get(f"{VENDOR}.HbTms"), written.get("715.ControllerHb")
@@ -514,8 +515,7 @@ class Heartbeat(PointGroup):
 
     def forget(self) -> None:
         """Expect no heartbeat until a client writes it again."""
-        self._last: float | None = None  # the device's time of the last beat, s; None: lost
-        self.missing = False
+        self._last, self.missing = None, False
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
         return {
