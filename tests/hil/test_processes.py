@@ -195,6 +195,20 @@ def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, 
     assert roles_of(folder) == {}
 
 
+def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(start, tmp_path):
+    """The plant stands still before its handshake, as one does that has to compile."""
+    scenario = write(tmp_path, **LONG, link={"start_timeout_s": 1.0})
+    folder = tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: "plant" in roles_of(folder), process)
+    os.kill(roles_of(folder)["plant"], signal.SIGSTOP)
+    code, out, _ = end(process)
+    found = json.loads(out)
+    assert (code, found["status"]) == (3, "safe")
+    assert "the plant did not come within 1 s" in found["reason"]
+    assert roles_of(folder) == {}
+
+
 def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_path):
     scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
