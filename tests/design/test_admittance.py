@@ -1,7 +1,5 @@
 """Passivity and stability from an admittance, against poles and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The one closed loop: its readings against each other, other programs and the nonlinear bench."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from typing import Any

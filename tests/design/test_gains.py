@@ -1,7 +1,5 @@
 """Free gains: valid choices, ties, and laws affine in them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

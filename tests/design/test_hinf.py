@@ -1,7 +1,5 @@
 """The H-infinity norm against python-control, dense grids and values computed by hand."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The loop with an inner stage: against the compiled kernel, and against the nonlinear bench."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Linear models against SciPy, finite differences, the nonlinear bench, and known figures."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Margins against closed forms, python-control, SLICOT, eigenvalues and the nonlinear bench."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,8 +1,6 @@
 """The loop of a network: against the loop of one converter, against the same network drawn in
 another way, and against the nonlinear bench."""
 
-from __future__ import annotations
-
 import copy
 import tomllib
 from pathlib import Path

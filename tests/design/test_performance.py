@@ -1,7 +1,5 @@
 """The paper's problem: weights, channels, and gamma of the printed gains."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The fast estimate and the polish against the guaranteed norm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

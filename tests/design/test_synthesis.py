@@ -1,7 +1,5 @@
 """The search: known optima, the paper's gains, bounds, seeds, and no solution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

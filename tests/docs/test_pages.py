@@ -1,7 +1,5 @@
 """The pages' examples work, and their hand-written lists match the code."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import sys

@@ -1,7 +1,5 @@
 """The box of real loops, and the gains that must be stable in it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

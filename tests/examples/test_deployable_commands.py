@@ -1,7 +1,5 @@
 """examples/paper/deployable: what its commands print and write."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

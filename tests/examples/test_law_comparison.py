@@ -1,7 +1,5 @@
 """examples/paper/law_comparison: rows, tables, law files, going on, what it refuses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

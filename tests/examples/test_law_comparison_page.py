@@ -1,7 +1,5 @@
 """The page's tables match the shipped laws."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

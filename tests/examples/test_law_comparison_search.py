@@ -1,7 +1,5 @@
 """One law of the comparison: its search, the mode in its way, what its sampled loop stands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """``gfmhil bench``: its files and its errors. The tests judge no figure."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

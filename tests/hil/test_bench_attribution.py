@@ -1,7 +1,5 @@
 """Causes of missed ticks, on synthetic timing with one fault at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The verdict on two results: the rank test against SciPy's, and synthetic results."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys

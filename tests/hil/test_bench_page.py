@@ -1,7 +1,5 @@
 """bench.html: all of a result in one file that needs no network."""
 
-from __future__ import annotations
-
 import base64
 import re
 import xml.etree.ElementTree as ET

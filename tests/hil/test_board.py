@@ -1,7 +1,5 @@
 """The example of a bare-metal board, in QEMU with its UART on a pseudo terminal."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Campaigns: determinism over workers, resuming, single runs, and wrong input."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """A campaign's draws: within bounds, with the set distribution, a function of seed and run."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """gfmhil dbc."""
 
-from __future__ import annotations
-
 import pytest
 
 from gfm_hil.cli import main

@@ -1,7 +1,5 @@
 """A virtual bus with a real bus's delays: the order of frames, and when each is delivered."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The command line: what each command prints, writes and returns."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Conformity tests: judged on runs made by formula, run against closed forms, and as a command."""
 
-from __future__ import annotations
-
 import cmath
 import json
 import math

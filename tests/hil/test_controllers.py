@@ -1,7 +1,5 @@
 """Models that are not ours as the controller: real-code DLLs and FMUs, and how they fail."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from pathlib import Path

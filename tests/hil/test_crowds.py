@@ -1,7 +1,5 @@
 """Both servers beside one run: hundreds of silent pages, thousands of half-open connections."""
 
-from __future__ import annotations
-
 import json
 import resource
 import signal

@@ -1,7 +1,5 @@
 """gfmhil design gamma and tune: their output, files and errors."""
 
-from __future__ import annotations
-
 import json
 
 import control

@@ -1,7 +1,5 @@
 """The single-line diagram shows what the scenario has."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ verification (c) RTE and Grupo AIA, MPL-2.0, commit b7576cb0: docs/GFM_envelopes
 and tests/dycov/gfm/resources. Their columns: time, expected, and the two limits.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames: each arrives unchanged or not at all, every fault counts under its name; their CRC."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

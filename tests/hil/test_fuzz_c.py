@@ -1,7 +1,5 @@
 """The parsers in C: equal to the bench's own, and under a fuzzer with sanitizers."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -1,7 +1,5 @@
 """The measured admittance: against the linear model, closed forms, and the poles of other grids."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

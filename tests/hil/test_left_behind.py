@@ -5,8 +5,6 @@ GFMHIL_KILLS_SEED selects other moments, and GFMHIL_KILLS_REPORT=file writes a l
 command, processes that were there, and the time in s until the last of them was gone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Controllers in shared libraries that measure and command phase voltages and currents."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import shutil

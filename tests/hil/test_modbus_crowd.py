@@ -1,7 +1,5 @@
 """The Modbus server among many clients: silent, half-open and flooding ones."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import resource

@@ -1,7 +1,5 @@
 """Runs of several converters in one network."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re

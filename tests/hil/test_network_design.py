@@ -1,7 +1,5 @@
 """The design commands on a scenario with several converters, and the same from Python."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Networks over links: one plant process, and a controller process for each converter."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

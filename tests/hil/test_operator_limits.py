@@ -1,7 +1,5 @@
 """The command server: arbitrary messages to its socket, and situations like the end of a run."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

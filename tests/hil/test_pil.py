@@ -1,7 +1,5 @@
 """The laws of a run on another processor: the bits of the kernel, and how it fails."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """What all ports have in common: beside one run with their real clients, and what they refuse."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

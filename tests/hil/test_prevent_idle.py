@@ -1,7 +1,5 @@
 """A thread of idle priority keeps a processor busy, and ends with its context."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

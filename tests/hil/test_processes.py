@@ -1,7 +1,5 @@
 """Two real processes: they start, connect, run, and end together, however one of them ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -2,8 +2,6 @@
 its authors compare with PSCAD (commit d94d74e7d), and Dynawo's three grid-forming converters. The
 CSV files lie beside the scenarios."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any, NamedTuple

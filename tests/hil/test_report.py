@@ -1,7 +1,5 @@
 """The report of a run: in words, in light and dark, on a screen and on a phone."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """With an inner stage a converter rides through what trips it without one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

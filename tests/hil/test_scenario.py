@@ -1,7 +1,5 @@
 """Scenario files: shipped ones load, written ones are read back, a mistake gives one line."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib

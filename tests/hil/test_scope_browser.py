@@ -1,7 +1,5 @@
 """The scope in Chromium: a run is shown, commanded, trips, and is reset."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

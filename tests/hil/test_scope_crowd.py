@@ -1,7 +1,5 @@
 """The scope among many pages, some silent and some malicious: none of them harms another."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

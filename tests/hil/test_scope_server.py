@@ -1,7 +1,5 @@
 """The scope's server: its files, its access rules, and its answers to messages."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A scope's view of a recording: no window loses a peak; the trigger's edge."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The serial link over pseudo terminals: framing, damage on the line, whole runs."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Events with a synchro-check: the grid's breaker of one converter, and the black start."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

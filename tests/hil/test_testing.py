@@ -1,7 +1,5 @@
 """The pytest plugin: a user's project, made in a folder and run by pytest itself."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

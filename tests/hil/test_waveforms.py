@@ -1,7 +1,5 @@
 """The three phases of recorded runs, against phasors, single-phase circuits and the recording."""
 
-from __future__ import annotations
-
 import cmath
 import csv
 import math

@@ -1,7 +1,5 @@
 """The XCP slave: packets by the tables of ASAM MCD-1 XCP, and pyxcp as the master of a run."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil

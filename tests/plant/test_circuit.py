@@ -1,7 +1,5 @@
 """The modes of a circuit: its motion is that of its differential equations, however it is drawn."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

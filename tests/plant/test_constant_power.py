@@ -1,7 +1,5 @@
 """Loads of constant power, against SciPy's DOP853 and against their own derivatives."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Three-phase faults on the line and at the filter capacitor, and their clearing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

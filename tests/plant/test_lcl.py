@@ -1,7 +1,5 @@
 """The second inductor of a filter: between its capacitor and the point of connection."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Synchronous machines: the classical model, against SciPy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

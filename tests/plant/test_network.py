@@ -1,7 +1,5 @@
 """Several converters in one network, against SciPy and against networks that are the same."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The bridge's peak-current limit: within the limit while the DC voltage can hold it there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

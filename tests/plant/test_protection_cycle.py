@@ -1,7 +1,5 @@
 """Protection by quantities over one cycle: overload profile and measured frequency."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

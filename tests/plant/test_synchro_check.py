@@ -1,7 +1,5 @@
 """The synchro-check of a breaker, against phasors solved by NumPy and the closed form of a slip."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

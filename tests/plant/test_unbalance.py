@@ -1,7 +1,5 @@
 """Unbalanced voltages of the grid: their sequences, and what the network makes of them."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Faults of one and two phases, against the equations of three phases and sequence networks."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """A program behind a guard: how it ends, what it leaves, what it prints."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The functions of a tick are compiled without numba's runtime."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """The controller's tick: states, checks, set-points, changes of law, scheduling."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

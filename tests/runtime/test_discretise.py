@@ -1,7 +1,5 @@
 """Tustin's discretisation and the kernel against SciPy, and the checks that reject a law."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

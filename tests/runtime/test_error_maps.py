@@ -1,7 +1,5 @@
 """The error maps against closed forms in extended precision."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

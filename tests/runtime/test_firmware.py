@@ -1,7 +1,5 @@
 """Firmware without a compiler: the text, the golden rows, the report, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Calibration files of firmware: what nm, another reader of DWARF and an A2L parser say of them."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

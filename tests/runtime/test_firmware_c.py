@@ -1,7 +1,5 @@
 """Firmware compiled: every bit of every law on this machine and on processors in QEMU."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import subprocess

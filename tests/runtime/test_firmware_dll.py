@@ -3,8 +3,6 @@
 The layout below is the interface's (natural alignment), not read from our header.
 """
 
-from __future__ import annotations
-
 import ctypes as c
 import os
 import shutil

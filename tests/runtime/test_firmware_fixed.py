@@ -1,7 +1,5 @@
 """Firmware in fixed point: ranges and bounds against float64, bits on targets, the proof by EVA."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

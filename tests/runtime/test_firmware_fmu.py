@@ -1,7 +1,5 @@
 """Laws as FMUs, validated and stepped by FMPy: the kernel's bits, states, and what they refuse."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path

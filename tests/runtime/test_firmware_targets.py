@@ -1,7 +1,5 @@
 """Firmware on processors in QEMU: every bit of every law, and counts that are kept."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Python functions as C: what becomes of them, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

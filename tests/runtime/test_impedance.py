@@ -1,7 +1,5 @@
 """The estimate of the grid's reactance from synthetic swings."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

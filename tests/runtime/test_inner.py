@@ -1,7 +1,5 @@
 """The inner stage against what is known from outside: SciPy, closed forms, its own limits."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from dataclasses import replace

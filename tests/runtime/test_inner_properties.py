@@ -1,7 +1,5 @@
 """What the inner stage keeps for every measurement that a controller accepts, and in float32."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The kernel's step: precision, layout, memory, limits and anti-windup."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The laws with tuned gains: not in the catalogue's list, but available by name."""
 
-from __future__ import annotations
-
 import pytest
 
 from gfm_runtime import LawError, discretise, law_file, law_names, load_law, tuned_names

@@ -1,7 +1,5 @@
 """Law files: values are read as written, and every mistake gives one clear line."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from typing import Any

@@ -1,7 +1,5 @@
 """Gain scheduling: stages over the estimated reactance, hysteresis, dwell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

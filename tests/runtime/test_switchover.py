@@ -1,7 +1,5 @@
 """A change of law: no bump, the trend continues, the remaining difference decays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

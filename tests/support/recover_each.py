@@ -6,8 +6,6 @@ each line of its input, the words of a command in JSON. For each it prints a lin
 said.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
