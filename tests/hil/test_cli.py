@@ -329,6 +329,13 @@ def test_unknown_options_are_refused_with_the_one_that_was_meant(capsys):
     assert capsys.readouterr().err == "gfmhil: --zzz 3: gfmhil run does not know it\n"
     assert main(["firmware", "export", "vsg-1", "--reel", "float32", "-o", "x"]) == 2
     assert "does not know it; did you mean '--real'?" in capsys.readouterr().err
+    assert main(["design", "poles", "own.toml"]) == 2
+    assert "--law own.toml" in capsys.readouterr().err
+    assert main(["run", "virtual", "P_ref=0.8"]) == 2
+    assert "a scenario's file says such values" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["design", "pole"])
+    assert "did you mean 'poles'?" in capsys.readouterr().err
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():
