@@ -39,11 +39,7 @@ class Experiment(Steps):
         self._judge(w.name, "settles", checks.settles(w, to, within, tolerance))
 
     def assert_overshoot_below(
-        self,
-        signal: str,
-        percent: float,
-        to: float | None = None,
-        since: float | None = None,
+        self, signal: str, percent: float, to: float | None = None, since: float | None = None
     ) -> None:
         """After the last step the signal exceeds ``to`` (by default its final value) by at most
         ``percent`` of its step."""

@@ -30,13 +30,7 @@ from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import Case, scenario_of
 from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
-from gfm_hil.studies.workers import (
-    RunFailed,
-    Watch,
-    WorkerLost,
-    pool_of,
-    run_tasks,
-)
+from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 

@@ -98,10 +98,7 @@ def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
 
 
 def draw_matrix(
-    path: Path,
-    laws: Sequence[str],
-    tests: Sequence[str],
-    cells: Mapping[tuple[str, str], str],
+    path: Path, laws: Sequence[str], tests: Sequence[str], cells: Mapping[tuple[str, str], str]
 ) -> None:
     """Draw laws × tests, each cell with the colour and the sign of its verdict."""
     size = 3.0 + 0.3 * len(tests), 3.2 + 0.3 * len(laws)

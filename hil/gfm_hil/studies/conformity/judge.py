@@ -11,10 +11,7 @@ from gfm_hil.studies.conformity.verdict import CANNOT, Verdict
 
 
 def judge(
-    run: Run,
-    criteria: Sequence[Clause],
-    under: UnderTest,
-    others: Mapping[str, Run] | None = None,
+    run: Run, criteria: Sequence[Clause], under: UnderTest, others: Mapping[str, Run] | None = None
 ) -> list[Verdict]:
     """The verdicts of all criteria, each at each of its times.
 

@@ -90,12 +90,7 @@ class Moment:
     """
 
     def __init__(
-        self,
-        run: Run,
-        under: UnderTest,
-        others: Mapping[str, Run],
-        clause: Clause,
-        at: float,
+        self, run: Run, under: UnderTest, others: Mapping[str, Run], clause: Clause, at: float
     ) -> None:
         self.run, self.under, self.others, self.clause = run, under, others, clause
         self.T_s = run.scenario.T_s

@@ -13,14 +13,7 @@ from pydantic import Field, model_validator
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.conformity.criteria.base import Clause
-from gfm_hil.studies.conformity.verdict import (
-    CANNOT,
-    FAIL,
-    INFORMATIVE,
-    PASS,
-    Outcome,
-    Verdict,
-)
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 
 if TYPE_CHECKING:
