@@ -1,4 +1,4 @@
-"""From the options of ``gfmhil bench`` to its measurements; checks every option first."""
+"""The options of ``gfmhil bench``, checked, and the measurements that they ask for."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def measurements(options: Namespace) -> list[Measurement]:
         UserError: an option is invalid.
     """
 
+    given = {k: v for k, v in vars(options).items() if v is not None}
+
     def part(kind: str, **changes: Any) -> Measurement:
-        checked = _checked(
-            kind, {k: v for k, v in vars(options).items() if v is not None} | changes
-        )
-        return partial(import_module(f"gfm_hil.bench.{kind}").measure, checked)
+        checked = _checked(kind, given | changes)
+        return partial(import_module(f"{__package__}.{kind}").measure, checked)
 
     if options.kind in KINDS:
         return [part(options.kind)]
@@ -86,8 +86,14 @@ def measurements(options: Namespace) -> list[Measurement]:
 
 def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
     of = options.get
+    links = _split("--links", of("links"))
+    try:
+        for name in links:
+            link_kind(name)
+    except ValueError as problem:
+        raise UserError(f"--links: {problem}") from None
     return BenchOptions(
-        links=_links(of("links")),
+        links=links,
         modes=_split("--mode", of("mode"), MODES) or MODES,
         loads=_split("--load", of("load"), LOADS) or LOADS,
         policies=_policies(of("policy", "auto")),
@@ -109,16 +115,6 @@ def _split(option: str, text: str | None, allowed: Sequence[Any] | None = None) 
         if not name or (allowed is not None and name not in allowed):
             wanted = f"from {', '.join(allowed)}" if allowed is not None else "none empty"
             raise UserError(f"{option} {text!r}: names separated by commas, {wanted}")
-    return names
-
-
-def _links(text: str | None) -> list[str]:
-    names = _split("--links", text)
-    for name in names:
-        try:
-            link_kind(name)
-        except ValueError as problem:
-            raise UserError(f"--links: {problem}") from None
     return names
 
 

@@ -144,8 +144,7 @@ def _ping_python(
             if time.monotonic_ns() - begin > SILENCE_NS:
                 return -1
         now = time.monotonic_ns()
-        took[n] = now - begin
-        begin = now
+        took[n], begin = now - begin, now
         n += 1
     return n
 
