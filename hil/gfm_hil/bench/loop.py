@@ -49,19 +49,13 @@ Beside = Callable[[], AbstractContextManager[None]]
 
 @dataclass
 class _Run:
-    """A run, and in real time the bare loop before and after it.
+    """A run, and in real time the bare loop before and after it."""
 
-    Attributes:
-        timing: columns of timing.npz, without the ticks before the CPU load has settled.
-        scheduling: of the two sides.
-        early: why it ended early; empty if it did not.
-        late: of the bare loop, (2, ticks), ns.
-    """
-
+    # columns of timing.npz, without the ticks before the CPU load has settled
     timing: dict[str, Times]
-    scheduling: list[str]
-    early: str
-    late: Times | None = None
+    scheduling: list[str]  # of the two sides
+    early: str  # why it ended early; empty if it did not
+    late: Times | None = None  # of the bare loop, (2, ticks), ns
 
 
 def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:

@@ -33,28 +33,17 @@ Measurement = Callable[[dict[str, Any], ShowProgress], None]
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to measure; a benchmark uses those that concern it.
+    """What to measure; a benchmark uses those that concern it."""
 
-    Attributes:
-        links, laws: names; no laws: the benchmark's own choice.
-        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
-        loads: idle, or busy: with a CPU load on each processor.
-        policies: scheduling of the two processes, the best one first.
-        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
-        cflags: for the C compiler.
-        seconds: of one round.
-        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
-    """
-
-    links: Sequence[str]
-    modes: Sequence[Mode]
-    loads: Sequence[Load]
-    policies: Sequence[Policy]
-    payload: int
-    laws: Sequence[str]
-    cflags: str
-    seconds: float
-    rounds: int
+    links: Sequence[str]  # names
+    modes: Sequence[Mode]  # lockstep: one round trip after the other; realtime: one every 100 µs
+    loads: Sequence[Load]  # idle, or busy: with a CPU load on each processor
+    policies: Sequence[Policy]  # scheduling of the two processes, the best one first
+    payload: int  # bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back
+    laws: Sequence[str]  # names; none: the benchmark's own choice
+    cflags: str  # for the C compiler
+    seconds: float  # of one round
+    rounds: int  # of each; fewer if they would not end by ``until`` (``time.monotonic``)
     until: float
 
 

@@ -30,30 +30,20 @@ FILES = ("udp", "shm", "iceoryx2", "zmq")
 
 @dataclass(frozen=True)
 class Contender:
-    """One way to send a message there and back.
+    """One way to send a message there and back."""
 
-    Attributes:
-        name: in tables, unique.
-        link: name of the link, or of the transport of C or of another package.
-        endpoint: where both sides meet.
-        end: opens one end that sends these messages; a function of a module. The controller opens
-            its end first.
-        peer: ``ours``, ``C`` or the name of another package.
-        options: of the link.
-        limit: name of the contender in C that it is compared with; its own name for one in C.
-        source: C source of a limit.
-        library: ``source``, compiled.
-    """
-
-    name: str
-    link: str
-    endpoint: str
+    name: str  # in tables, unique
+    link: str  # name of the link, or of the transport of C or of another package
+    endpoint: str  # where both sides meet
+    # opens one end that sends these messages; a function of a module. The controller opens its
+    # end first
     end: Callable[[Contender, Role, Messages], PingPong]
-    peer: str = "ours"
-    options: dict[str, Any] = field(default_factory=dict)
+    peer: str = "ours"  # ``ours``, ``C`` or the name of another package
+    options: dict[str, Any] = field(default_factory=dict)  # of the link
+    # name of the contender in C that it is compared with; its own name for one in C
     limit: str = ""
-    source: Path | None = None
-    library: Path | None = None
+    source: Path | None = None  # C source of a limit
+    library: Path | None = None  # ``source``, compiled
 
     def open(self, role: Role, payload: int) -> PingPong:
         """Open one end, for requests of ``payload`` bytes.

@@ -17,20 +17,14 @@ from gfm_hil.studies.campaign.worker import Record
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of the figure.
+    """One axis of the figure."""
 
-    Attributes:
-        name: the path or sum, as given.
-        label: what is written at the axis.
-        log: drawn over a logarithm.
-        words: the values where they are not numbers; the axis counts them from 0.
-        apart: how far a value may be shifted aside so that equal ones do not hide each other.
-    """
-
-    name: str
-    label: str
-    log: bool = False
+    name: str  # the path or sum, as given
+    label: str  # what is written at the axis
+    log: bool = False  # drawn over a logarithm
+    # the values where they are not numbers; the axis counts them from 0
     words: tuple[str, ...] = ()
+    # how far a value may be shifted aside so that equal ones do not hide each other
     apart: float = 0.0
 
     def values(self, records: Sequence[Record]) -> NDArray[np.float64]:

@@ -82,21 +82,13 @@ class CampaignFile(StrictSchema):
 
 @dataclass(frozen=True)
 class Campaign:
-    """A checked campaign, ready to be sent to workers.
+    """A checked campaign, ready to be sent to workers."""
 
-    Attributes:
-        name: stem of the file.
-        text: the file itself.
-        file: what it says.
-        base: the scenario with ``set`` put in, as plain data.
-        laws: name in the file to what ``load_law`` takes.
-    """
-
-    name: str
-    text: str
-    file: CampaignFile
-    base: dict[str, Any]
-    laws: dict[str, str]
+    name: str  # stem of the file
+    text: str  # the file itself
+    file: CampaignFile  # what it says
+    base: dict[str, Any]  # the scenario with ``set`` put in, as plain data
+    laws: dict[str, str]  # name in the file to what ``load_law`` takes
 
     @cached_property
     def _packed(self) -> bytes:

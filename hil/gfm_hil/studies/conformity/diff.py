@@ -36,22 +36,14 @@ class _Read(BaseModel):
 
 
 class ClauseResult(_Read):
-    """What results.json says of a clause; a part without clauses is one without words.
+    """What results.json says of a clause; a part without clauses is one without words."""
 
-    Attributes:
-        clause, kind: its words and its criterion.
-        verdict: pass, fail, cannot judge or informative.
-        value: measured, in ``unit``, or None.
-        unit: of the value.
-        text: one sentence.
-    """
-
-    clause: str
+    clause: str  # clause, kind: its words and its criterion
     kind: str
-    verdict: Outcome
-    value: float | None
-    unit: str
-    text: str
+    verdict: Outcome  # pass, fail, cannot judge or informative
+    value: float | None  # measured, in ``unit``, or None
+    unit: str  # of the value
+    text: str  # one sentence
 
 
 class _Part(_Read):
@@ -67,39 +59,26 @@ class _Test(_Read):
 
 
 class Results(_Read):
-    """What results.json holds, as far as it is compared.
+    """What results.json holds, as far as it is compared."""
 
-    Attributes:
-        version: of gfmhil.
-        inner: stage of every law, or None.
-        under_test: the converter under test.
-        laws: tests by law and id.
-    """
-
-    version: str
-    inner: str | None
-    under_test: dict[str, Any]
-    laws: dict[str, dict[str, _Test]]
+    version: str  # of gfmhil
+    inner: str | None  # stage of every law, or None
+    under_test: dict[str, Any]  # the converter under test
+    laws: dict[str, dict[str, _Test]]  # tests by law and id
 
 
 @dataclass(frozen=True)
 class ChangedClause:
-    """A clause that is not what it was.
+    """A clause that is not what it was."""
 
-    Attributes:
-        change: worse or better: of its verdict; moved: its value; new, gone: in one report only.
-        law, test, part: where it is.
-        old, new: what the reports say; None where it is missing.
-        counts: whether the new report is worse for it.
-    """
-
+    # worse or better: of its verdict; moved: its value; new, gone: in one report only
     change: Change
-    law: str
+    law: str  # law, test, part: where it is
     test: str
     part: str
-    old: ClauseResult | None
+    old: ClauseResult | None  # old, new: what the reports say; None where it is missing
     new: ClauseResult | None
-    counts: bool
+    counts: bool  # whether the new report is worse for it
 
     @property
     def clause(self) -> ClauseResult:
@@ -129,19 +108,12 @@ class ChangedClause:
 
 @dataclass(frozen=True)
 class ReportDiff:
-    """Two reports beside each other.
+    """Two reports beside each other."""
 
-    Attributes:
-        rows: what changed, the worst first.
-        notes: what differs in how the reports were made, one sentence each.
-        same: how many clauses are what they were.
-        share: by which part of the larger a value had to move.
-    """
-
-    rows: list[ChangedClause]
-    notes: list[str]
-    same: int
-    share: float
+    rows: list[ChangedClause]  # what changed, the worst first
+    notes: list[str]  # what differs in how the reports were made, one sentence each
+    same: int  # how many clauses are what they were
+    share: float  # by which part of the larger a value had to move
 
     @property
     def worse(self) -> bool:

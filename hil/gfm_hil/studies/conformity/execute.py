@@ -40,16 +40,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ControllerUnderTest:
-    """A model as the controller, in place of a law.
+    """A model as the controller, in place of a law."""
 
-    Attributes:
-        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, or ``pil:TARGET`` for the law itself as
-            firmware on a processor.
-        ports: file of the map of its ports.
-    """
-
+    # ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, or ``pil:TARGET`` for the law itself as firmware
+    # on a processor
     model: str
-    ports: Path | None = None
+    ports: Path | None = None  # file of the map of its ports
 
     @property
     def name(self) -> str:
@@ -66,29 +62,20 @@ class ControllerUnderTest:
 
 @dataclass(frozen=True)
 class Job:
-    """A part of a test under a law.
+    """A part of a test under a law."""
 
-    Attributes:
-        law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
-            whose operating point a run begins.
-        case, part: what to run.
-        inner: stage of every law; the law's own if None.
-        under: the converter under test.
-        converters: folder for converter files, which lasts while jobs run.
-        folder: where the scenario and the figure go; None writes neither.
-        figures: whether to draw one.
-        external: the model that computes u in place of the law, or None.
-    """
-
+    # law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
+    # whose operating point a run begins
     law: str
     file: str
-    case: Case
+    case: Case  # case, part: what to run
     part: TestPart
-    inner: str | None
-    under: UnderTest
-    converters: Path
-    folder: Path | None
-    figures: bool
+    inner: str | None  # stage of every law; the law's own if None
+    under: UnderTest  # the converter under test
+    converters: Path  # folder for converter files, which lasts while jobs run
+    folder: Path | None  # where the scenario and the figure go; None writes neither
+    figures: bool  # whether to draw one
+    # the model that computes u in place of the law, or None
     external: ControllerUnderTest | None = None
 
     @property
@@ -99,24 +86,16 @@ class Job:
 
 @dataclass(frozen=True)
 class PartResult:
-    """What became of a part of a test under a law.
+    """What became of a part of a test under a law."""
 
-    Attributes:
-        law, test, part: names; the part of a test without parts is empty.
-        status, reason: how the run ended; ``none`` if it did not take place.
-        verdicts: one a clause and time.
-        again: the command that repeats the run; empty if no scenario was written.
-        figure: if one was drawn.
-    """
-
-    law: str
+    law: str  # law, test, part: names; the part of a test without parts is empty
     test: str
     part: str
-    status: str
+    status: str  # status, reason: how the run ended; ``none`` if it did not take place
     reason: str
-    verdicts: list[Verdict]
-    again: str = ""
-    figure: Picture | None = None
+    verdicts: list[Verdict]  # one a clause and time
+    again: str = ""  # the command that repeats the run; empty if no scenario was written
+    figure: Picture | None = None  # if one was drawn
 
     @property
     def verdict(self) -> Outcome:

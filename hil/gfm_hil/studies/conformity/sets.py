@@ -25,15 +25,10 @@ _FOLDER, _UNDER_TEST = "conformity", "converter.toml"
 
 @dataclass(frozen=True)
 class Case:
-    """A test with where it is from.
+    """A test with where it is from."""
 
-    Attributes:
-        id: set and name, e.g. ``miso/3-phase-jump``.
-        path: of its file.
-    """
-
-    id: str
-    path: Path
+    id: str  # set and name, e.g. ``miso/3-phase-jump``
+    path: Path  # of its file
     test: Test
 
 
