@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
@@ -90,20 +90,14 @@ class ChangedClause:
     @property
     def value(self) -> str:
         """The measured values, ``old → new``."""
-        both = [_value(x) for x in (self.old, self.new)]
-        return " → ".join(both) if both[0] != both[1] else both[0]
+        each = [x and x.value is not None and f"{shown(x.value)} {x.unit}".rstrip()
+                for x in (self.old, self.new)]  # fmt: skip
+        return " → ".join(dict.fromkeys(x or "–" for x in each))
 
     @property
     def verdict(self) -> str:
         """The verdicts, ``old → new``."""
-        both = [x.verdict if x else "–" for x in (self.old, self.new)]
-        return " → ".join(both) if both[0] != both[1] else both[0]
-
-    def plain(self) -> dict[str, Any]:
-        """As data for JSON."""
-        of = {"change": self.change, "counts": self.counts, "law": self.law, "test": self.test}
-        both = {n: x.model_dump() if x else None for n, x in (("old", self.old), ("new", self.new))}
-        return {**of, "part": self.part, **both}
+        return " → ".join(dict.fromkeys(x.verdict if x else "–" for x in (self.old, self.new)))
 
 
 @dataclass(frozen=True)
@@ -129,13 +123,7 @@ class ReportDiff:
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
-        return {
-            "worse": self.worse,
-            "share": self.share,
-            "same": self.same,
-            "notes": self.notes,
-            "rows": [row.plain() for row in self.rows],
-        }
+        return {"worse": self.worse, **TypeAdapter(ReportDiff).dump_python(self)}
 
     def page(self, old: str, new: str) -> str:
         """As an HTML page; the arguments are the reports' names."""
@@ -247,7 +235,3 @@ def _notes(old: Results, new: Results) -> Iterator[str]:
         yield "The converter under test is another one."
     if len(old.laws) == len(new.laws) == 1 and [*old.laws] != [*new.laws]:
         yield f"The law was {next(iter(old.laws))} and is {next(iter(new.laws))}."
-
-
-def _value(of: ClauseResult | None) -> str:
-    return "–" if of is None or of.value is None else f"{shown(of.value)} {of.unit}".rstrip()
