@@ -31,11 +31,8 @@ class NoCompiler(Exception):
 def compile_c(
     source: Path, folder: Path, name: str, flags: str = FLAGS, more: Sequence[Path] = ()
 ) -> Path:
-    """Compile sources into ``folder``/``name``.so by $CC or cc; headers may be there too.
-
-    Raises:
-        NoCompiler: there is none, or it fails.
-    """
+    """Compile sources into ``folder``/``name``.so by $CC or cc; headers may be there too. Raises
+    NoCompiler: there is none, or it fails."""
     compiler, library = os.environ.get("CC", "cc"), folder / f"{name}.so"
     command = [compiler, *shlex.split(flags), *_ALWAYS, f"-I{folder}"]
     command += [str(source), *map(str, more), "-o", str(library), "-lm"]
@@ -81,11 +78,8 @@ class Twin:
 
 
 def compile_twin(folder: Path, names: Sequence[str], real: DTypeLike, flags: str = FLAGS) -> Twin:
-    """Export laws of the catalogue for float64 or float32, and compile them.
-
-    Raises:
-        NoCompiler: there is none, or it fails.
-    """
+    """Export laws of the catalogue for float64 or float32, and compile them. Raises NoCompiler:
+    there is none, or it fails."""
     modules = make_modules({name: get_law(name) for name in names}, T_S, real)
     files = sources(modules, T_S, "records")
     for file, text in files.items():

@@ -117,11 +117,8 @@ class InprocLoop:
             array[:] = start
 
     def whole(self, ticks: int | None = None) -> float:
-        """The closed loop.
-
-        Raises:
-            UserError: the run ended early, so that there is nothing to time.
-        """
+        """The closed loop. Raises UserError: the run ended early, so that there is nothing to
+        time."""
         self._reset()
         b, n = self.bench, ticks or self.ticks
         done, controllers = 0, stack([b])
@@ -161,11 +158,8 @@ class InprocLoop:
 def measure_laws(
     laws: Sequence[str], rounds: int, folder: Path, show: ShowProgress
 ) -> Iterator[dict[str, Any]]:
-    """ns per tick of laws and of the rig, one row each; ``folder`` is for the recordings.
-
-    Raises:
-        UserError: a run ended early, so that there is nothing to time.
-    """
+    """ns per tick of laws and of the rig, one row each; ``folder`` is for the recordings. Raises
+    UserError: a run ended early, so that there is nothing to time."""
     runs = {name: ("pref_step", name) for name in laws or LAWS}
     runs[RIG] = ("rig_pref_step", "mimo-gfm")
     for k, (name, (scenario, law)) in enumerate(runs.items()):

@@ -49,11 +49,8 @@ class Pair:
         return {s: _wait(future) for s, future in futures.items()}
 
     def open(self, contender: Contender, payload: int) -> bool:
-        """Open a contender's ends; returns whether its loops are compiled.
-
-        Raises:
-            UserError: it cannot be opened.
-        """
+        """Open a contender's ends; returns whether its loops are compiled. Raises UserError: it
+        cannot be opened."""
         for role in ROLES:
             compiled = _wait(self._pools[role].submit(_open, contender, payload))
         return bool(compiled)

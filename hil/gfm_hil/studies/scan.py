@@ -362,11 +362,7 @@ def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float
 def _bands(
     start_hz: float, stop_hz: float, points: int, T_s: float, window_s: float
 ) -> list[_Band]:
-    """The tones by decade.
-
-    Raises:
-        UserError: a value that cannot be.
-    """
+    """The tones by decade. Raises UserError: a value that cannot be."""
     top = 0.45 / T_s
     if not 0.01 <= start_hz < stop_hz <= top:
         raise UserError(
@@ -444,11 +440,8 @@ def _omega_b(scenario: Scenario) -> float:
 def _inject(
     scenario: Scenario, plan: _Plan, axis: str, external: tuple[str, ...]
 ) -> tuple[_Spectra, dict[str, Any]]:
-    """The spectra of a run with the injection along one axis, and its summary.
-
-    Raises:
-        UserError: the run did not complete.
-    """
+    """The spectra of a run with the injection along one axis, and its summary. Raises UserError:
+    the run did not complete."""
     grid, T_s = scenario.plant.grid, scenario.T_s
     starts, events = plan.starts(), []
     with tempfile.TemporaryDirectory(prefix="gfmhil-scan-") as place:
@@ -501,11 +494,8 @@ class _Spectra:
 
     @classmethod
     def of(cls, run: Run, plan: _Plan) -> _Spectra:
-        """Those of a run.
-
-        Raises:
-            UserError: the circuit's states do not follow the commands: a limit acts.
-        """
+        """Those of a run. Raises UserError: the circuit's states do not follow the commands: a
+        limit acts."""
         path = _Path.of(run)
         parts, ends = [], 0.0
         for first, settle, band in zip(plan.starts(), plan.settle, plan.bands, strict=False):
@@ -580,11 +570,8 @@ class _Path:
         return float(self.delta[window].mean())
 
     def check(self, window: slice) -> None:
-        """Compare each state with what the circuit makes of the one before.
-
-        Raises:
-            UserError: they differ: a limit of the bridge acts.
-        """
+        """Compare each state with what the circuit makes of the one before. Raises UserError: they
+        differ: a limit of the bridge acts."""
         z = self.w[window] @ self.modes.T
         for _, length, at, speeds in self.stretches:
             z = z * np.exp(self.rates * length)

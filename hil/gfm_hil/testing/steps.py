@@ -35,11 +35,8 @@ class StepPlan:
         self._steps: list[Any] = []
 
     def step(self, kind: str, /, **fields: Any) -> None:
-        """Add an event at the present tick, after the ticks planned so far.
-
-        Raises:
-            UserError: a scenario cannot have such an event.
-        """
+        """Add an event at the present tick, after the ticks planned so far. Raises UserError: a
+        scenario cannot have such an event."""
         given = {name: value for name, value in fields.items() if value is not None}
         try:
             event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
@@ -69,11 +66,8 @@ class StepPlan:
         return sorted((e for e in every if e.at(T_s) < ticks), key=lambda e: e.at(T_s))
 
     def scenario(self, ticks: int) -> Scenario:
-        """The first ``ticks`` ticks as a scenario.
-
-        Raises:
-            UserError: a step is impossible, for example its law does not exist.
-        """
+        """The first ``ticks`` ticks as a scenario. Raises UserError: a step is impossible, for
+        example its law does not exist."""
         content = self.base.model_dump(exclude_none=True)
         content["duration"] = ticks * self.base.T_s
         content["events"] = [e.model_dump(exclude_none=True) for e in self.events(ticks)]

@@ -46,11 +46,8 @@ class Contender:
     library: Path | None = None  # ``source``, compiled
 
     def open(self, role: Role, payload: int) -> PingPong:
-        """Open one end, for requests of ``payload`` bytes.
-
-        Raises:
-            UserError: it cannot be opened here.
-        """
+        """Open one end, for requests of ``payload`` bytes. Raises UserError: it cannot be opened
+        here."""
         return self.end(self, role, messages(role, payload))
 
 

@@ -25,11 +25,8 @@ def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    """A socket with the link's options, of the library that pyzmq has loaded.
-
-    Raises:
-        UserError: its functions cannot be found.
-    """
+    """A socket with the link's options, of the library that pyzmq has loaded. Raises UserError: its
+    functions cannot be found."""
     import zmq
     from zmq.backend.cython import _zmq
 

@@ -40,11 +40,8 @@ FORMATS = {
 
 
 def check_format(name: str) -> None:
-    """See that a format is there and can be written here.
-
-    Raises:
-        UserError: it is none, or its package is not installed.
-    """
+    """See that a format is there and can be written here. Raises UserError: it is none, or its
+    package is not installed."""
     if name not in FORMATS:
         raise UserError(f"--format {name}: must be one of {', '.join(FORMATS)}")
     needs = FORMATS[name].needs

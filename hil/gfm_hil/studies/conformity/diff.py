@@ -133,11 +133,8 @@ class ReportDiff:
 
 
 def read_results(path: str | Path) -> Results:
-    """A report's results.json, or that in a report's folder.
-
-    Raises:
-        UserError: it cannot be read, or is none.
-    """
+    """A report's results.json, or that in a report's folder. Raises UserError: it cannot be read,
+    or is none."""
     file = Path(path)
     file = file / "results.json" if file.is_dir() else file
     try:

@@ -52,11 +52,8 @@ class ControllerUnderTest:
 
     @property
     def name(self) -> str:
-        """What reports call it: its kind and the name of its file, or of its target.
-
-        Raises:
-            UserError: there is no such file.
-        """
+        """What reports call it: its kind and the name of its file, or of its target. Raises
+        UserError: there is no such file."""
         if self.model.startswith(PIL):
             return self.model
         kind, path = controller_file(self.model)
@@ -136,11 +133,8 @@ class PartResult:
 
 
 def external_controller(model: str | None, ports: str | Path | None) -> ControllerUnderTest | None:
-    """The model that a user names, checked as far as that goes without loading it.
-
-    Raises:
-        UserError: there is no such file, the map is none, or there is a map but no model.
-    """
+    """The model that a user names, checked as far as that goes without loading it. Raises
+    UserError: there is no such file, the map is none, or there is a map but no model."""
     if model is None:
         if ports is not None:
             raise UserError(f"map {ports}: is of a controller; name it too")
@@ -248,11 +242,7 @@ def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
 
 
 def _scenario(job: Job) -> Scenario:
-    """The scenario of a job.
-
-    Raises:
-        UserError: it cannot be run.
-    """
+    """The scenario of a job. Raises UserError: it cannot be run."""
     found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
     if job.external is None:
         return found
@@ -262,11 +252,8 @@ def _scenario(job: Job) -> Scenario:
 
 
 def run_part(job: Job) -> PartResult:
-    """Run, judge and draw a part; what cannot be run cannot be judged.
-
-    Raises:
-        RunFailed: an error of the program; the message names law and test.
-    """
+    """Run, judge and draw a part; what cannot be run cannot be judged. Raises RunFailed: an error
+    of the program; the message names law and test."""
     try:
         return _run_part(job)
     except Exception as problem:

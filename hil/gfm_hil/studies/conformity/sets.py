@@ -211,11 +211,8 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
 
 
 def load_under_test(given: str | Path | None) -> UnderTest:
-    """The converter under test, of a file; the shipped one if None.
-
-    Raises:
-        UserError: one line per mistake.
-    """
+    """The converter under test, of a file; the shipped one if None. Raises UserError: one line per
+    mistake."""
     if given is None:
         shipped = [root / _FOLDER / _UNDER_TEST for root in SCENARIO_FOLDERS]
         given = next(path for path in shipped if path.is_file())

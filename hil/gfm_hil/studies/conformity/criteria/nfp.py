@@ -67,11 +67,7 @@ class Nfp(Clause):
         return self
 
     def scan(self, scenario: Scenario, controller_command: Sequence[str]) -> FrequencyScan:
-        """Measure the plot.
-
-        Raises:
-            UserError: as ``measure_admittance``.
-        """
+        """Measure the plot. Raises UserError: as ``measure_admittance``."""
         return measure_admittance(
             scenario, start_hz=self.from_hz, stop_hz=self.to_hz, points=self.points,
             controller_command=controller_command,
