@@ -147,10 +147,10 @@ def put(content: dict[str, Any], path: str, value: Any) -> None:
     place: Any = content
     keys = path.split(".")
     for depth, key in enumerate(keys, 1):
-        is_last, where = depth == len(keys), ".".join(keys[: depth - 1])
-        where = repr(where) if where else "the scenario"
+        is_last, above = depth == len(keys), ".".join(keys[: depth - 1])
+        at: Any = key
         if isinstance(place, dict):
-            there, at = key in place or (is_last and depth > 1), key
+            there = key in place or (is_last and depth > 1)
             holds = f"holds {', '.join(place) or 'nothing'}"
         elif isinstance(place, list):
             there = key in map(str, range(len(place)))
@@ -159,6 +159,7 @@ def put(content: dict[str, Any], path: str, value: Any) -> None:
         else:
             there, holds = False, f"is {place!r} and holds nothing"
         if not there:
+            where = repr(above) if above else "the scenario"
             raise KeyError(f"path {path!r}: {where} {holds}")
         if is_last:
             place[at] = value
