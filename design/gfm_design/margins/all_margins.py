@@ -47,21 +47,16 @@ class ChannelMargins:
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """The margins of a loop at one operating point.
+    """The margins of a loop at one operating point."""
 
-    Attributes:
-        worst: the mode that is damped least, its damping ratio the smallest.
-        u, y: each channel that the loop uses.
-        disk_u, disk_y: all channels of u, of y at once.
-        delay: additional delay of all of u; the scan ended at ``longest``, s.
-    """
-
-    worst: Mode
+    worst: Mode  #: the mode that is damped least, its damping ratio the smallest
+    #: u, y: each channel that the loop uses
     u: tuple[ChannelMargins, ...]
     y: tuple[ChannelMargins, ...]
+    #: disk_u, disk_y: all channels of u, of y at once
     disk_u: DiskMargin
     disk_y: DiskMargin
-    delay: DelayMargin
+    delay: DelayMargin  #: additional delay of all of u; the scan ended at ``longest``, s
     longest: float
 
 

@@ -24,23 +24,17 @@ _NO_LIMIT = 1e6  # a larger gain factor is due to rounding
 
 @dataclass(frozen=True)
 class GainPhase:
-    """Margins of one loop.
+    """Margins of one loop."""
 
-    Attributes:
-        gain_low, gain_high: factors between which the loop gain may go; 0 and inf: no limit.
-        gain_low_hz, gain_high_hz: frequency of the mode that becomes unstable there, Hz.
-        phase_deg: the smallest lag or lead that makes the loop unstable; inf: there is none.
-        phase_hz: frequency of the mode that becomes unstable then, Hz.
-        disk: disk margin of this loop alone (skew 0), at most 2.
-    """
-
+    #: gain_low, gain_high: factors between which the loop gain may go; 0 and inf: no limit
     gain_low: float
+    #: gain_low_hz, gain_high_hz: frequency of the mode that becomes unstable there, Hz
     gain_low_hz: float
     gain_high: float
     gain_high_hz: float
-    phase_deg: float
-    phase_hz: float
-    disk: float
+    phase_deg: float  #: the smallest lag or lead that makes the loop unstable; inf: there is none
+    phase_hz: float  #: frequency of the mode that becomes unstable then, Hz
+    disk: float  #: disk margin of this loop alone (skew 0), at most 2
 
 
 def gain_phase(locus: Locus, omega: Vector, H: NDArray[np.complex128], k: int) -> GainPhase:

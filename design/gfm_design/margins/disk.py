@@ -31,17 +31,11 @@ _LOOKS = 6
 
 @dataclass(frozen=True)
 class DiskMargin:
-    """Multivariable disk margin at one cut.
+    """Multivariable disk margin at one cut."""
 
-    Attributes:
-        alpha: at least this, at most 2.
-        frequency_hz: where the bound is smallest, Hz.
-        full: the guaranteed smaller one that ignores the structure.
-    """
-
-    alpha: float
-    frequency_hz: float
-    full: float
+    alpha: float  #: at least this, at most 2
+    frequency_hz: float  #: where the bound is smallest, Hz
+    full: float  #: the guaranteed smaller one that ignores the structure
 
     @property
     def gain(self) -> tuple[float, float]:

@@ -32,34 +32,21 @@ _LAST_ADDRESS = 2**32 - 1
 
 @dataclass(frozen=True)
 class Entry:
-    """One number, or one array of numbers, in a memory.
+    """One number, or one array of numbers, in a memory."""
 
-    Attributes:
-        name: of the entry, unique; parts of a struct are joined by dots.
-        text: what it is, one line.
-        kind: a key of ``TYPES``.
-        address: of its first byte.
-        unit: with its base, e.g. ``p.u. (S_n)``; empty for a number without one.
-        low, high: plausible range; the whole range of its type if None.
-        shape: of an array in C's order; empty for a number.
-        words: meanings of the values of a code.
-        symbol: how C names it, e.g. ``law.u[0]``; empty if no program has it.
-        calibrated: whether a tool may write it (a CHARACTERISTIC), or only measure it.
-        fixed: of what is calibrated: lies in memory that cannot be written.
-    """
-
-    name: str
-    text: str
-    kind: str
-    address: int
-    unit: str = ""
+    name: str  #: of the entry, unique; parts of a struct are joined by dots
+    text: str  #: what it is, one line
+    kind: str  #: a key of ``TYPES``
+    address: int  #: of its first byte
+    unit: str = ""  #: with its base, e.g. ``p.u. (S_n)``; empty for a number without one.
+    #: low, high: plausible range; the whole range of its type if None
     low: float | None = None
     high: float | None = None
-    shape: tuple[int, ...] = ()
-    words: tuple[tuple[int, str], ...] = ()
-    symbol: str = ""
-    calibrated: bool = False
-    fixed: bool = False
+    shape: tuple[int, ...] = ()  #: of an array in C's order; empty for a number
+    words: tuple[tuple[int, str], ...] = ()  #: meanings of the values of a code
+    symbol: str = ""  #: how C names it, e.g. ``law.u[0]``; empty if no program has it.
+    calibrated: bool = False  #: whether a tool may write it (a CHARACTERISTIC), or only measure it
+    fixed: bool = False  #: of what is calibrated: lies in memory that cannot be written
 
 
 def unit_of(signal: Signal) -> str:

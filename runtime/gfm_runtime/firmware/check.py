@@ -38,31 +38,19 @@ _TIMEOUT_S = 300
 
 @dataclass(frozen=True)
 class Target:
-    """A compiler and where its programs run.
+    """A compiler and where its programs run."""
 
-    Attributes:
-        what: in words.
-        prefix: of the compiler and its tools.
-        compiler: the compiler's name after the prefix.
-        packages: from apt, for the compiler and the machine.
-        flags: for the processor.
-        link: for the linker.
-        machine: QEMU's command, or () for this machine.
-        order: of bytes, as numpy has it.
-        tick_ns: of the clock that counts instructions; 0 for QEMU in user mode, which has none.
-        real: float32 if that is all that its floating-point unit has.
-    """
-
-    what: str
-    prefix: str
-    compiler: str
-    packages: str
-    flags: tuple[str, ...] = ()
-    link: tuple[str, ...] = ()
-    machine: tuple[str, ...] = ()
+    what: str  #: in words
+    prefix: str  #: of the compiler and its tools
+    compiler: str  #: the compiler's name after the prefix
+    packages: str  #: from apt, for the compiler and the machine
+    flags: tuple[str, ...] = ()  #: for the processor
+    link: tuple[str, ...] = ()  #: for the linker
+    machine: tuple[str, ...] = ()  #: QEMU's command, or () for this machine
+    #: of the clock that counts instructions; 0 for QEMU in user mode, which has none
     tick_ns: int = 0
-    real: str = "float64"
-    order: Literal["<", ">"] = "<"
+    real: str = "float64"  #: float32 if that is all that its floating-point unit has
+    order: Literal["<", ">"] = "<"  #: of bytes, as numpy has it
 
     @property
     def run(self) -> list[str]:
@@ -146,28 +134,19 @@ TARGETS = {
 
 @dataclass(frozen=True)
 class Checked:
-    """What a law gave on a target.
+    """What a law gave on a target."""
 
-    Attributes:
-        name: the law.
-        rows: golden rows that it was stepped through.
-        differ: words of outputs and state, over all rows, that are not the kernel's.
-        instructions: fewest and most of a step, or None where they are not counted.
-        checks: instructions of these that check whether y and ref are in range, or None.
-        code, constants: bytes of the law's object file.
-        state: bytes of one instance.
-        stack: bytes that a step needs at most, or None where the compiler does not say.
-    """
-
-    name: str
-    rows: int
-    differ: int
+    name: str  #: the law
+    rows: int  #: golden rows that it was stepped through
+    differ: int  #: words of outputs and state, over all rows, that are not the kernel's
+    #: fewest and most of a step, or None where they are not counted
     instructions: tuple[int, int] | None
-    checks: int | None
+    checks: int | None  #: instructions of these that check whether y and ref are in range, or None
+    #: code, constants: bytes of the law's object file
     code: int
     constants: int
-    state: int
-    stack: int | None
+    state: int  #: bytes of one instance
+    stack: int | None  #: bytes that a step needs at most, or None where the compiler does not say
 
     @property
     def law_and_limits(self) -> tuple[int, int]:

@@ -58,14 +58,10 @@ Vector = NDArray[np.float64]
 
 
 class Deviation(NamedTuple):
-    """Of one output from its value in float64.
+    """Of one output from its value in float64."""
 
-    Attributes:
-        bound: p.u., for ever if the drift is 0.
-        drift: p.u. a tick at most, to be added for each tick since the start or the last settle.
-    """
-
-    bound: float
+    bound: float  #: p.u., for ever if the drift is 0
+    #: p.u. a tick at most, to be added for each tick since the start or the last settle.
     drift: float
 
     def after(self, ticks: float) -> float:

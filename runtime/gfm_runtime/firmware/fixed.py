@@ -46,16 +46,11 @@ OMEGA = 2  # column of y that is the law's own omega_u
 
 
 class Number(NamedTuple):
-    """An int32 of the C code.
+    """An int32 of the C code."""
 
-    Attributes:
-        text: in C.
-        q: its value is the integer times 2^-q, in p.u.
-        low, high: the integers between which it stays.
-    """
-
-    text: str
-    q: int
+    text: str  #: in C
+    q: int  #: its value is the integer times 2^-q, in p.u.
+    #: low, high: the integers between which it stays
     low: int
     high: int
 
@@ -66,52 +61,35 @@ class Number(NamedTuple):
 
 
 class Sum(NamedTuple):
-    """A sum of products at one exponent.
+    """A sum of products at one exponent."""
 
-    Attributes:
-        e: its value is the integer times 2^-e.
-        start: the constant.
-        terms: coefficient and place of each number; none is 0.
-        meant: the coefficients in real numbers by place, those that round to 0 too.
-        meant_start: the constant in real numbers.
-    """
-
-    e: int
-    start: int
-    terms: tuple[tuple[int, int], ...]
+    e: int  #: its value is the integer times 2^-e
+    start: int  #: the constant
+    terms: tuple[tuple[int, int], ...]  #: coefficient and place of each number; none is 0
+    #: the coefficients in real numbers by place, those that round to 0 too
     meant: Mapping[int, float]
-    meant_start: float
+    meant_start: float  #: the constant in real numbers
 
 
 @dataclass(frozen=True)
 class FixedLaw:
-    """A law's numbers and sums.
+    """A law's numbers and sums."""
 
-    Attributes:
-        n: states.
-        numbers: of a tick, by place (REF, Y, ...); a place without a number has None.
-        low, high: limits of u, as integers of u.
-        output: u before its limits, at each row's exponent.
-        state: increments of x.
-        decay, follow: increments of the offset and of the trend.
-        settle: x at a bumpless change.
-        last: u of the tick before a bumpless change.
-        error_map: its code.
-        across: of hybrid-angle, for the references and for the measurements.
-    """
-
-    n: int
+    n: int  #: states
+    #: of a tick, by place (REF, Y, ...); a place without a number has None
     numbers: tuple[Number, ...]
+    #: low, high: limits of u, as integers of u
     low: tuple[int, ...]
     high: tuple[int, ...]
-    output: tuple[Sum, ...]
-    state: tuple[Sum, ...]
+    output: tuple[Sum, ...]  #: u before its limits, at each row's exponent
+    state: tuple[Sum, ...]  #: increments of x
+    #: decay, follow: increments of the offset and of the trend
     decay: tuple[Sum, ...]
     follow: tuple[Sum, ...]
-    settle: tuple[Sum, ...]
-    last: tuple[Sum, ...]
-    error_map: int
-    across: tuple[Across, ...] = ()
+    settle: tuple[Sum, ...]  #: x at a bumpless change
+    last: tuple[Sum, ...]  #: u of the tick before a bumpless change
+    error_map: int  #: its code
+    across: tuple[Across, ...] = ()  #: of hybrid-angle, for the references and for the measurements
 
     def shift(self, total: Sum, place: int) -> int:
         """Bits from a sum to the number at a place."""

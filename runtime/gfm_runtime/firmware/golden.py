@@ -60,16 +60,12 @@ Inputs = tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]
 
 @dataclass(frozen=True)
 class Golden:
-    """Golden rows of a set of laws.
+    """Golden rows of a set of laws."""
 
-    Attributes:
-        words: shape (rows, columns), uint32 or uint64.
-        columns: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the
-            law's u of the last tick), trend_*; with an inner stage its variables, and limited; in
-            fixed point the rests, 31 lower bits and what is above.
-    """
-
-    words: NDArray[Any]
+    words: NDArray[Any]  #: shape (rows, columns), uint32 or uint64
+    #: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the law's u of
+    #: the last tick), trend_*; with an inner stage its variables, and limited; in fixed point the
+    #: rests, 31 lower bits and what is above
     columns: tuple[str, ...]
 
     def csv(self) -> str:

@@ -30,17 +30,12 @@ TO, FROM = "to", "from"
 
 @dataclass(frozen=True)
 class LoopProgram:
-    """A program, built.
+    """A program, built."""
 
-    Attributes:
-        target: where it runs.
-        folder: where it lies, and in which its pipes have to be.
-        request, state, answer: of what goes over the pipes; a state follows each START, a golden
-            row each CHECK.
-    """
-
-    target: Target
-    folder: Path
+    target: Target  #: where it runs
+    folder: Path  #: where it lies, and in which its pipes have to be
+    #: request, state, answer: of what goes over the pipes; a state follows each START, a golden row
+    #: each CHECK
     request: np.dtype[Any]
     state: np.dtype[Any]
     answer: np.dtype[Any]

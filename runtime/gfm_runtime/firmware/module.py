@@ -90,21 +90,14 @@ def fields(stages: bool, fixed: bool = False) -> tuple[tuple[str, ...], tuple[st
 
 @dataclass(frozen=True)
 class Module:
-    """A law on its way to C.
+    """A law on its way to C."""
 
-    Attributes:
-        name: the law's name, with its stage if it has several.
-        law: the law itself; None for one that was read back from a report.
-        record: the law as ``pack_law`` gives it.
-        stages: whether a law of its folder has an inner stage: y has 11 signals then, and u 4.
-        fixed: the law in fixed point; None in a floating-point precision.
-    """
-
-    name: str
-    law: Law | None
-    record: np.void
+    name: str  #: the law's name, with its stage if it has several
+    law: Law | None  #: the law itself; None for one that was read back from a report
+    record: np.void  #: the law as ``pack_law`` gives it
+    #: whether a law of its folder has an inner stage: y has 11 signals then, and u 4
     stages: bool = False
-    fixed: FixedLaw | None = None
+    fixed: FixedLaw | None = None  #: the law in fixed point; None in a floating-point precision
 
     @property
     def prefix(self) -> str:

@@ -28,19 +28,12 @@ OPTIONS = ("-eva", "-eva-slevel", "20", "-eva-auto-loop-unroll", "32", "-eva-spl
 
 @dataclass(frozen=True)
 class Proved:
-    """What EVA says of a law.
+    """What EVA says of a law."""
 
-    Attributes:
-        name: the law.
-        alarms: what it could not prove.
-        functions: how many it went through: all of the law and of the harness.
-        seconds: what it took.
-    """
-
-    name: str
-    alarms: int
-    functions: int
-    seconds: float
+    name: str  #: the law
+    alarms: int  #: what it could not prove
+    functions: int  #: how many it went through: all of the law and of the harness
+    seconds: float  #: what it took
 
 
 def files_of(module: Module) -> tuple[str, str]:
