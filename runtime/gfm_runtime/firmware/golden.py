@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.firmware.fixed import REFS, YS
-from gfm_runtime.firmware.fixed_tick import Instance, bump_of, refusal, to_integers
+from gfm_runtime.firmware.fixed import REFS, YS, Instance, bump_of, refusal, to_integers
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
 from gfm_runtime.kernel import (

@@ -18,8 +18,7 @@ import numpy as np
 from gfm_runtime.error_maps import DVOC
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal
-from gfm_runtime.firmware.deviation import NEAR, deviations
-from gfm_runtime.firmware.fixed import FIXED, G_MOST, FixedLaw, make_fixed
+from gfm_runtime.firmware.fixed import FIXED, G_MOST, NEAR, FixedLaw, deviations, make_fixed
 from gfm_runtime.firmware.module import (
     REALS,
     STYLES,
