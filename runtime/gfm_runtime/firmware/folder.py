@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from gfm_runtime.catalogue import LawSet
@@ -76,14 +75,13 @@ def export(
 
 def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
-    adapters, table, names, sizes = [], [], [], []
+    adapters, table, own = [], [], style == "unrolled"
     parts = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     choices = {"stages": stages, "fixed": fixed}
     e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
-        own = style == "unrolled"
         keys = {
             "P": m.prefix,
             "T": m.prefix if own else "gfm",
@@ -94,8 +92,6 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         }
         adapters.append(filled(chosen(template("adapter.c"), choices), keys))
         table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
-        names.append(f'    "{m.prefix}",')
-        sizes.append(f"    sizeof({keys['T']}_t),")
     states = max([1, *(m.n for m in modules)])
     keys = {
         "MADE": MADE,
@@ -112,8 +108,8 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
         "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",
         "TABLE": "\n".join(table),
-        "NAMES": "\n".join(names),
-        "SIZES": "\n".join(sizes),
+        "NAMES": "\n".join(f'    "{m.prefix}",' for m in modules),
+        "SIZES": "\n".join(f"    sizeof({m.prefix if own else 'gfm'}_t)," for m in modules),
     }
     return {
         name: filled(chosen(template(name), choices), keys) for name in ("selftest.h", "selftest.c")
@@ -148,4 +144,4 @@ def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -
     root = bool(choosing) or style == "records"  # whether a step takes a square root
     root = root or any(not m.fixed and (m.stages or m.tick.operations()["sqrt"]) for m in modules)
     keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
-    return re.sub(r"@(MADE|SOURCES|LIBM)@", lambda f: keys[f[1]], template("CMakeLists.txt"))
+    return filled(template("CMakeLists.txt"), keys)
