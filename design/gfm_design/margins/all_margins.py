@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gfm_design.margins.classical import GainPhase, gain_phase
 from gfm_design.margins.delays import DelayMargin, DelayMargins, longest
-from gfm_design.margins.disk import DiskMargin, disk_margin
-from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
+from gfm_design.margins.locus import (
+    DiskMargin,
+    GainPhase,
+    Locus,
+    disk_margin,
+    gain_phase,
+    locus_at_u,
+    locus_at_y,
+)
 from gfm_design.margins.tolerance import GridStrength, Range, element_ranges, grid_strength
 from gfm_design.model.closed_loop import U_CARRIED, Y_CARRIED, ClosedLoop
 from gfm_design.model.linear import Mode

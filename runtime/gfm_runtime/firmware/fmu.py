@@ -217,7 +217,7 @@ def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi) -> dict[str, bytes]:
     """
     machine, flags = platform.machine(), [f"-I{_headers()}"]
     here = _HERE[fmi].get(machine, f"{machine}-linux")
-    made = {f"{here}/{m.prefix}.so": ("", "-fPIC")}
+    made: dict[str, tuple[str, ...]] = {f"{here}/{m.prefix}.so": ("", "-fPIC")}
     if shutil.which(_MINGW) is not None:
         place = f"{_WINDOWS[fmi]}/{m.prefix}.dll"
         made[place] = (_MINGW, "-static-libgcc", "-Wl,--no-insert-timestamp")

@@ -66,12 +66,15 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
     )
     y, u = len(carried("y", stages)), len(carried("u", stages))
-    request = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
-    answer = [("result", word), ("channel", word), ("limited", word), ("count", word)]
-    state = [("x", real, (N_MAX,)), *((name, real, (NU,)) for name in ("offset", "u", "trend"))]
+    request: list[Any] = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
+    answer: list[Any] = [("result", word), ("channel", word), ("limited", word), ("count", word)]
+    state: list[Any] = [
+        ("x", real, (N_MAX,)),
+        *((name, real, (NU,)) for name in ("offset", "u", "trend")),
+    ]
     answer += [("u", real, (u,)), ("own", real, (NU,)), ("bump", real), ("i_ref", real, (2,))]
     state += [(name, real, (size,)) for name, size, _ in INNER_STATE if stages]
-    dtypes = map(np.dtype, ([*request, ("y", real, (y,))], state, answer))
+    dtypes = [np.dtype(fields) for fields in ([*request, ("y", real, (y,))], state, answer)]
     return LoopProgram(where, folder, *dtypes)
 
 

@@ -375,7 +375,7 @@ def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, An
 def _record(m: Module, states: int) -> str:
     """A law's record as an initialiser, for a generic step with room for ``states``."""
     integers, numbers = fields(m.stages)
-    room = {"A": (states, states), "C": (NU, states)}
+    room: dict[str, tuple[int, ...]] = {"A": (states, states), "C": (NU, states)}
     room |= dict.fromkeys(("B_r", "B_y", "W", "E_r", "E_y", "F", "G", "row"), (states,))
     lines = ["{"]
     for field in (*integers, *numbers):
