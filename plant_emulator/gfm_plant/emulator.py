@@ -19,7 +19,7 @@ from gfm_plant.components import (
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
-from gfm_plant.period import advance, go_back, keep, length
+from gfm_plant.period import go_back, keep, length, stretch
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
@@ -115,7 +115,8 @@ def plant_step(plant: PlantRecords) -> None:
     if now.clearing:
         advance_clearing(plant)
     else:
-        advance(plant, 0.0, math.inf)
+        for part in range(n.n_parts):
+            stretch(plant, part)
 
     worst, largest = 0, 0.0
     for k in range(n.n_converters):

@@ -80,61 +80,73 @@ def go_back(plant: PlantRecords) -> None:
 
 
 @compiled
-def advance(plant: PlantRecords, begin: float, end: float) -> None:
-    """Go on between two instants of the period, s after its beginning."""
-    n = plant.net[0]
-    starts = 0.0
-    for part in range(n.n_parts):
-        ends = starts + field(n, "stretch")[part]
-        if begin <= starts and ends <= end:
-            _stretch(plant, part, True, 0.0)
-        elif starts < end and begin < ends:
-            h = min(ends, end) - max(starts, begin)
-            if h > 0.0:
-                _stretch(plant, part, begin <= starts, h)
-        starts = ends
-
-
-@compiled
-def _stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> None:
-    """Go on by one stretch of the period, under the commands that act in it.
-
-    Args:
-        plant: the plant.
-        part: which stretch.
-        begins: whether it starts now.
-        h: s, of a part of it; 0: the whole.
-    """
+def stretch(plant: PlantRecords, part: int) -> None:
+    """Go on by one stretch of the period, under the commands that act in it."""
     n, now = plant.net[0], plant.now[0]
-    age = field(n, "age")
     for k in range(n.n_converters):
-        r, s = plant.par[k], plant.st[k]
-        if s.trip == 0:
-            for j in range(N_COMMANDS):
-                s.u_now[j] = s.u[age[part, k], j]
-        else:
-            s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`
-        if begins:  # the modulator divides by the v_dc that it has then
-            _command(s, r.m_max * s.x[V_DC])
+        _take_command(plant, k, part)
+        # the modulator divides by the v_dc that it has at the beginning of its period
+        _limit(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
     c, cut = circuit(n, now), part
     for k in range(n.n_converters):
         if _may_peak(plant, k, part):
             cut = part + n.n_parts
-    peaks = cut != part
-    if h > 0.0:
-        cut = cut_to(n, now, c, h, 2.0 * field(n, "half_h")[cut])
+    for _ in range(field(n, "pieces")[cut]):
+        if cut != part:
+            for k in range(n.n_converters):
+                if plant.par[k].i_peak < math.inf and plant.st[k].trip == 0:
+                    s = plant.st[k]
+                    s.E[0], s.E[1] = _within_peak(plant, k, cut)
+        _piece(plant, c, cut)
+
+
+@compiled
+def advance(plant: PlantRecords, begin: float, end: float) -> None:
+    """Go on between two instants of the period, s after its beginning; inf: to its end."""
+    n, starts = plant.net[0], 0.0
+    for part in range(n.n_parts):
+        ends = starts + field(n, "stretch")[part]
+        if begin <= starts and ends <= end:
+            stretch(plant, part)
+        elif starts < end and begin < ends:
+            _part_of_stretch(plant, part, begin <= starts, min(ends, end) - max(starts, begin))
+        starts = ends
+
+
+@compiled
+def _part_of_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> None:
+    """As ``stretch``, for h s of it; ``begins``: its first."""
+    n, now = plant.net[0], plant.now[0]
+    peaks = False
+    for k in range(n.n_converters):
+        _take_command(plant, k, part)
+        if begins:
+            _limit(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
+        peaks = peaks or _may_peak(plant, k, part)
+    c = circuit(n, now)
+    cut = cut_to(n, now, c, h, 2.0 * field(n, "half_h")[part + (n.n_parts if peaks else 0)])
     for _ in range(field(n, "pieces")[cut]):
         for k in range(n.n_converters):
-            r, s = plant.par[k], plant.st[k]
-            if peaks and r.i_peak < math.inf and s.trip == 0:
+            s = plant.st[k]
+            s.E[0], s.E[1] = s.E_commanded[0], s.E_commanded[1]
+            if peaks and plant.par[k].i_peak < math.inf and s.trip == 0:
                 s.E[0], s.E[1] = _within_peak(plant, k, cut)
-            elif h > 0.0:
-                s.E[0], s.E[1] = s.E_commanded[0], s.E_commanded[1]
         _piece(plant, c, cut)
 
 
 @inlined
-def _command(s: Any, most: float) -> None:
+def _take_command(plant: PlantRecords, k: int, part: int) -> None:
+    """Set the command that acts in a stretch; a blocked bridge turns as the grid does."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[k]
+    if s.trip == 0:
+        for j in range(N_COMMANDS):
+            s.u_now[j] = s.u[field(n, "age")[part, k], j]
+    else:
+        s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`
+
+
+@inlined
+def _limit(s: Any, most: float) -> None:
     """Set the bridge's voltage by the command that acts, within what the DC link gives."""
     s.E_most = most
     s.E[0], s.E[1] = s.u_now[2], s.u_now[3]
