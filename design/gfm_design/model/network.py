@@ -431,7 +431,7 @@ class _Writing:
     def __init__(self, plant: Network, members: Sequence[LinearConverter]) -> None:
         wiring, now, N = plant.wiring, plant.now[0], len(members)
         self.plant, self.members, self.omega_b = plant, members, wiring.omega_b
-        self.modes, self.sources = wiring.modes(wiring.blocked, False)
+        self.modes, self.sources = wiring.modes(wiring.blocked, None)
         self.w = now["w"][: len(wiring.order)]
         fed = [item for item in plant.fed() if item[1].is_voltage or item[0] not in wiring.opened]
         voltages = [(name, one, record) for name, one, record in fed if one.is_voltage]
