@@ -16,6 +16,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.core.schema import StrictSchema
 
 if TYPE_CHECKING:
+    from gfm_hil.scenario.events.grid_profile import ProfilePoint
     from gfm_hil.scenario.schema import Scenario
     from gfm_plant import Network
     from gfm_runtime.assembly import Controller
@@ -127,7 +128,7 @@ class PlantEvent(Event):
         """
         self.apply(plant)
 
-    def course(self, plant: Network) -> Iterator[tuple[int, CoursePoint]]:
+    def course(self, plant: Network) -> Iterator[tuple[int, ProfilePoint]]:
         """What follows, each with its tick after the event."""
         return iter(())
 
@@ -137,10 +138,3 @@ class PlantEvent(Event):
     def carry_out(self, target: EventTarget) -> None:
         if target.place == 0:  # a network's plant is one, and changes once
             self.apply(target.plant)
-
-
-class CoursePoint(Protocol):
-    """A point of the course that an event lets the grid follow; the log does not name it."""
-
-    def apply(self, plant: Network) -> None:
-        """Change the plant's records, between two ticks."""

@@ -49,9 +49,6 @@ class GainChange(Event):
         c.retune(*ready_gains(c, self.values), {**c.gains, **self.values})
 
 
-EVENT = GainChange
-
-
 @lru_cache(maxsize=64)
 def retuned(
     name: str, gains: tuple[tuple[str, float], ...], T_s: float, omega_b: float, inner: str | None

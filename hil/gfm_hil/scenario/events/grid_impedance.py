@@ -71,6 +71,3 @@ class GridImpedance(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_impedance(plant, *self.factors(plant))
-
-
-EVENT = GridImpedance

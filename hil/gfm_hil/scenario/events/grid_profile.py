@@ -61,9 +61,6 @@ class GridProfile(PlantEvent):
         raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
 
 
-EVENT = GridProfile
-
-
 class ProfilePoint(NamedTuple):
     """What the plant does from a tick of a course on: go to these values, in a line.
 

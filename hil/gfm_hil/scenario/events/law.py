@@ -36,6 +36,3 @@ class LawChange(Event):
 
     def carry_out(self, target: EventTarget) -> None:
         target.controller.select(self.law)
-
-
-EVENT = LawChange
