@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.controllers.external import (
     BenchContext,
@@ -17,7 +16,7 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
-from gfm_hil.controllers.ports import PortMap, wire
+from gfm_hil.controllers.ports import PortMap, Vector, wire
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import Archive
@@ -86,8 +85,7 @@ class FmuController(MappedController):
         text = said[-1]
         self._said = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
-    def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ControllerProtocol``."""
+    def start(self, u: Vector) -> None:
         self._ticks = 0
         try:
             if not self._fresh:
@@ -103,7 +101,7 @@ class FmuController(MappedController):
         except self._failed as problem:
             raise ControllerError(self._why(problem)) from None
 
-    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, inputs: Vector) -> Vector:
         outputs = np.zeros(len(self._names))
         try:
             for kind, places, references in self._in:
@@ -116,7 +114,6 @@ class FmuController(MappedController):
         return outputs
 
     def close(self) -> None:
-        """See ``ControllerProtocol``."""
         with contextlib.suppress(self._failed):
             self._it.terminate()
             self._it.freeInstance()

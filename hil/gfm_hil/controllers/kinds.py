@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from gfm_hil.controllers.dll import DllController
-from gfm_hil.controllers.external import BenchContext, ControllerProtocol, refuse_source
+from gfm_hil.controllers.external import BenchContext, ExternalController, refuse_source
 from gfm_hil.controllers.fmu import FmuController
 from gfm_hil.controllers.library import LibraryController
 from gfm_hil.controllers.ports import PortMap
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gfm_hil.controllers.pil import PilController
 
 PIL = "pil:"
-_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ControllerProtocol]] = {
+_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ExternalController]] = {
     "dll": DllController,
     "fmu": FmuController,
     "c": LibraryController,
@@ -32,9 +32,7 @@ _LOOK_S = 0.05
 T = TypeVar("T")
 
 
-def open_controller(
-    text: str, ports: PortMap, context: BenchContext
-) -> ControllerProtocol | PilController:
+def open_controller(text: str, ports: PortMap, context: BenchContext) -> ExternalController:
     """The controller that ``text`` names.
 
     Args:
@@ -105,8 +103,7 @@ def precision(text: str) -> str:
 
 
 def _pil(text: str) -> PilController:
-    from gfm_hil.controllers.pil import (
-        PilController,  # brings the compilers in, which few runs need
-    )
+    # brings the compilers in, which few runs need
+    from gfm_hil.controllers.pil import PilController
 
     return PilController(text.removeprefix(PIL))

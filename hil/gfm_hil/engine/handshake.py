@@ -16,6 +16,7 @@ escaped and cut.
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import threading
 import time
@@ -30,7 +31,6 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from gfm_hil.core.errors import PeerLost, lines
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.engine.loop_records import limited_reader
-from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError
@@ -38,6 +38,7 @@ from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import TABLE_VERSION, carried, table_hash
 
 _PREFIX = b"GFMHIL "
+_SPIN_NS = 50_000  # longer would starve the threads that bring the answer
 _REPEAT_NS = 100_000_000
 _AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
 _LEAD_NS = 20_000_000  # from START to tick 0
@@ -185,6 +186,26 @@ def shake_hands(
     if stopped():
         raise PeerLost(f"interrupted while waiting for the {side.other}{side.heard()}")
     raise side.lost()
+
+
+def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
+    """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
+
+    It yields after every poll, because a pure spin would starve libzmq's own thread on two cores,
+    and sleeps between two polls after 50 us.
+    """
+    spin_until = time.monotonic_ns() + _SPIN_NS
+    while True:
+        message = link.receive()
+        if message is not None:
+            return message
+        now = time.monotonic_ns()
+        if now >= deadline_ns or stopped():
+            return None
+        if now < spin_until:
+            os.sched_yield()
+        else:
+            link.wait(min(0.02, (deadline_ns - now) * 1e-9))
 
 
 class _Side:

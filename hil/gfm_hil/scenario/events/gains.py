@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
@@ -17,12 +17,9 @@ from gfm_hil.scenario.events.reset import Reset
 from gfm_runtime.errors import LawError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from gfm_hil.controllers.external import Retuned
     from gfm_hil.scenario.schema import Scenario
     from gfm_runtime.assembly import Controller
-
-    Retuned = tuple[gfm_runtime.DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
 
 class GainChange(Event):
