@@ -5,8 +5,6 @@ have any width and any type of number; real-code models that leave out FirstCall
 or Terminate are loaded too.
 """
 
-from __future__ import annotations
-
 import ctypes as c
 from pathlib import Path
 from typing import Any

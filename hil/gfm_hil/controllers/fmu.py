@@ -1,7 +1,5 @@
 """An FMU for co-simulation, FMI 2.0 or 3.0, as a controller; FMPy loads it."""
 
-from __future__ import annotations
-
 import contextlib
 import zipfile
 from pathlib import Path

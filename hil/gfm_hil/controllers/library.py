@@ -7,8 +7,6 @@ of it. The bridge's voltage stays where it is in space until the next call, as t
 does: each tick it is turned back in the frame by what the frame turns.
 """
 
-from __future__ import annotations
-
 import cmath
 import ctypes as c
 import math

@@ -1,7 +1,5 @@
 """Which signal each port of a controller is: by their names, or by a map in a TOML file."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ A folder may come from anybody: what lies in place of a file may be a link, a pi
 larger than memory. ``open_file``, ``read_file`` and ``read_json`` are the only ways in.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

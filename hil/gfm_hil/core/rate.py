@@ -1,7 +1,5 @@
 """Rate limit of commands: a token bucket."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -6,8 +6,6 @@ files of our own user are locked, read or removed: another user may put anything
 any name, and may hold a lock on any file that that user can open.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Which command servers a run folder announces; a killed process leaves its file behind."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ numba compiles a function when it is first called, and keeps the result in its c
 run of an installation on a machine compiles for minutes, and those after it only load.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any

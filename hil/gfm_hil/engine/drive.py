@@ -3,8 +3,6 @@
 The loop has a thread of its own, which the main thread watches; that one receives Ctrl-C.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -13,8 +13,6 @@ A side refuses and counts a malformed greeting, and goes on waiting. It shows a 
 escaped and cut.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

@@ -1,7 +1,5 @@
 """One role as a process of its own: set up the bench, shake hands, run, record."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence

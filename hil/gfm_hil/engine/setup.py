@@ -4,8 +4,6 @@ Both sides build the same bench from the same scenario, possibly on two machines
 frames have to cross the link.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path

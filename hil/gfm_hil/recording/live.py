@@ -3,8 +3,6 @@
 Reading does not disturb the loops, which only append rows to memory-mapped files.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Mapping

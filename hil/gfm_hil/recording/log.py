@@ -1,7 +1,5 @@
 """The log of a run, one JSON object per line, and the outcome that follows from it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """The checks of one signal behind the assertions of tests and the clauses of the conformity tests:
 each returns None, or what is wrong and where."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

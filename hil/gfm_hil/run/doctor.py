@@ -4,8 +4,6 @@ Green: nothing to do. Yellow: the longest times are longer than necessary. Red: 
 or the machine refuses something that a run needs.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import resource

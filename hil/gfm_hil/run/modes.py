@@ -10,8 +10,6 @@ Exponentials are what a loop does that is left to itself. So the fit begins wher
 scenario acts any more: after the end of a ramp, a course, a sag or a fault.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cache

@@ -5,8 +5,6 @@ files are made of, and ``recover`` can make them again. ``merge_roles`` makes on
 that the sides of a run leave if they were started apart.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

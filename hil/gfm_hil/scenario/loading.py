@@ -1,7 +1,5 @@
 """A scenario's file: found, read, overridden, checked whole, and written."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import shutil

@@ -1,7 +1,5 @@
 """Change to another law."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field
