@@ -74,19 +74,13 @@ class ExternalController:
         return False
 
     def start(self, u: Vector) -> None:
-        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
-
-        Raises:
-            ControllerError: it refuses.
-        """
+        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,). Raises
+        ControllerError: it refuses."""
 
     def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
         """One tick: u[k] from the references (5,) and the measurements, p.u.; before it one that
-        has our laws changes to that of the index ``changed``, or to none at -1.
-
-        Raises:
-            ControllerError: it fails, or blocks the bridge.
-        """
+        has our laws changes to that of the index ``changed``, or to none at -1. Raises
+        ControllerError: it fails, or blocks the bridge."""
 
     def close(self) -> None:
         """End it, and remove what it left."""
@@ -115,11 +109,8 @@ class MappedController(ExternalController):
 
 
 def refuse_source(text: str) -> None:
-    """Check that a controller is no source.
-
-    Raises:
-        UserError: it is; the message says how to compile it.
-    """
+    """Check that a controller is no source. Raises UserError: it is; the message says how to
+    compile it."""
     file = Path(text.partition(":")[2])
     if text.startswith(("c:", "dll:")) and file.suffix in (".c", ".h", ".cc", ".cpp"):
         raise UserError(
@@ -131,10 +122,7 @@ def refuse_source(text: str) -> None:
 
 def check_currents(text: str, inner: bool) -> None:
     """Check that a run, with an inner stage or without, carries what a library in C measures.
-
-    Raises:
-        UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
-    """
+    Raises UserError: ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
     if text.startswith("c:") and not inner:
         raise UserError(
@@ -150,11 +138,8 @@ def run_name(kind: str, controller: str) -> str:
 
 
 def ticks_a_step(where: str, step_s: float, T_s: float) -> int:
-    """How many ticks of T_s [s] pass between two steps of a controller.
-
-    Raises:
-        UserError: its step is not a whole number of ticks.
-    """
+    """How many ticks of T_s [s] pass between two steps of a controller. Raises UserError: its step
+    is not a whole number of ticks."""
     ticks = round(step_s / T_s) if step_s > 0 else 0
     if ticks < 1 or abs(step_s - ticks * T_s) > 1e-6 * T_s:
         raise UserError(

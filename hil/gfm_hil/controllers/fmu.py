@@ -126,12 +126,8 @@ class FmuController(MappedController):
 
 
 def _check_size(path: Path) -> None:
-    """See that a file is an archive that may be unpacked.
-
-    Raises:
-        OSError: it is no regular file.
-        BadZipFile: it is no archive, or has too many or too large members.
-    """
+    """See that a file is an archive that may be unpacked. Raises OSError: it is no regular file;
+    BadZipFile: it is no archive, or has too many or too large members."""
     with open_regular(path) as file, zipfile.ZipFile(Archive(file, _MEMBERS)) as archive:
         size = sum(info.file_size for info in archive.infolist())
         if size > _UNPACKED:

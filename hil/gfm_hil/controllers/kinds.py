@@ -56,11 +56,8 @@ def open_controller(text: str, ports: PortMap, context: BenchContext) -> Externa
 
 def until_signal(what: str, work: Callable[[], T]) -> T:
     """What ``work`` gives, in a thread of its own: foreign code that does not come back would keep
-    signals from acting.
-
-    Raises:
-        UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what`` did not come back.
-    """
+    signals from acting. Raises UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what``
+    did not come back."""
     found: Future[T] = Future()
 
     def call() -> None:
@@ -79,10 +76,7 @@ def until_signal(what: str, work: Callable[[], T]) -> T:
 
 def controller_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
     """The kind and the file of the controller ``KIND:FILE``; ``forms`` is what the message allows.
-
-    Raises:
-        UserError: there is no such kind or file.
-    """
+    Raises UserError: there is no such kind or file."""
     kind, colon, file = text.partition(":")
     if not colon or kind not in _KINDS or not file:
         raise UserError(f"controller {text!r}: must be {forms}")
@@ -95,10 +89,7 @@ def controller_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
 
 def precision(text: str) -> str:
     """The precision, float64 or float32, of the laws beside the controller that ``text`` names.
-
-    Raises:
-        UserError: it is a target that is not there.
-    """
+    Raises UserError: it is a target that is not there."""
     return _pil(text).real if text.startswith(PIL) else "float64"
 
 

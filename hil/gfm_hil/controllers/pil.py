@@ -77,10 +77,8 @@ class PilController(ExternalController):
 
     def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
         """Build the program for a controller's laws, on whose records it then works, and start it.
-
-        Raises:
-            UserError: it cannot be built, does not start, or gives other bits than the kernel.
-        """
+        Raises UserError: it cannot be built, does not start, or gives other bits than the
+        kernel."""
         self._controller, kind = controller, controller.laws.dtype
         ready = [*zip(controller.discrete, controller.laws, strict=True)][:-SPARE]
         ready += [(discrete, packed.astype(kind)[0]) for discrete, packed in changed]
@@ -131,11 +129,8 @@ class PilController(ExternalController):
         self._none = int(self._answer["count"][0])
 
     def _check(self, modules: Sequence[Module], rows: Golden) -> None:
-        """Step the program through golden rows; from then on reading waits for ever.
-
-        Raises:
-            ControllerError: a bit is not the kernel's, or the program has ended.
-        """
+        """Step the program through golden rows; from then on reading waits for ever. Raises
+        ControllerError: a bit is not the kernel's, or the program has ended."""
         differ = []
         for row in rows.words:
             self._request["what"], self._give_up = CHECK, time.monotonic() + _START_S
@@ -202,11 +197,7 @@ class PilController(ExternalController):
         os.write(self._to, what.view(np.uint8).data)
 
     def _receive(self) -> None:
-        """The next answer.
-
-        Raises:
-            ControllerError: the program has ended.
-        """
+        """The next answer. Raises ControllerError: the program has ended."""
         into = self._answer.view(np.uint8).data
         while len(into):
             while self._starts and not self._starts.poll(_LOOK_S * 1e3):
@@ -240,11 +231,8 @@ class PilController(ExternalController):
         return self._places[_numbers(self._controller.laws[k])]
 
     def _refuse(self, result: int, channel: int, n_u: int) -> None:
-        """Say why there is no u; an output that is not finite the controller itself reports.
-
-        Raises:
-            ControllerError: the law refuses its inputs, or the answer is none.
-        """
+        """Say why there is no u; an output that is not finite the controller itself reports. Raises
+        ControllerError: the law refuses its inputs, or the answer is none."""
         names = {**_SIGNALS, BAD_U: range(n_u)}.get(result, ())
         if not 0 <= channel < len(names):
             raise self._problem(f"answers {result} for signal {channel}, which no law does")

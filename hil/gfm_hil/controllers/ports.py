@@ -53,11 +53,8 @@ class PortMap(StrictSchema):
 
 
 def read_map(file: Path | None) -> PortMap:
-    """The map in a file; an empty one without a file.
-
-    Raises:
-        UserError: the file cannot be read, or a key or value is wrong.
-    """
+    """The map in a file; an empty one without a file. Raises UserError: the file cannot be read, or
+    a key or value is wrong."""
     if file is None:
         return PortMap()
     try:
@@ -115,12 +112,9 @@ class PortWiring(NamedTuple):
 def wire(
     where: str, ports: PortMap, inputs: Sequence[str], outputs: Sequence[str], inner: bool
 ) -> PortWiring:
-    """Map a controller's ports, which are in its order, to the signals of a run.
-
-    Raises:
-        UserError: a port or a signal that is not there, a port without a signal, or a signal of u
-            that comes from nowhere or twice.
-    """
+    """Map a controller's ports, which are in its order, to the signals of a run. Raises UserError:
+    a port or a signal that is not there, a port without a signal, or a signal of u that comes from
+    nowhere or twice."""
     known, u = [*names("ref"), *carried("y", inner)], [s.name for s in command_rows(inner)]
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):

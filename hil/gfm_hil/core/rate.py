@@ -29,11 +29,8 @@ class Rate:
         self.refused = 0
 
     def take(self) -> None:
-        """Count one command.
-
-        Raises:
-            UserError: it exceeds the limit; the caller must not carry it out.
-        """
+        """Count one command. Raises UserError: it exceeds the limit; the caller must not carry it
+        out."""
         with self._lock:
             now = self._clock()
             gained = (now - self._since) * self._per_s

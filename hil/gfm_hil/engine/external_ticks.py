@@ -69,11 +69,7 @@ class SteppedController:
         external.start(self._start)
 
     def check(self, event: Event, controller: Controller) -> None:
-        """Refuse an event that the external controller cannot follow.
-
-        Raises:
-            ValueError: why.
-        """
+        """Refuse an event that the external controller cannot follow. Raises ValueError: why."""
         if not event.changes_law:
             return
         if not self.has_laws:
@@ -91,13 +87,9 @@ class SteppedController:
             self._external.close()
 
     def _begin_anew(self, ctl: Any, y: NDArray[np.float64]) -> None:
-        """Start after a reset: as at the beginning, or from what is measured in a network that
-        went on.
-
-        Raises:
-            gfm_hil.controllers.ControllerError: it refuses, or runs our laws, which its program
-                starts from rest only.
-        """
+        """Start after a reset: as at the beginning, or from what is measured in a network that went
+        on. Raises gfm_hil.controllers.ControllerError: it refuses, or runs our laws, which its
+        program starts from rest only."""
         if ctl["joins"][0]:
             ctl["joins"] = 0
             if self.has_laws:
@@ -109,11 +101,8 @@ class SteppedController:
     def __call__(
         self, end: LinkEnd, records: Records, controller: ControllerRecords, event: int
     ) -> ReturnReason:
-        """As ``controller_ticks``.
-
-        Raises:
-            gfm_hil.controllers.ControllerError: the external controller fails.
-        """
+        """As ``controller_ticks``. Raises gfm_hil.controllers.ControllerError: the external
+        controller fails."""
         ctl, u, given = controller.ctl, self._u, (end, records, controller)
         if not self._calls:
             # numba finds out the types of such arguments anew at each call, which takes 400 µs
@@ -146,11 +135,7 @@ class SteppedController:
 
     def watch(self, end: Callable[[Status, str, int], None], patience_s: float) -> None:
         """End the run if the external controller has not answered for that long; another thread
-        calls this.
-
-        Raises:
-            PeerLost: it has not.
-        """
+        calls this. Raises PeerLost: it has not."""
         began = self._began
         silent_s = (time.monotonic_ns() - began) * 1e-9 if began else 0.0
         if silent_s > patience_s:

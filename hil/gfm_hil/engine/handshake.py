@@ -236,11 +236,8 @@ class _Side:
         self._link.send(_PREFIX + json.dumps(greeting).encode())
 
     def take(self, message: bytes | None, now: int) -> Start | None:
-        """Process what came, if anything; returns what both sides agreed on once they have.
-
-        Raises:
-            PeerLost: the other side runs something else.
-        """
+        """Process what came, if anything; returns what both sides agreed on once they have. Raises
+        PeerLost: the other side runs something else."""
         try:
             greeting = None if message is None else _read(message)
             if isinstance(greeting, _Hello):
@@ -279,11 +276,8 @@ class _Side:
         self.met = True
 
     def _start_at(self, t0: int, now: int) -> Start:
-        """Take the plant's time of tick 0.
-
-        Raises:
-            _Refused: it lies before this side began to wait, or far ahead.
-        """
+        """Take the plant's time of tick 0. Raises _Refused: it lies before this side began to wait,
+        or far ahead."""
         if not self._one_clock:
             return self._agreed(now + _LEAD_NS)
         if not self.begin <= t0 <= now + _MOST_LEAD_NS:
@@ -347,11 +341,8 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
 
 
 def _read(message: bytes) -> _Hello | _Go | None:
-    """The greeting in a message; None if it does not begin as one.
-
-    Raises:
-        _Refused: it begins as one, but is none.
-    """
+    """The greeting in a message; None if it does not begin as one. Raises _Refused: it begins as
+    one, but is none."""
     if message[: len(_PREFIX)] != _PREFIX[: len(message)]:
         return None
     try:

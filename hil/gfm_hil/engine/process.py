@@ -89,11 +89,8 @@ def run_role(
 
 
 def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
-    """An external controller ready for tick 0 at the operating point.
-
-    Raises:
-        UserError: it refuses, or the scenario has events that are about a law.
-    """
+    """An external controller ready for tick 0 at the operating point. Raises UserError: it refuses,
+    or the scenario has events that are about a law."""
     scenario = bench.scenario
     if not external.has_laws:
         for event in scenario.events:
@@ -136,11 +133,7 @@ class _SideResources:
         stack.callback(self.timeline.close)
 
     def open(self, stack: ExitStack) -> None:
-        """Open the link.
-
-        Raises:
-            UserError: the endpoint cannot be opened.
-        """
+        """Open the link. Raises UserError: the endpoint cannot be opened."""
         given = self.scenario.link
         assert given.endpoint is not None
         self.good = open_link(
@@ -191,12 +184,8 @@ def _meet_and_run(
     notice: Callable[[str], None],
     interrupt: Interrupt,
 ) -> None:
-    """Open the links, meet the other sides, run, and keep what the links counted.
-
-    Raises:
-        PeerLost: another side did not come.
-        UserError: an endpoint cannot be opened.
-    """
+    """Open the links, meet the other sides, run, and keep what the links counted. Raises PeerLost:
+    another side did not come; UserError: an endpoint cannot be opened."""
     scenario = sides[0].scenario
     rights = None
     if scenario.mode == "realtime":
@@ -243,10 +232,7 @@ def _meet(
     notice: Callable[[str], None],
 ) -> list[Start]:
     """Shake hands over all links at a time: the controllers of a plant may come in any order.
-
-    Raises:
-        PeerLost: one did not come.
-    """
+    Raises PeerLost: one did not come."""
     meeting, failed = Meeting(len(sides)), threading.Event()
     external = sides[0].bench.external
 

@@ -69,9 +69,7 @@ class Bench:
         """Take the controller from SAFE to READY, with its first law and references.
 
         That of a converter in a network will begin with the voltage and frequency that it measures.
-
-        Raises:
-            ValueError: it is not in SAFE.
+        Raises ValueError: it is not in SAFE.
         """
         c = self.controller
         state, changes = int(c.ctl["state"][0]), int(c.ctl["changes"][0])

@@ -266,11 +266,8 @@ def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> 
 
 
 def run_network_in_memory(scenario: Scenario) -> NetworkRun:
-    """Run a scenario with a network in this process and leave nothing on the disk.
-
-    Raises:
-        UserError: the scenario has no operating point.
-    """
+    """Run a scenario with a network in this process and leave nothing on the disk. Raises
+    UserError: the scenario has no operating point."""
     benches = make_benches(scenario)
     runs = _in_memory(benches, [_room(bench) for bench in benches])
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))

@@ -27,20 +27,14 @@ SCENARIO_FOLDERS = (
 
 
 def find_scenario(name: str) -> Path:
-    """The file of a scenario: a path, or the name of a shipped one (with or without .toml).
-
-    Raises:
-        UserError: neither exists.
-    """
+    """The file of a scenario: a path, or the name of a shipped one (with or without .toml). Raises
+    UserError: neither exists."""
     return find_file("scenario", name, "*.toml")
 
 
 def find_file(kind: str, name: str, pattern: str) -> Path:
-    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
-
-    Raises:
-        UserError: neither exists.
-    """
+    """The file at that path, or the shipped file of that name; ``kind`` is for the message. Raises
+    UserError: neither exists."""
     given, shipped = Path(name), _shipped(pattern)
     try:
         is_file, exists = given.is_file(), given.exists()
@@ -137,11 +131,8 @@ def _of_converter(
     options: Mapping[str, str],
 ) -> tuple[dict[str, Any], Mapping[str, str]]:
     """Overrides and their names as for ``load_scenario``, with ``law`` and ``inner`` where they
-    reach the converters of a network.
-
-    Raises:
-        UserError: there is no such converter; none is named, and one has its own law or stage.
-    """
+    reach the converters of a network. Raises UserError: there is no such converter; none is named,
+    and one has its own law or stage."""
     members = _inside(content, "network", "converters")
     if converter is not None and converter not in members:
         allowed = f"must be one of {[*members]}" if members else "the scenario has no network"
@@ -287,11 +278,8 @@ def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
 
 
 def plant_of(scenario: Scenario) -> Network:
-    """The plant of a scenario: one converter, or those of its network.
-
-    Raises:
-        ValueError: as ``make_plant`` and ``make_network``.
-    """
+    """The plant of a scenario: one converter, or those of its network. Raises ValueError: as
+    ``make_plant`` and ``make_network``."""
     if scenario.network is None:
         options = scenario.plant
         options = options.with_seed(scenario.seed) if scenario.seed else options
@@ -351,10 +339,7 @@ def toml_text(content: dict[str, Any]) -> str:
 
 def write_scenario(folder: Path, scenario: Scenario) -> None:
     """Write ``scenario.toml`` into a run folder, with the files of its events in ``profiles``.
-
-    Raises:
-        OSError: a file cannot be read or written.
-    """
+    Raises OSError: a file cannot be read or written."""
     events, taken = [], dict[str, str]()
     for k, event in enumerate(scenario.events):
         if (file := getattr(event, "file", None)) is not None:

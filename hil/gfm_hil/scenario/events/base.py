@@ -92,18 +92,12 @@ class Event(StrictSchema):
         return []
 
     def check_now(self, target: EventTarget) -> None:
-        """Check, off the loop, that an operator's event can be carried out now.
-
-        Raises:
-            ValueError: why not.
-        """
+        """Check, off the loop, that an operator's event can be carried out now. Raises ValueError:
+        why not."""
 
     def carry_out(self, target: EventTarget) -> None:
-        """Carry it out between two ticks.
-
-        Raises:
-            ValueError: it is not possible; nothing has changed.
-        """
+        """Carry it out between two ticks. Raises ValueError: it is not possible; nothing has
+        changed."""
         raise NotImplementedError
 
 
@@ -113,19 +107,13 @@ class PlantEvent(Event):
     side: ClassVar[Role] = "plant"
 
     def apply(self, plant: Network) -> None:
-        """Change the plant's records, between two ticks.
-
-        Raises:
-            ValueError: it is not possible; nothing has changed.
-        """
+        """Change the plant's records, between two ticks. Raises ValueError: it is not possible;
+        nothing has changed."""
         raise NotImplementedError
 
     def try_on(self, plant: Network) -> None:
-        """Try the event of a scenario on its plant before the run.
-
-        Raises:
-            UserError, ValueError: it is not possible.
-        """
+        """Try the event of a scenario on its plant before the run. Raises UserError, ValueError: it
+        is not possible."""
         self.apply(plant)
 
     def course(self, plant: Network) -> Iterator[tuple[int, ProfilePoint]]:

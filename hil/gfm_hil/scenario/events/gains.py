@@ -54,10 +54,8 @@ def retuned(
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
     results are cached: the command server's check prepares what the loop then uses. ``omega_b`` is
-    that of the converter, rad/s, for an inner stage.
-
-    Raises:
-        ValueError: a scheduled law, a name that its file does not have, or no such law.
+    that of the converter, rad/s, for an inner stage. Raises ValueError: a scheduled law, a name
+    that its file does not have, or no such law.
     """
     try:
         file = gfm_runtime.law_file(name)
@@ -72,11 +70,8 @@ def retuned(
 
 
 def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
-    """The law selected last with new gains, on top of earlier changes.
-
-    Raises:
-        ValueError: as ``retuned``.
-    """
+    """The law selected last with new gains, on top of earlier changes. Raises ValueError: as
+    ``retuned``."""
     gains = {**controller.gains, **values}
     name = controller.asked
     inner = controller.sets[name].inner
@@ -85,11 +80,7 @@ def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
 
 def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
     """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
-    ``retuned``.
-
-    Raises:
-        UserError: a change that is not possible.
-    """
+    ``retuned``. Raises UserError: a change that is not possible."""
     found: list[Retuned] = []
     name, gains = scenario.law, dict[str, float]()
     for event in scenario.sorted_events():
