@@ -12,8 +12,6 @@ The mark ``alone`` is for tests of the last two that fail beside another one on 
 ``--tier`` chooses tiers; a path, ``-k`` or ``-m`` on the command line chooses from all of them.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterable

@@ -23,14 +23,14 @@ def rows_of(name: str, *words: str) -> Any:
     return json.loads(done.stdout)
 
 
-def test_versus_motulator() -> None:
+def test_versus_motulator():
     pytest.importorskip("motulator", reason="needs the extra 'bench'")
     found = rows_of("versus_motulator", "--quick")
     assert found["gfmhil"]["median"] > found["motulator"]["median"] > 0
 
 
 @pytest.mark.full
-def test_observers() -> None:
+def test_observers():
     words = ["--clients", "3", "--rounds", "1", "--seconds", "0.3"]
     bare, none, many = rows_of("observers", *words)["rows"]
     assert [row["what"] for row in (bare, none, many)] == ["bare pacing", "no client", "clients"]
@@ -39,7 +39,7 @@ def test_observers() -> None:
 
 
 @pytest.mark.full
-def test_prevent_idle() -> None:
+def test_prevent_idle():
     rows = rows_of("prevent_idle", "--links", "shm", "--rounds", "1", "--seconds", "0.3")
     assert [(row["prevent_idle"], row["ticks"]) for row in rows] == [
         ("never", 3000),

@@ -1,7 +1,5 @@
 """The files in deploy/: units, container files, CAN and the tuning script pass their tools."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

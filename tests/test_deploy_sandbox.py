@@ -5,8 +5,6 @@ filter of system calls from the units and set them before the command is execute
 may not raise a limit, as in some containers, they grant the equivalent capability instead.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import json

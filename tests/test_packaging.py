@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -61,7 +61,7 @@ def files(folder: Path, suffixes: set[str]) -> list[Path]:
     ]
 
 
-def test_imports_run_one_way() -> None:
+def test_imports_run_one_way():
     """The contracts of pyproject.toml hold, between the packages and between the rooms."""
     where = os.pathsep.join(str(folder.parent) for folder in FOLDERS.values())
     done = subprocess.run(
@@ -72,7 +72,7 @@ def test_imports_run_one_way() -> None:
     assert "0 broken" in done.stdout
 
 
-def test_runtime_needs_numpy_and_numba_only() -> None:
+def test_runtime_needs_numpy_and_numba_only():
     known = RUNTIME_NEEDS | {"gfm_runtime"} | set(sys.stdlib_module_names)
     wrong = [
         f"{path.relative_to(ROOT)}: {name}"
@@ -83,7 +83,7 @@ def test_runtime_needs_numpy_and_numba_only() -> None:
     assert not wrong
 
 
-def test_a_plain_install_has_all_that_the_plant_imports() -> None:
+def test_a_plain_install_has_all_that_the_plant_imports():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     installed = {canonicalize_name(Requirement(each).name) for each in project["dependencies"]}
     names = {n.split(".")[0] for p in files(FOLDERS["gfm_plant"], {".py"}) for n in imported(p)}
@@ -94,11 +94,11 @@ def test_a_plain_install_has_all_that_the_plant_imports() -> None:
 
 
 @pytest.mark.parametrize("package", FOLDERS)
-def test_package_is_typed(package: str) -> None:
+def test_package_is_typed(package):
     assert (FOLDERS[package] / "py.typed").is_file()
 
 
-def test_no_machine_paths() -> None:
+def test_no_machine_paths():
     folders = [*SOURCES, *(ROOT / name for name in ("scenarios", "deploy"))]
     paths = [path for folder in folders for path in files(folder, TEXT)]
     paths += [path for path in ROOT.iterdir() if path.suffix in TEXT]
@@ -122,9 +122,7 @@ def committed(folder: str) -> set[str]:
 @pytest.mark.attack(
     "10.7", "deploying from a wheel", "deploy/ was not in it: units and scripts only by a checkout"
 )
-def test_deploy_writes_what_is_committed_and_keeps_what_is_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], attack_now: Callable[[str], None]
-) -> None:
+def test_deploy_writes_what_is_committed_and_keeps_what_is_there(tmp_path, capsys, attack_now):
     out = tmp_path / "deploy"
     assert main(["deploy", "--out", str(out)]) == 0
     written = {p.relative_to(tmp_path).as_posix() for p in out.rglob("*") if p.is_file()}
@@ -160,9 +158,7 @@ LOCKED = re.compile(r"^([a-z0-9][a-z0-9._-]*)(==[^ ]+(?:.|\n(?=    --))*)", re.M
     "a package of the same version but other content, in CI and in the image",
     "it was installed: no version was fixed and no hash checked",
 )
-def test_the_locks_fit_the_project_and_every_line_has_hashes(
-    name: str, extras: tuple[str, ...], attack_now: Callable[[str], None]
-) -> None:
+def test_the_locks_fit_the_project_and_every_line_has_hashes(name, extras, attack_now):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = [*project["dependencies"], "hatchling>=1.27"]
     wanted += [line for extra in extras for line in project["optional-dependencies"][extra]]
@@ -182,7 +178,7 @@ def test_the_locks_fit_the_project_and_every_line_has_hashes(
 
 
 @pytest.mark.full
-def test_the_bill_of_materials_names_versions_and_licences(tmp_path: Path) -> None:
+def test_the_bill_of_materials_names_versions_and_licences(tmp_path):
     pytest.importorskip("cyclonedx_py")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     command = [ROOT / ".ci" / "sbom", tmp_path / "sbom.json", sys.executable]
@@ -197,7 +193,7 @@ def test_the_bill_of_materials_names_versions_and_licences(tmp_path: Path) -> No
         assert parts[name]["licenses"]
 
 
-def test_wheel_holds_packages_and_scenarios(tmp_path: Path) -> None:
+def test_wheel_holds_packages_and_scenarios(tmp_path):
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

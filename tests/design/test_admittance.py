@@ -1,7 +1,5 @@
 """Passivity and stability from an admittance, against poles and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -24,13 +22,13 @@ def both() -> np.ndarray:
     return 2j * np.pi * np.concatenate([HZ, -HZ])
 
 
-def test_a_line_is_its_phasor_impedance_in_the_dq_frame() -> None:
+def test_a_line_is_its_phasor_impedance_in_the_dq_frame():
     s = both()
     expected = turned(0.02 + (s + 1.01j * OMEGA_B) * 0.3 / OMEGA_B)
     assert line_impedance(HZ, 0.02, 0.3, OMEGA_B, 1.01) == pytest.approx(expected, rel=1e-12)
 
 
-def test_passivity_is_that_of_a_resistor_and_of_a_constant_power_load() -> None:
+def test_passivity_is_that_of_a_resistor_and_of_a_constant_power_load():
     R = np.tile(np.diag([4.0, 4.0]).astype(complex), (3, 1, 1))
     assert passivity(R) == pytest.approx([8.0] * 3)
     load = np.tile(np.diag([-0.5, 0.5]).astype(complex), (3, 1, 1))  # P / V^2 in d, against it
@@ -53,7 +51,7 @@ def poles(R: float, L: float, c: float, g: float, b: float) -> np.ndarray:
     [(0.02, 0.1, 0.4, 300.0), (0.02, 0.1, 2.0, 300.0), (0.02, 0.4, 0.4, 300.0),
      (0.3, 0.6, 0.4, 900.0), (0.3, 0.6, 0.9, 900.0), (0.1, 0.1, 2.2, 50.0)],
 )  # fmt: skip
-def test_nyquist_counts_the_unstable_poles(R: float, L: float, g: float, b: float) -> None:
+def test_nyquist_counts_the_unstable_poles(R, L, g, b):
     c, stable = 0.2, (0.4, 0.05)
     s = both()
     Y = turned((s / OMEGA_B + 1j) * c - g * b / (s + b))
@@ -67,7 +65,7 @@ def test_nyquist_counts_the_unstable_poles(R: float, L: float, g: float, b: floa
     assert found.stable is (expected == 0)
 
 
-def test_the_margin_is_the_least_distance_from_minus_one() -> None:
+def test_the_margin_is_the_least_distance_from_minus_one():
     Y = np.tile(np.diag([-0.5, 0.25]).astype(complex), (len(HZ), 1, 1))
     Z = np.tile(np.eye(2, dtype=complex), (len(HZ), 1, 1))
     found = grid_stability(HZ, Y, Z, 0.1 * Z)
@@ -75,7 +73,7 @@ def test_the_margin_is_the_least_distance_from_minus_one() -> None:
     assert sorted(eigenloci(Y, Z)[0].real) == pytest.approx([-0.5, 0.25])
 
 
-def test_what_the_frequencies_do_not_show_is_not_judged() -> None:
+def test_what_the_frequencies_do_not_show_is_not_judged():
     s = both()
     c, g, b = 0.2, 0.4, 300.0
     Y = turned((s / OMEGA_B + 1j) * c - g * b / (s + b))

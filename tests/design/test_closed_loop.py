@@ -1,7 +1,5 @@
 """The one closed loop: its readings against each other, other programs and the nonlinear bench."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from typing import Any
@@ -40,18 +38,18 @@ def loop(law: str = "mimo-gfm", plant: dict[str, Any] | None = None, **kind: Any
 
 
 @pytest.mark.parametrize(("law", "gamma"), [("mimo-gfm", 2.0209), ("vsg-2", 15.975)])
-def test_gamma_of_the_printed_gains(law: str, gamma: float) -> None:
+def test_gamma_of_the_printed_gains(law, gamma):
     assert loop(law, ideal=True).gamma() == pytest.approx(gamma, rel=5e-5)
 
 
-def test_a_law_may_be_a_name_a_law_or_a_discrete_law() -> None:
+def test_a_law_may_be_a_name_a_law_or_a_discrete_law():
     by_name, law = loop("vsg-5").A, get_law("vsg-5")
     np.testing.assert_array_equal(ClosedLoop.of(law).A, by_name)
     np.testing.assert_array_equal(ClosedLoop.of(discretise(law, 1e-4)).A, by_name)
 
 
 @pytest.mark.parametrize("law", ["mimo-gfm-deployable", "vsg-2"])
-def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
+def test_step_is_that_of_the_nonlinear_bench(law):
     # 1e-4 p.u. of P_ref: nonlinear terms are of the order of 1e-8
     size, ticks = 1e-4, 1500
     content = {"title": "", "duration": ticks * 1e-4, "law": law, "plant": RIG}
@@ -67,7 +65,7 @@ def test_step_is_that_of_the_nonlinear_bench(law: str) -> None:
     assert np.abs(p / size - y[:ticks, 1]).max() < 2e-3 * np.abs(y[:, 1]).max()
 
 
-def test_step_settles_where_the_response_at_rest_says() -> None:
+def test_step_settles_where_the_response_at_rest_says():
     for of in (loop("mimo-gfm-deployable", RIG), loop("mimo-gfm-deployable", ideal=True)):
         rest = of.frequency_response([0.0])[0].real
         for k, name in enumerate(INPUTS):
@@ -78,7 +76,7 @@ def test_step_settles_where_the_response_at_rest_says() -> None:
 
 
 @pytest.mark.parametrize("ideal", [True, False])
-def test_frequency_response_is_that_of_python_control(ideal: bool) -> None:
+def test_frequency_response_is_that_of_python_control(ideal):
     of = loop("vsg-5", {} if ideal else RIG, ideal=ideal)
     omega = np.geomspace(0.1, 2e4, 20)
     system = control.ss(*of.state_space, *([] if ideal else [of.T_s]))
@@ -86,7 +84,7 @@ def test_frequency_response_is_that_of_python_control(ideal: bool) -> None:
     np.testing.assert_allclose(of.frequency_response(omega), expected, rtol=1e-6, atol=1e-9)
 
 
-def test_loop_transfer_gives_the_sensitivity_that_the_margins_use() -> None:
+def test_loop_transfer_gives_the_sensitivity_that_the_margins_use():
     of, omega = loop("mimo-gfm", RIG), np.geomspace(1.0, 3e4, 40)
     for at_y, locus, channels in (
         (False, locus_at_u(of), of.commands),
@@ -99,7 +97,7 @@ def test_loop_transfer_gives_the_sensitivity_that_the_margins_use() -> None:
 
 
 @pytest.mark.parametrize("ideal", [True, False])
-def test_gain_of_one_loop_is_that_of_python_control_with_the_others_closed(ideal: bool) -> None:
+def test_gain_of_one_loop_is_that_of_python_control_with_the_others_closed(ideal):
     of, omega = loop("mimo-gfm", {} if ideal else RIG, ideal=ideal), np.geomspace(1.0, 2e4, 20)
     p, c, step = of.held, of.law, [] if ideal else [of.T_s]
     plant = control.ss(p.A, p.B, p.C, np.zeros((5, 3)), *step)
@@ -120,7 +118,7 @@ def test_gain_of_one_loop_is_that_of_python_control_with_the_others_closed(ideal
 
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-5", "hybrid-angle"])
 @pytest.mark.parametrize("plant", [{}, RIG, {"dc_source": {"mode": "regulated"}}])
-def test_output_impedance_and_line_make_the_loop(law: str, plant: dict[str, Any]) -> None:
+def test_output_impedance_and_line_make_the_loop(law, plant):
     # a step of V_g through the line onto the impedance, against the loop's own response
     of, omega = loop(law, plant, ideal=True), np.geomspace(0.5, 2e4, 25)
     r, x = of.made_of.par[0], of.made_of.op.x
@@ -143,7 +141,7 @@ def test_output_impedance_and_line_make_the_loop(law: str, plant: dict[str, Any]
         np.testing.assert_allclose(response[:, row], expected[name], atol=1e-7 * size, rtol=1e-6)
 
 
-def test_output_impedance_of_a_sampled_loop_is_that_of_its_periodic_motion() -> None:
+def test_output_impedance_of_a_sampled_loop_is_that_of_its_periodic_motion():
     # A current e^(j omega t) into the plant's own equations, and u held, 1.25 samples late. The
     # motion over one tick from (x at its end) = z (x at its start); then v's part at omega.
     of = loop("vsg-2", {"delay": {"samples": 1, "fraction": 0.25}, "factors": {"R_f": 3.0}})
@@ -193,7 +191,7 @@ def test_output_impedance_of_a_sampled_loop_is_that_of_its_periodic_motion() -> 
         np.testing.assert_allclose(of.output_impedance([omega])[0], Z, rtol=1e-4, atol=1e-5)
 
 
-def test_many_plants_in_one_loop_are_each_of_them() -> None:
+def test_many_plants_in_one_loop_are_each_of_them():
     law = discretise(get_law("mimo-gfm"), 1e-4)
     loops = [Point(0.1, 1.0, L_g, delay).loop(law) for L_g, delay in ((1.0, 1.4), (20.0, 2.0))]
     many = ClosedLoop.stacked(loops)
@@ -207,7 +205,7 @@ def test_many_plants_in_one_loop_are_each_of_them() -> None:
 
 
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-5"])
-def test_many_laws_in_one_loop_are_each_of_them(law: str) -> None:
+def test_many_laws_in_one_loop_are_each_of_them(law):
     file = law_file(law)
     problem = PaperProblem(file, free_gains(file))
     start = np.array([g.start for g in problem.gains])
@@ -219,7 +217,7 @@ def test_many_laws_in_one_loop_are_each_of_them(law: str) -> None:
     np.testing.assert_allclose(many.sampled(1e-4, 1.3e-4).sigma(), late, rtol=1e-6)
 
 
-def test_sampling_a_loop_is_discretising_its_law() -> None:
+def test_sampling_a_loop_is_discretising_its_law():
     # Tustin of the law with closed omega_u loop, against the runtime, which closes it after Tustin
     ideal, exact = loop("vsg-5", ideal=True), loop("vsg-5", {"delay": {"samples": 1}})
     ours = ideal.sampled(1e-4, 1e-4)
@@ -232,7 +230,7 @@ def test_sampling_a_loop_is_discretising_its_law() -> None:
     )
 
 
-def test_sensors_are_in_the_loop_but_not_in_what_it_gives() -> None:
+def test_sensors_are_in_the_loop_but_not_in_what_it_gives():
     ideal, gained = loop(), loop(plant={"sensors": {"gain": {"p": 1.05}}})
     np.testing.assert_array_equal(ideal.plant.C, ideal.plant.C_true)
     np.testing.assert_allclose(gained.plant.C[1], 1.05 * gained.plant.C_true[1])
@@ -241,14 +239,14 @@ def test_sensors_are_in_the_loop_but_not_in_what_it_gives() -> None:
         assert of.frequency_response([0.0])[0, 1, 1].real == pytest.approx(rest, rel=1e-6)
 
 
-def test_changed_elements_are_those_of_another_plant() -> None:
+def test_changed_elements_are_those_of_another_plant():
     other = loop(plant={**RIG, "factors": {"R_f": 3.0, "R_g": 0.5, "L_g": 2.0}})
     np.testing.assert_allclose(
         loop(plant=RIG).changed({"R_g": 0.5, "L_g": 2.0}).A, other.A, atol=1e-9
     )
 
 
-def test_what_cannot_be() -> None:
+def test_what_cannot_be():
     ideal = loop(ideal=True)
     with pytest.raises(ValueError, match="continuous loop has no delay"):
         ideal.later(1e-4)
@@ -262,7 +260,7 @@ def test_what_cannot_be() -> None:
         loop(plant={"delay": {"samples": 1}}).gamma()
 
 
-def test_representation_and_margins() -> None:
+def test_representation_and_margins():
     of = loop()
     assert repr(of) == "<ClosedLoop mimo-gfm, T_s = 0.0001 s, A (11, 11)>"
     assert repr(loop(ideal=True)) == "<ClosedLoop mimo-gfm, continuous, A (11, 11)>"
@@ -271,7 +269,7 @@ def test_representation_and_margins() -> None:
     assert of.modes()[0].sigma > least.sigma  # the slowest to decay is another mode, well damped
 
 
-def test_a_live_process_loads_neither_synthesis_nor_its_packages() -> None:
+def test_a_live_process_loads_neither_synthesis_nor_its_packages():
     code = "import sys, gfm_hil.engine.setup\nprint(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy = {"gfm_design.model.closed_loop", "gfm_design.norms", "scipy.optimize", "cma"}
@@ -280,7 +278,7 @@ def test_a_live_process_loads_neither_synthesis_nor_its_packages() -> None:
     assert not loaded & heavy
 
 
-def test_one_schur_form_answers_as_a_solve_at_each_frequency() -> None:
+def test_one_schur_form_answers_as_a_solve_at_each_frequency():
     """On a sampled loop with delay lines, whose states are then scaled by powers of two over
     fourteen orders of magnitude: that is exact, and leaves the response as it is."""
     late = {"delay": {"samples": 3, "fraction": 0.4}}

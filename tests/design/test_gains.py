@@ -1,7 +1,5 @@
 """Free gains: valid choices, ties, and laws affine in them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from gfm_runtime.lawfile import parse_law, tied
 from ..support.laws import every_law
 
 
-def test_ties_follow() -> None:
+def test_ties_follow():
     assert tied(law_file("mimo-gfm"), {"k_34": 2.0})["k_35"] == pytest.approx(40.0)
 
 
@@ -28,22 +26,20 @@ def test_ties_follow() -> None:
         ({"k_22": 5.0}, ["k_34"], "not among those to move"),
     ],
 )
-def test_gains_that_cannot_be(
-    start: dict[str, float] | None, only: list[str] | None, words: str
-) -> None:
+def test_gains_that_cannot_be(start, only, words):
     with pytest.raises(LawError, match=words):
         free_gains(law_file("mimo-gfm"), start, only)
 
 
 @pytest.mark.parametrize("law", every_law())
-def test_every_law_declares_its_gains(law: str) -> None:
+def test_every_law_declares_its_gains(law):
     file = law_file(law)
     assert free_gains(file)  # its defaults lie within its own bounds
     assert not {"D_p", "D_q", "R", "X"} & {n for n, p in file.parameters.items() if p.free}
 
 
 @pytest.mark.parametrize("law", every_law())
-def test_a_law_as_a_function_of_its_gains(law: str) -> None:
+def test_a_law_as_a_function_of_its_gains(law):
     """Many at once against one at a time from the file, by T(s)."""
     gains = free_gains(law_file(law))
     problem = PaperProblem(law_file(law), gains)
@@ -63,7 +59,7 @@ def test_a_law_as_a_function_of_its_gains(law: str) -> None:
 
 
 @pytest.mark.parametrize(("law", "affine"), [("mimo-gfm", True), ("vsg-11", False)])
-def test_affine_or_not(law: str, affine: bool) -> None:
+def test_affine_or_not(law, affine):
     gains = free_gains(law_file(law))
     assert PaperProblem(law_file(law), gains).law.is_affine is affine
 
@@ -89,12 +85,12 @@ k = { value = 1.0, unit = "p.u.", source = "s", free = [-5.0, 5.0] }
 
 
 @pytest.mark.parametrize("bounds", ["[5.0, 1.0]", "[1.0, 1.0]", "[nan, 5.0]", "[0.1, inf]"])
-def test_bounds_that_are_none(bounds: str) -> None:
+def test_bounds_that_are_none(bounds):
     with pytest.raises(LawError, match="must be finite and ascending"):
         free_gains(parse_law(OWN.replace("[-5.0, 5.0]", bounds)))
 
 
-def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law() -> None:
+def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law():
     file = parse_law(OWN)
     problem = PaperProblem(file, free_gains(file))
     values = np.array([[0.02, 0.004, 2.0], [0.05, 0.006, -1.0], [0.05, 0.02, 1.0]])
@@ -111,7 +107,7 @@ def test_gains_in_the_error_map_cancelling_factors_and_gains_that_make_no_law() 
     assert problem(values[2]) > UNSTABLE
 
 
-def test_coordinates() -> None:
+def test_coordinates():
     gains = (FreeGain("a", 2.0, 0.1, 100.0), FreeGain("b", -0.3, -10.0, 10.0))
     code = Encoding(gains)
     np.testing.assert_allclose(code.values(code.start), [2.0, -0.3])

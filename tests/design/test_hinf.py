@@ -1,7 +1,5 @@
 """The H-infinity norm against python-control, dense grids and values computed by hand."""
 
-from __future__ import annotations
-
 import control
 import numpy as np
 import pytest
@@ -28,7 +26,7 @@ def on_grid(A: Matrix, B: Matrix, C: Matrix, D: Matrix, points: Matrix) -> float
 
 @pytest.mark.parametrize("direct", [False, True])
 @pytest.mark.parametrize("seed", range(12))
-def test_random_systems(seed: int, direct: bool) -> None:
+def test_random_systems(seed, direct):
     system = random_system(seed, direct)
     found = hinf_norm(*system)
     # control takes a tolerance of 1e-10 here
@@ -42,7 +40,7 @@ def test_random_systems(seed: int, direct: bool) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_discrete_systems(seed: int) -> None:
+def test_discrete_systems(seed):
     A, B, C, D = random_system(seed, True)
     A = A / (np.abs(np.linalg.eigvals(A)).max() * 1.05)
     T = 1e-3
@@ -55,7 +53,7 @@ def test_discrete_systems(seed: int) -> None:
 
 
 @pytest.mark.parametrize("damping", [1e-3, 1e-6])
-def test_resonance_close_to_the_axis(damping: float) -> None:
+def test_resonance_close_to_the_axis(damping):
     # 1/(s^2 + 2 d w s + w^2): the peak is 1/(2 d sqrt(1 - d^2) w^2), by hand
     w = 6800.0
     A = np.array([[0.0, w], [-w, -2 * damping * w]])
@@ -64,14 +62,14 @@ def test_resonance_close_to_the_axis(damping: float) -> None:
     assert found.omega == pytest.approx(w, rel=1e-5)
 
 
-def test_peak_only_in_the_limit() -> None:
+def test_peak_only_in_the_limit():
     # (s + 1)/(s + 2) grows towards 1
     one = np.ones((1, 1))
     found = hinf_norm(-2 * one, one, -one, one)
     assert found.gain == pytest.approx(1.0, rel=1e-8)
 
 
-def test_scales_eight_decades_apart() -> None:
+def test_scales_eight_decades_apart():
     # (s + 4)/(s + 4e-4) into 1/(1.4e-5 s + 1): 1e4 at s = 0
     A = np.array([[-4e-4, 0.0], [1e5 / 1.4, -1e5 / 1.4]])
     B, C = np.array([[4.0 - 4e-4], [1e5 / 1.4]]), np.array([[0.0, 1.0]])
@@ -80,7 +78,7 @@ def test_scales_eight_decades_apart() -> None:
 
 
 @pytest.mark.parametrize("T_s", [None, 1e-4])
-def test_no_norm_on_or_beyond_the_edge(T_s: float | None) -> None:
+def test_no_norm_on_or_beyond_the_edge(T_s):
     one = np.ones((1, 1))
     for pole in (0.0, 1.0) if T_s is None else (1.0, -1.0, 1.5):
         with pytest.raises(Unstable, match="unstable"):

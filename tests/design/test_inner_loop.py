@@ -1,7 +1,5 @@
 """The loop with an inner stage: against the compiled kernel, and against the nonlinear bench."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -107,7 +105,7 @@ class Kernel:
 
 @pytest.mark.parametrize("law", ["vsg-2", "dvoc", "vsg-5"])
 @pytest.mark.parametrize("stage", STAGES)
-def test_law_and_stage_are_the_compiled_kernels_slopes(stage: str, law: str) -> None:
+def test_law_and_stage_are_the_compiled_kernels_slopes(stage, law):
     # differences of 1e-6 p.u. have an error of 1e-12 by curvature and of 1e-10 by rounding
     loop = loop_of(STAGES[stage], law)
     c, kernel, h = loop.controller, Kernel(loop), 1e-6
@@ -122,7 +120,7 @@ def test_law_and_stage_are_the_compiled_kernels_slopes(stage: str, law: str) -> 
             np.testing.assert_allclose(found, wanted[:, k], atol=1e-6, err_msg=f"{which}, {k}")
 
 
-def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame() -> None:
+def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame():
     # central differences of f itself, with the voltage on f's own d axis
     par = make_plant(Plant.model_validate(PLANT), T_S).par
     op, h = loop_of(STAGES["cascaded"]).made_of.op, 1e-6
@@ -184,9 +182,7 @@ PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
         (PLL, "vsg-5", {"dc_source": {"mode": "regulated"}, "delay": {"samples": 0}}),
     ],
 )
-def test_a_step_is_that_of_the_nonlinear_bench(
-    stage: str, law: str, plant: dict[str, Any], tmp_path: Any
-) -> None:
+def test_a_step_is_that_of_the_nonlinear_bench(stage, law, plant, tmp_path):
     # 1e-4 p.u. of P_ref: nonlinear terms are of the order of 1e-8
     size, ticks = 1e-4, 1500
     bench = bench_of(stage, law, ticks, {**PLANT, **plant}, tmp_path)
@@ -201,13 +197,13 @@ def test_a_step_is_that_of_the_nonlinear_bench(
         assert np.abs(moved - y[:ticks, column]).max() < 2e-3 * np.abs(y[:, column]).max(), name
 
 
-def test_the_bench_rests_where_a_pll_measures_another_frequency(tmp_path: Any) -> None:
+def test_the_bench_rests_where_a_pll_measures_another_frequency(tmp_path):
     plant = {**PLANT, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}
     bench = bench_of(PLL, "vsg-5", 300, plant, tmp_path)
     assert np.ptp(recorded(bench, 300)["true_p"]) < 1e-11
 
 
-def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues() -> None:
+def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues():
     loop = loop_of(STAGES["virtual-stator"])
     found = loop_margins(loop)
     assert [c.name for c in found.u] == ["i_u", "omega_u", "E_u", "E_q"]
@@ -218,7 +214,7 @@ def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues() -> None:
 
 
 @pytest.mark.parametrize("stage", ["virtual-stator", "cascaded"])
-def test_output_impedance_and_line_make_the_loop(stage: str) -> None:
+def test_output_impedance_and_line_make_the_loop(stage):
     # A step of V_g through the line onto the impedance, against the loop's own response, which
     # holds V_g over a tick; at these frequencies the images of sampling are below 1e-3.
     loop, omega = loop_of(STAGES[stage]), np.geomspace(0.5, 600.0, 25)
@@ -233,7 +229,7 @@ def test_output_impedance_and_line_make_the_loop(stage: str) -> None:
     np.testing.assert_allclose(found, p / (1j * omega * T_S), atol=2e-3 * np.abs(found).max())
 
 
-def test_many_loops_with_stages_are_each_of_them() -> None:
+def test_many_loops_with_stages_are_each_of_them():
     loops = [loop_of(STAGES["cascaded"], grid={"scr": s, "x_over_r": 6.0}) for s in (2.0, 8.0)]
     many = ClosedLoop.stacked(loops)
     np.testing.assert_array_equal(many.A, [of.A for of in loops])
@@ -256,12 +252,12 @@ def test_many_loops_with_stages_are_each_of_them() -> None:
         (VirtualStator(m=0.9), {}, "the limit of modulation acts"),
     ],
 )
-def test_a_limit_that_acts_is_named(stage: InnerStage, references: Any, said: str) -> None:
+def test_a_limit_that_acts_is_named(stage, references, said):
     with pytest.raises(NoEquilibrium, match=said):
         loop_of(stage)
 
 
-def test_a_continuous_loop_has_no_stage() -> None:
+def test_a_continuous_loop_has_no_stage():
     law = replace(get_law("vsg-2"), inner=VirtualStator())
     with pytest.raises(LawError, match="inner: runs from tick to tick"):
         ClosedLoop.of(law, ideal=True)
@@ -274,7 +270,7 @@ def test_a_continuous_loop_has_no_stage() -> None:
         ClosedLoop(bare.plant, bare.law, stage=stage)
 
 
-def test_an_operating_point_at_the_power_limit_is_below_it() -> None:
+def test_an_operating_point_at_the_power_limit_is_below_it():
     # the shipped stages limit p to 1 p.u., which is rated power
     point = Point(P_ref=1.0, delay=1.3)
     law = discretise(
@@ -284,7 +280,7 @@ def test_an_operating_point_at_the_power_limit_is_below_it() -> None:
     np.testing.assert_array_equal(point.loop(law).A, point.loop(free).A)
 
 
-def test_a_search_in_the_box_sees_the_stage_at_every_point() -> None:
+def test_a_search_in_the_box_sees_the_stage_at_every_point():
     file = law_file("mimo-gfm-practical")
     file = file.model_copy(update={"inner": named_inner("cascaded")})
     gains = free_gains(file)
@@ -296,7 +292,7 @@ def test_a_search_in_the_box_sees_the_stage_at_every_point() -> None:
     np.testing.assert_allclose(Loops(file, gains, points).sigma(values), each, rtol=1e-6)
 
 
-def test_the_searchs_loop_has_the_norms_of_the_sampled_one() -> None:
+def test_the_searchs_loop_has_the_norms_of_the_sampled_one():
     """Its inverse Tustin transform on a grid, against the sampled loop's guaranteed norms."""
     file = law_file("vsg-2").model_copy(update={"inner": named_inner("virtual-stator")})
     problem = PaperProblem(file, free_gains(file))

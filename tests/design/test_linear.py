@@ -1,7 +1,5 @@
 """Linear models against SciPy, finite differences, the nonlinear bench, and known figures."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -42,7 +40,7 @@ def near(found: list[Mode], frequency_hz: float) -> Mode:
     return min(found, key=lambda mode: abs(mode.frequency_hz - frequency_hz))
 
 
-def test_plant_agrees_with_central_differences() -> None:
+def test_plant_agrees_with_central_differences():
     # 1e-6 p.u. up and down: an error of order 1e-12 from the curvature, 1e-10 from rounding,
     # both on derivatives of up to 2e4 1/s
     par = make_plant(Plant(), 1e-4).par
@@ -65,7 +63,7 @@ def test_plant_agrees_with_central_differences() -> None:
 
 
 @pytest.mark.parametrize("T", [0.0, 1e-5, 1e-4, 1e-2])
-def test_hold_agrees_with_scipy(T: float) -> None:
+def test_hold_agrees_with_scipy(T):
     par = make_plant(Plant.model_validate({**RIG, **REGULATED}), 1e-4).par
     plant = linearise_plant(par, operating_point(par, discretise(get_law("vsg-2"), 1e-4), REF))
     n = len(plant.A)
@@ -126,7 +124,7 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         ("dvoc", {"factors": {"L_g": 10.0, "R_g": 10.0}, "delay": {"samples": 1}}),
     ],
 )
-def test_predicts_the_nonlinear_bench(law: str, plant: dict[str, Any], tmp_path: Path) -> None:
+def test_predicts_the_nonlinear_bench(law, plant, tmp_path):
     simulated, predicted = perturbed_run(law, plant, 2000, 1e-5, tmp_path)
     assert np.abs(simulated - predicted).max() < 2e-3 * np.abs(predicted).max()
 
@@ -148,9 +146,7 @@ def rate_and_frequency(x: np.ndarray, T: float, band: tuple[float, float]) -> tu
     ("law", "band", "ticks", "stride"),
     [("vsg-2", (40.0, 60.0), 4000, 10), ("mimo-gfm", (1000.0, 1120.0), 2500, 2)],
 )
-def test_mode_is_what_the_bench_shows(
-    law: str, band: tuple[float, float], ticks: int, stride: int, tmp_path: Path
-) -> None:
+def test_mode_is_what_the_bench_shows(law, band, ticks, stride, tmp_path):
     simulated, _ = perturbed_run(law, RIG, ticks, 1e-6, tmp_path)
     sigma, f_hz = rate_and_frequency(simulated[500::stride], stride * 1e-4, band)
     mode = near(modes(law, RIG), sum(band) / 2)
@@ -169,16 +165,14 @@ def test_mode_is_what_the_bench_shows(
         ("mimo-gfm", {"delay": {"samples": 1}}, False, 1180.0, 22.6),
     ],
 )
-def test_known_figures(
-    law: str, plant: dict[str, Any], ideal: bool, frequency: float, sigma: float
-) -> None:
+def test_known_figures(law, plant, ideal, frequency, sigma):
     mode = near(modes(law, plant, ideal=ideal), frequency)
     assert mode.sigma == pytest.approx(sigma, abs=0.06)
     assert mode.frequency_hz == pytest.approx(frequency, abs=0.5)
 
 
 @pytest.mark.parametrize("law", every_law())
-def test_sampling_fast_leads_to_the_continuous_loop(law: str) -> None:
+def test_sampling_fast_leads_to_the_continuous_loop(law):
     # without delay only the hold's half a sample differs: at 1 us it turns 1.1 kHz by 0.4 deg
     home = get_law(law).home_grid
     plant = {"factors": {"L_g": home.L_g, "R_g": home.R_g}}
@@ -188,12 +182,12 @@ def test_sampling_fast_leads_to_the_continuous_loop(law: str) -> None:
     assert fast[0].sigma < 0.0  # the catalogue's promise for each law's home grid
 
 
-def test_row_1_is_no_mode_beside_a_regulated_source() -> None:
+def test_row_1_is_no_mode_beside_a_regulated_source():
     # its integrator would be an open one, at z = 1
     assert max(m.sigma for m in modes("vsg-2", {**REGULATED})) < -0.1
 
 
-def test_mode_ratio() -> None:
+def test_mode_ratio():
     assert Mode(-3.0, 4.0 / (2 * np.pi)).ratio == pytest.approx(0.6)
     assert Mode(2.0, 0.0).ratio == -1.0
     assert Mode(0.0, 0.0).ratio == 0.0

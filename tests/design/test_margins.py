@@ -1,7 +1,5 @@
 """Margins against closed forms, python-control, SLICOT, eigenvalues and the nonlinear bench."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -65,7 +63,7 @@ def loop_of(law: str | Law, scenario: str, **plant: Any) -> ClosedLoop:
     return ClosedLoop.of(law, changed, s.references.vector())
 
 
-def test_integrator_has_the_margins_that_algebra_gives() -> None:
+def test_integrator_has_the_margins_that_algebra_gives():
     # z-transform of 1/s is T/(z-1): 1 + k T/(z-1) = 0 at z = 1 - k T, on the circle at k T = 2;
     # |T/(e^(j w T) - 1)| = 1 at 2 sin(w T/2) = k T, where the phase is -90 deg - w T/2
     k = 20.0
@@ -87,7 +85,7 @@ def test_integrator_has_the_margins_that_algebra_gives() -> None:
 
 @pytest.mark.parametrize("samples", [0.0, 1.0, 1.4])
 @pytest.mark.parametrize("part", [0.0, 0.3])
-def test_fractional_delay_of_an_integrator(samples: float, part: float) -> None:
+def test_fractional_delay_of_an_integrator(samples, part):
     # u acts with its delay: the integral over a tick is that of two held values, at u and at y
     loop = chain([1.0], [1.0, 0.0], 5.0, samples)
     for extra in ({"u": part * T}, {"y": part * T}):
@@ -103,7 +101,7 @@ def test_fractional_delay_of_an_integrator(samples: float, part: float) -> None:
         np.testing.assert_allclose(y, ramp, atol=1e-12)
 
 
-def test_agrees_with_python_control() -> None:
+def test_agrees_with_python_control():
     loop = chain([1200.0], [1.0, 10.0, 416.0, 800.0], 2.0)
     locus = locus_at_u(loop)
     m = gain_phase(locus, *locus.sampled(), 0)
@@ -123,7 +121,7 @@ def test_agrees_with_python_control() -> None:
     )
 
 
-def test_scan_stops_at_the_first_loss() -> None:
+def test_scan_stops_at_the_first_loss():
     def island(value: float) -> float:  # lost in (2, 3) and from 7 on
         return 0.5 if 2.0 < value < 3.0 or value > 7.0 else -0.5
 
@@ -131,7 +129,7 @@ def test_scan_stops_at_the_first_loss() -> None:
     assert first_loss(lambda value: -0.5, [0.0, 1.0]) is None
 
 
-def test_mu_of_known_matrices() -> None:
+def test_mu_of_known_matrices():
     # rank one: mu = sum |u_i v_i|; a triangular matrix: its largest diagonal entry
     u, v = np.array([1.0, 2j, -3.0, 0.5]), np.array([0.1, 1.0, 2.0, 4j])
     found = mu_bound(np.outer(u, v)[None])[0]
@@ -140,7 +138,7 @@ def test_mu_of_known_matrices() -> None:
 
 
 @pytest.mark.parametrize("at", [locus_at_u, locus_at_y])
-def test_disk_margin_is_mu(at: Any) -> None:
+def test_disk_margin_is_mu(at):
     slycot = pytest.importorskip("slycot")
     locus = at(loop_of("mimo-gfm", "rig_pref_step"))
     m = len(locus.channels)
@@ -162,7 +160,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("law", "scenario", "plant"), CASES)
-def test_loop_is_that_of_the_modes(law: str, scenario: str, plant: dict[str, Any]) -> None:
+def test_loop_is_that_of_the_modes(law, scenario, plant):
     # the emulator's own record of its delay, against the delay in seconds
     loop = loop_of(law, scenario, **plant)
     ours = np.sort(np.abs(np.linalg.eigvals(loop.A)))[::-1]
@@ -173,9 +171,7 @@ def test_loop_is_that_of_the_modes(law: str, scenario: str, plant: dict[str, Any
 
 
 @pytest.mark.parametrize(("law", "scenario", "plant"), CASES[1:4])
-def test_margins_are_where_eigenvalues_cross(
-    law: str, scenario: str, plant: dict[str, Any]
-) -> None:
+def test_margins_are_where_eigenvalues_cross(law, scenario, plant):
     loop = loop_of(law, scenario, **plant)
     m = loop_margins(loop)
     assert all(c.confirmed for c in (*m.u, *m.y))
@@ -202,7 +198,7 @@ def test_margins_are_where_eigenvalues_cross(
         ("vsg-2", "cascaded", {"delay": {"samples": 1}}),
     ],
 )
-def test_turns_count_the_unstable_poles(law: str, inner: str | None, plant: dict[str, Any]) -> None:
+def test_turns_count_the_unstable_poles(law, inner, plant):
     """The first unstable value of each scan by the argument principle is that by eigenvalues."""
     given = load_law(law, inner).laws[0]
     loop = loop_of(given, "rig_pref_step", **plant)
@@ -238,7 +234,7 @@ def swing(law: str, plant: dict[str, Any], tmp: Path, ticks: int = 6000) -> floa
     return float(np.abs(p[2 * third :]).max() / np.abs(p[third : 2 * third]).max())
 
 
-def test_delay_margin_on_the_nonlinear_bench(tmp_path: Path) -> None:
+def test_delay_margin_on_the_nonlinear_bench(tmp_path):
     # the ideal mimo-gfm loses 1181 Hz half a sample out; 5 % of that is 2.6 us
     margin = overall_delay(loop_of("mimo-gfm", "pref_step"))
     assert 0.0 < margin.seconds < 1e-4
@@ -249,7 +245,7 @@ def test_delay_margin_on_the_nonlinear_bench(tmp_path: Path) -> None:
         assert (found > 1.0) is grows
 
 
-def test_element_ranges_are_where_eigenvalues_cross() -> None:
+def test_element_ranges_are_where_eigenvalues_cross():
     loop = loop_of("mimo-gfm", "rig_pref_step")
     bounded = 0
     for name, found in element_ranges(loop).items():
@@ -266,7 +262,7 @@ def test_element_ranges_are_where_eigenvalues_cross() -> None:
     assert bounded >= 3
 
 
-def test_grid_strength_and_region() -> None:
+def test_grid_strength_and_region():
     loop = loop_of("mimo-gfm", "rig_pref_step")
     grid = grid_strength(loop)
     # the paper's line is 1.75 % of Z_b; R_g at half of it
@@ -303,7 +299,7 @@ def late_run(missed: slice) -> Run:
         (slice(500, 520), False, "does not fit", 2100.0),
     ],
 )
-def test_measured_delay(missed: slice, fits: bool, word: str, worst: float) -> None:
+def test_measured_delay(missed, fits, word, worst):
     found = loop_delay(late_run(missed), 1e-4, 1.5e-3)
     assert found.fits(1500.0) is fits
     assert word in found.words(1500.0)
@@ -317,9 +313,7 @@ def command(*arguments: str) -> int:
     return main(["design", "margins", *arguments])
 
 
-def test_command_as_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_as_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("gfm_hil.cli.design.margins.POINTS", 3)
     run, pictures = tmp_path / "run", tmp_path / "pictures"
     arguments = ["run", "rig_pref_step", "--link", "inproc", "--duration", "1.1"]
@@ -337,16 +331,14 @@ def test_command_as_json(
     assert np.shape(out["region"]["sigma"]) == (3, 3)
 
 
-def test_the_command_names_the_least_damped_mode_by_its_ratio(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_names_the_least_damped_mode_by_its_ratio(capsys):
     assert command("--law", "vsg-2") == 0  # on pref_step, as bode, nyquist, poles and step
     said = capsys.readouterr().out
     assert "P_ref steps from 0.5 to 1 p.u." in said
     assert "least damped: damping ratio 0.00148 at 1075 Hz" in said  # of filter and line
 
 
-def test_unstable_loop_has_no_margins(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_unstable_loop_has_no_margins(capsys, tmp_path):
     assert command("--law", "vsg-2", "--scenario", "rig_pref_step", "--json") == 3
     out = json.loads(capsys.readouterr().out)
     assert out["stable"] is False and "delay_us" not in out
@@ -361,7 +353,7 @@ def test_unstable_loop_has_no_margins(capsys: pytest.CaptureFixture[str], tmp_pa
     assert "neither grows nor decays" in " ".join(capsys.readouterr().out.split())
 
 
-def test_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_input(tmp_path, capsys):
     assert command("--run", str(tmp_path / "nothing")) == 2
     assert "is not a run folder (signals.npz is missing)" in capsys.readouterr().err
     (tmp_path / "scenario.toml").write_text("")
@@ -371,7 +363,7 @@ def test_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "nobody" in capsys.readouterr().err
 
 
-def test_longest_delay_keeps_the_matrices_small() -> None:
+def test_longest_delay_keeps_the_matrices_small():
     assert longest(1e-4) == pytest.approx(0.01)
     assert longest(1e-5) == pytest.approx(0.003)
     assert longest(1e-3) == pytest.approx(0.05)

@@ -1,8 +1,6 @@
 """The loop of a network: against the loop of one converter, against the same network drawn in
 another way, and against the nonlinear bench."""
 
-from __future__ import annotations
-
 import copy
 import tomllib
 from pathlib import Path
@@ -68,9 +66,7 @@ def are_equal(found: np.ndarray, wanted: np.ndarray) -> bool:
         ("vsg-5", None, {**RIG, "dc_source": {"mode": "regulated", "tau_s": 3e-3}, "grid": FINITE}),
     ],
 )
-def test_a_network_of_one_is_the_loop_of_one_converter(
-    law: str, inner: str | None, plant: dict[str, Any]
-) -> None:
+def test_a_network_of_one_is_the_loop_of_one_converter(law, inner, plant):
     of = scenario({"converters": {"A": {"node": "g"}}, "grid": "g"}, law=law, plant=plant,
                   **({} if inner is None else {"inner": inner}))  # fmt: skip
     one = ClosedLoop.of(load_law(law, inner).laws[0], of.plant, of.references.vector())
@@ -152,7 +148,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
 @pytest.mark.full  # compiles the loop of several converters
 @pytest.mark.parametrize("of", [island, two_islands, with_machine, with_finite_grid, with_pll])
 @pytest.mark.parametrize("reference", ["P_ref", "V_ref"])
-def test_a_step_is_that_of_the_nonlinear_bench(of: Any, reference: str, tmp_path: Path) -> None:
+def test_a_step_is_that_of_the_nonlinear_bench(of, reference, tmp_path):
     # 1e-4 p.u.: nonlinear terms are of the order of 1e-8. The tolerance is that of one converter.
     size, ticks, given = 1e-4, 3000, of(tmp_path)
     rest, moved = recorded(given, ticks), recorded(given, ticks, **{reference: size})
@@ -165,7 +161,7 @@ def test_a_step_is_that_of_the_nonlinear_bench(of: Any, reference: str, tmp_path
 
 
 @pytest.mark.full
-def test_lines_in_series_and_in_parallel_are_one_line() -> None:
+def test_lines_in_series_and_in_parallel_are_one_line():
     whole = loop(with_machine())
     split = {"f1": {"start": "bus", "end": "mid", "L": 0.04, "R": 0.008},
              "f2": {"start": "mid", "end": "far", "L": 0.06, "R": 0.012}}  # fmt: skip
@@ -180,7 +176,7 @@ def test_lines_in_series_and_in_parallel_are_one_line() -> None:
 
 
 @pytest.mark.full
-def test_two_converters_of_half_the_size_are_one(tmp_path: Path) -> None:
+def test_two_converters_of_half_the_size_are_one(tmp_path):
     whole = tomllib.loads((Path(gfm_plant.__file__).parent / "converters/paper.toml").read_text())
     halved = {"S_n": 0.5, "C_f": 0.5, "C_dc": 0.5, "L_f": 2.0, "R_f": 2.0, "L_g": 2.0, "R_g": 2.0}
     half = tmp_path / "half.toml"
@@ -203,7 +199,7 @@ def test_two_converters_of_half_the_size_are_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_participations_say_who_oscillates() -> None:
+def test_participations_say_who_oscillates():
     """Two equal converters at one bus swing against each other, and both against a third one."""
     given = scenario({"converters": {n: {"node": "bus"} for n in "AB"} | {"C": {"node": "far"}},
                       "lines": {"l": {"start": "bus", "end": "far", "L": 0.3, "R": 0.03}},
@@ -222,7 +218,7 @@ def test_participations_say_who_oscillates() -> None:
 
 
 @pytest.mark.full
-def test_islands_have_their_own_speed_and_their_own_modes() -> None:
+def test_islands_have_their_own_speed_and_their_own_modes():
     network = loop(two_islands())
     a, b, c = (member.op.u[1] for member in network.members)
     assert b == pytest.approx(c, abs=1e-12) and abs(a - b) > 1e-3
@@ -235,7 +231,7 @@ def test_islands_have_their_own_speed_and_their_own_modes() -> None:
 
 
 @pytest.mark.full
-def test_a_view_has_the_modes_and_the_response_of_the_network() -> None:
+def test_a_view_has_the_modes_and_the_response_of_the_network():
     network, omega = loop(with_machine()), np.geomspace(0.1, 2e4, 20)
     whole = network.frequency_response(omega)
     for k, name in enumerate(network.names):
@@ -247,7 +243,7 @@ def test_a_view_has_the_modes_and_the_response_of_the_network() -> None:
 
 
 @pytest.mark.full
-def test_margins_of_a_converter_are_those_of_the_network() -> None:
+def test_margins_of_a_converter_are_those_of_the_network():
     """With 0.99 of the delay margin of one converter the network is stable, with 1.01 it is not,
     and so with each of its gains (``confirmed``)."""
     network = loop(with_finite_grid(Path()))
@@ -264,7 +260,7 @@ def test_margins_of_a_converter_are_those_of_the_network() -> None:
         assert sigma[0] < 0.0 < sigma[1]
 
 
-def test_what_cannot_be() -> None:
+def test_what_cannot_be():
     one = loop(scenario({"converters": {"A": {"node": "g"}}, "grid": "g"}, law="vsg-2"))
     assert repr(one) == "<NetworkLoop A (vsg-2), T_s = 0.0001 s, A (11, 11)>"
     assert repr(one.converter("A")) == "<ClosedLoop A (vsg-2), T_s = 0.0001 s, A (11, 11)>"

@@ -1,9 +1,5 @@
 """The paper's problem: weights, channels, and gamma of the printed gains."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import control
 import numpy as np
 import pytest
@@ -21,13 +17,13 @@ def problem(law: str) -> PaperProblem:
 
 
 @pytest.mark.parametrize(("law", "gamma"), [("mimo-gfm", 2.0209), ("vsg-2", 15.975)])
-def test_printed_gains(law: str, gamma: float) -> None:
+def test_printed_gains(law, gamma):
     # computed before this module existed, with other programs, to four digits
     assert max(c.norm for c in problem(law).channels(NONE)) == pytest.approx(gamma, rel=5e-5)
 
 
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-2"])
-def test_channels_agree_with_control_and_a_dense_grid(law: str) -> None:
+def test_channels_agree_with_control_and_a_dense_grid(law):
     p = problem(law)
     A, B, C, D = p.closed_loop(NONE).performance()
     for channel, weight in zip(p.channels(NONE), PAPER_WEIGHTS, strict=True):
@@ -43,7 +39,7 @@ def test_channels_agree_with_control_and_a_dense_grid(law: str) -> None:
 
 
 @pytest.mark.parametrize("weight", PAPER_WEIGHTS, ids=lambda w: f"W_{w.i}{w.j}")
-def test_state_space_of_a_weight(weight: Weight) -> None:
+def test_state_space_of_a_weight(weight):
     s, T = 1j * np.array([1e-3, 3.0, 1e3, 2e4]), 1e-4
     A, B, C, D = weight.state_space()
     for x in s:
@@ -56,7 +52,7 @@ def test_state_space_of_a_weight(weight: Weight) -> None:
         assert value == pytest.approx(complex(weight(np.array([x]))[0]), rel=1e-7)
 
 
-def test_sampled_fast_leads_to_the_continuous_norm() -> None:
+def test_sampled_fast_leads_to_the_continuous_norm():
     p = PaperProblem(law_file("mimo-gfm"), (), T_s=1e-6)
     for sampled, ideal in zip(
         p.closed_loop(NONE).sampled(p.T_s).channels(), p.channels(NONE), strict=True
@@ -76,12 +72,12 @@ def test_sampled_fast_leads_to_the_continuous_norm() -> None:
         ((0.0, 0.0), (1.0, 1.0), "numerator is zero"),
     ],
 )
-def test_weights_that_cannot_be(num: tuple[float, ...], den: tuple[float, ...], words: str) -> None:
+def test_weights_that_cannot_be(num, den, words):
     with pytest.raises(ValueError, match=words):
         Weight(1, 1, num, den)
 
 
-def test_weights_from_a_file(tmp_path: Path) -> None:
+def test_weights_from_a_file(tmp_path):
     path = tmp_path / "w.toml"
     path.write_text("[W_11]\nnum = [1.0, 4]\nden = [1.0, 0.0004]\n")
     assert read_weights(path) == (PAPER_WEIGHTS[0],)
@@ -98,7 +94,7 @@ def test_weights_from_a_file(tmp_path: Path) -> None:
         ("[W_11", "table declaration"),
     ],
 )
-def test_weight_files_that_cannot_be(text: str, words: str, tmp_path: Path) -> None:
+def test_weight_files_that_cannot_be(text, words, tmp_path):
     path = tmp_path / "w.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=words):

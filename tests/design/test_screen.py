@@ -1,7 +1,5 @@
 """The fast estimate and the polish against the guaranteed norm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -24,7 +22,7 @@ def gamma(values: np.ndarray) -> float:
     return max(c.norm for c in PROBLEM.channels(values))
 
 
-def test_close_below_the_norm() -> None:
+def test_close_below_the_norm():
     random = np.random.default_rng(0)
     values = PRINTED * (1 + 0.05 * random.normal(size=(12, len(PRINTED))))
     costs = PROBLEM.many(values)
@@ -37,7 +35,7 @@ def test_close_below_the_norm() -> None:
         assert PROBLEM(row) == pytest.approx(cost, rel=1e-12)
 
 
-def test_unstable_points_are_ranked_by_their_growth() -> None:
+def test_unstable_points_are_ranked_by_their_growth():
     values = np.repeat(PRINTED[None], 3, axis=0)
     values[:, [g.name for g in GAINS].index("k_34")] = (50.0, 70.0, 90.0)
     costs = PROBLEM.many(values)
@@ -47,7 +45,7 @@ def test_unstable_points_are_ranked_by_their_growth() -> None:
     )
 
 
-def test_slopes_of_peaks_against_differences() -> None:
+def test_slopes_of_peaks_against_differences():
     code = Encoding(GAINS)
     at, h = code.start, 1e-5
 
@@ -69,7 +67,7 @@ def test_slopes_of_peaks_against_differences() -> None:
 
 
 @pytest.mark.parametrize("law", ["mimo-gfm", "vsg-12"])
-def test_curvature_of_peaks(law: str) -> None:
+def test_curvature_of_peaks(law):
     """A peak moves in frequency: its model is compared with peaks found by search."""
     gains = free_gains(law_file(law))
     problem, code = PaperProblem(law_file(law), gains), Encoding(gains)
@@ -92,7 +90,7 @@ def test_curvature_of_peaks(law: str) -> None:
         assert abs(curved - true) < 0.1 * abs(flat - true) + 1e-8
 
 
-def test_polish_lowers_gamma_within_the_bounds() -> None:
+def test_polish_lowers_gamma_within_the_bounds():
     code = Encoding(GAINS)
     found = polish(
         lambda x: PROBLEM.loops(code.values(x)), PROBLEM.weights, code.start, code.low, code.high

@@ -1,7 +1,5 @@
 """The search: known optima, the paper's gains, bounds, seeds, and no solution."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,19 +38,19 @@ def gains(n: int, start: float = 1.0) -> list[FreeGain]:
 
 @pytest.mark.parametrize("start", [1.0, 50.0])  # 50: infeasible at first
 @pytest.mark.parametrize("n", [1, 3])
-def test_reaches_a_known_optimum(n: int, start: float) -> None:
+def test_reaches_a_known_optimum(n, start):
     least = (2.0, 30.0, 0.3)[:n]
     found = tune(Valley(least), gains(n, start), evaluations=6000, starts=1)
     np.testing.assert_allclose(found.values, least, rtol=1e-3)
 
 
-def test_a_least_beyond_a_bound_stops_there() -> None:
+def test_a_least_beyond_a_bound_stops_there():
     found = tune(Valley((0.01,)), gains(1), evaluations=2000, starts=1)
     assert found.values[0] == pytest.approx(0.1, rel=1e-3)
     assert found.values[0] >= 0.1
 
 
-def test_none_to_be_found() -> None:
+def test_none_to_be_found():
     fixed = [FreeGain("k_0", 50.0, 10.0, 100.0)]
     with pytest.raises(NotStabilised, match="10 1/s") as none:
         tune(Valley((20.0,)), fixed, evaluations=1000, starts=1)
@@ -69,29 +67,29 @@ def paper(law: str, seed: int = 0, start: dict[str, float] | None = None) -> Tun
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.full)])
-def test_mimo_gfm_from_the_papers_start(seed: int) -> None:
+def test_mimo_gfm_from_the_papers_start(seed):
     """The lower of two families of minima, one with k_pdc near 100, one near 6."""
     assert paper("mimo-gfm", seed).cost == pytest.approx(1.338, rel=0.005)  # printed gains: 2.02
 
 
-def test_vsg_2_is_no_worse_than_printed() -> None:
+def test_vsg_2_is_no_worse_than_printed():
     found = paper("vsg-2")
     assert found.cost <= 15.972806
     assert found.values == pytest.approx([5.9801, 1.9048], rel=1e-4)  # the printed gains
 
 
-def test_the_same_for_a_seed() -> None:
+def test_the_same_for_a_seed():
     np.testing.assert_array_equal(paper("droop-5", 3).values, paper("droop-5", 3).values)
 
 
-def test_unstable_start_is_stabilised_first() -> None:
+def test_unstable_start_is_stabilised_first():
     start = {"k_34": 50.0}
     problem = PaperProblem(law_file("vsg-2"), free_gains(law_file("vsg-2"), start))
     assert problem(np.array([g.start for g in problem.gains])) > UNSTABLE
     assert paper("vsg-2", start=start).cost < 16.0
 
 
-def test_gains_that_move_the_operating_point() -> None:
+def test_gains_that_move_the_operating_point():
     """k_34 sets the equilibrium of E_u of droop-4: gamma is that of the loop at that point."""
     found = paper("droop-4")
     file = law_file("droop-4")
@@ -100,7 +98,7 @@ def test_gains_that_move_the_operating_point() -> None:
     assert max(c.norm for c in own.channels(found.values)) == pytest.approx(found.cost, rel=1e-9)
 
 
-def test_the_reason_when_there_are_none() -> None:
+def test_the_reason_when_there_are_none():
     file = law_file("psc-1")
     problem = PaperProblem(file, free_gains(file))
     with pytest.raises(NotStabilised, match="no stabilising gains") as none:
@@ -110,7 +108,7 @@ def test_the_reason_when_there_are_none() -> None:
     assert "i_o" in words  # of the grid's current
 
 
-def test_gains_that_cannot_move_gamma_are_chosen_for_the_rest() -> None:
+def test_gains_that_cannot_move_gamma_are_chosen_for_the_rest():
     """droop-2 controls p through V: in steady state two channels are 294 for any gains."""
     file = law_file("droop-2")
     problem = PaperProblem(file, free_gains(file))

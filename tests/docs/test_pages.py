@@ -1,7 +1,5 @@
 """The pages' examples work, and their hand-written lists match the code."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import sys
@@ -30,12 +28,12 @@ RIG = {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": 300.0}}
 
 @pytest.mark.parametrize("name", ["my-law", "my-schedule", "droop-5-integral"])
 @pytest.mark.parametrize("plant", [{}, RIG])
-def test_example_law_is_stable(name: str, plant: dict) -> None:
+def test_example_law_is_stable(name, plant):
     for stage in load_law(str(EXAMPLES / f"{name}.toml")).laws:
         assert ClosedLoop.of(stage, Plant.model_validate(plant)).modes()[0].sigma < -0.5
 
 
-def test_droop_5_with_row_3_of_vsg_2_is_vsg_2_from_the_measurements() -> None:
+def test_droop_5_with_row_3_of_vsg_2_is_vsg_2_from_the_measurements():
     droop, vsg = get_law(str(EXAMPLES / "droop-5-integral.toml")), get_law("vsg-2")
     for s in (0.1j, 10j, 1e3j):
         for i in range(3):
@@ -50,13 +48,11 @@ def example_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run_scenario(scenario, tmp_path_factory.mktemp("docs") / "run")
 
 
-def test_example_scenario_completes(example_run: Run) -> None:
+def test_example_scenario_completes(example_run):
     assert example_run.summary["status"] == "completed"
 
 
-def test_modes_of_the_example_law_are_looked_at_as_the_page_says(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_modes_of_the_example_law_are_looked_at_as_the_page_says(capsys, monkeypatch):
     (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "laws.md").read_text("utf-8"), re.S)
     monkeypatch.chdir(DOCS.parent)
     exec(program, {})
@@ -65,7 +61,7 @@ def test_modes_of_the_example_law_are_looked_at_as_the_page_says(
     assert max(rates) < 0
 
 
-def test_no_property_of_the_api_begins_with_a_colon_sentence() -> None:
+def test_no_property_of_the_api_begins_with_a_colon_sentence():
     """Sphinx reads what stands before a colon of a property's first line as its type."""
     rooms = (gfmhil, gfmhil.design, gfmhil.envelopes)
     names = {getattr(room, name) for room in rooms for name in room.__all__ if name != "design"}
@@ -81,7 +77,7 @@ def test_no_property_of_the_api_begins_with_a_colon_sentence() -> None:
     assert [name for name, line in first.items() if ":" in line] == []
 
 
-def test_readme_names_pages_that_there_are() -> None:
+def test_readme_names_pages_that_there_are():
     text = (DOCS.parent / "README.md").read_text("utf-8")
     named = re.findall(r"\]\(([^)#:]+)", text)
     assert len(named) > 10
@@ -98,14 +94,14 @@ def documented(head: str) -> list[set[str]]:
     ]
 
 
-def test_summary_keys_are_documented(example_run: Run) -> None:
+def test_summary_keys_are_documented(example_run):
     whole, event = documented("summary.json")
     assert whole == {*example_run.summary, "instructions"}  # of a processor in the loop
     there = {key for e in example_run.summary["events"] for key in e}
     assert event == there | {"cut_short"}  # which only a run that trips has
 
 
-def test_run_folder_is_documented(example_run: Run) -> None:
+def test_run_folder_is_documented(example_run):
     (files,) = documented("The run folder")[:1]
     assert {path.name for path in example_run.folder.iterdir()} <= {f for f in files if "." in f}
 
@@ -114,7 +110,7 @@ def numbers(row: str) -> list[float]:
     return [float(n) for n in re.findall(r"-?\d+(?:\.\d+)?", row.replace("−", "-"))]
 
 
-def test_committed_eigenvalues_are_current(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_committed_eigenvalues_are_current(monkeypatch):
     # the tables with runs of the bench take a minute: `python docs/make_figures.py`
     monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
     from _figures import eigenvalues
@@ -136,7 +132,7 @@ def test_committed_eigenvalues_are_current(monkeypatch: pytest.MonkeyPatch) -> N
             np.testing.assert_allclose(numbers(old), numbers(new), rtol=1e-3, atol=0.02)
 
 
-def test_committed_modes_over_the_delay_are_current(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_committed_modes_over_the_delay_are_current(monkeypatch):
     monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
     from _figures import delay_loci
 
@@ -150,9 +146,7 @@ def test_committed_modes_over_the_delay_are_current(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.full
 @pytest.mark.timeout(600)
-def test_worked_example_of_a_tuning_says_what_the_page_shows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_worked_example_of_a_tuning_says_what_the_page_shows(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [str(DOCS), *sys.path])
     from _figures import tuning
 
@@ -171,7 +165,7 @@ def test_worked_example_of_a_tuning_says_what_the_page_shows(
         assert [float(n) for n in re.findall(what, said[name])] == pytest.approx(shown, rel=0.02)
 
 
-def test_weights_to_begin_with_are_the_papers() -> None:
+def test_weights_to_begin_with_are_the_papers():
     found = {(w.i, w.j): w for w in read_weights(EXAMPLES / "my-weights.toml")}
     s = 1j * np.logspace(-4, 6, 50)
     for weight in PAPER_WEIGHTS:

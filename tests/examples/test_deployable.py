@@ -1,7 +1,5 @@
 """The box of real loops, and the gains that must be stable in it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -54,7 +52,7 @@ def delay_margin(law: str, dc: Source = "controlled") -> float:
         Point(0.5, 0.5, 10.0, 1.5, 0.7, "regulated"),
     ],
 )
-def test_stack_is_the_sampled_loop(point: Point) -> None:
+def test_stack_is_the_sampled_loop(point):
     """An independent computation: the runtime discretises the law, support.py gives the matrix."""
     par = make_plant(point.plant(), T_S).par
     # the printed k_35 is k_34/D_q to four digits; a search ties it exactly
@@ -68,7 +66,7 @@ def test_stack_is_the_sampled_loop(point: Point) -> None:
     assert found[1] == pytest.approx(expected, abs=1e-5)
 
 
-def test_overshoot_is_that_of_the_loop_stepped_tick_by_tick() -> None:
+def test_overshoot_is_that_of_the_loop_stepped_tick_by_tick():
     point = Point(0.1, 1.0, 20.0, 5.0)
     par = make_plant(point.plant(), T_S).par
     law = discretise(get_law(LAW), T_S)
@@ -87,7 +85,7 @@ def test_overshoot_is_that_of_the_loop_stepped_tick_by_tick() -> None:
     assert found == pytest.approx(max(p.max() - 1.0, 0.0), abs=2e-3)
 
 
-def test_corners_are_all_combinations_and_random_points_lie_inside() -> None:
+def test_corners_are_all_combinations_and_random_points_lie_inside():
     box = Box()
     assert len(box.corners()) == len(set(box.corners())) == 3 * 3 * 4 * 5 * 3 * 2
     inside = box.random(200, seed=3)
@@ -97,25 +95,25 @@ def test_corners_are_all_combinations_and_random_points_lie_inside() -> None:
         assert 1.0 <= p.delay <= 5.0 and 0.0 <= p.P_ref <= 1.0
 
 
-def test_gamma_and_delay_margin() -> None:
+def test_gamma_and_delay_margin():
     channels = PaperProblem(law_file(LAW), gains()).channels(start())
     assert max(c.norm for c in channels) <= 1.5
     assert delay_margin(LAW) >= 1e-3
 
 
 @pytest.mark.full
-def test_every_corner_decays() -> None:
+def test_every_corner_decays():
     assert sigma(CONTROLLED.corners()).max() <= -1.0
     assert sigma(RIG.corners()).max() < 0.0  # stable, but slower: see docs/deployable.md
 
 
-def test_random_points_decay() -> None:
+def test_random_points_decay():
     assert sigma(CONTROLLED.random(250, seed=11)).max() <= -1.0
     assert sigma(RIG.random(100, seed=12)).max() < 0.0
 
 
 @pytest.mark.full
-def test_the_rigs_law_holds_beside_its_source() -> None:
+def test_the_rigs_law_holds_beside_its_source():
     box = replace(RIG, R_f=THIRD, R_g=THIRD)
     assert sigma(box.corners(), RIG_LAW).max() <= -1.0
     assert sigma(box.random(100, seed=13), RIG_LAW).max() <= -1.0
@@ -130,7 +128,7 @@ def test_the_rigs_law_holds_beside_its_source() -> None:
     assert sigma(RIG.corners(), RIG_LAW).max() > 0.0
 
 
-def test_the_rigs_problem_is_that_of_row_1_in_its_source() -> None:
+def test_the_rigs_problem_is_that_of_row_1_in_its_source():
     """With only a PI in row 1, the source does the same as the law would."""
     only_pi = {"k_pdc": 90.0, "k_idc": 400.0, "k_12": 0.0, "k_14": 0.0, "k_15": 0.0}
     file = law_file("mimo-gfm")
@@ -140,7 +138,7 @@ def test_the_rigs_problem_is_that_of_row_1_in_its_source() -> None:
     assert [c.norm for c in own] == pytest.approx([c.norm for c in rig], rel=1e-4)
 
 
-def test_printed_gains_do_not_hold() -> None:
+def test_printed_gains_do_not_hold():
     assert sigma(CONTROLLED.corners(), "mimo-gfm").max() > 100.0
 
 
@@ -152,7 +150,7 @@ def test_printed_gains_do_not_hold() -> None:
         (Point(0.1, 1.0, 20.0, 1.0), 0.20),
     ],
 )
-def test_nonlinear_step(point: Point, limit: float) -> None:
+def test_nonlinear_step(point, limit):
     found = step_run(point, LAW)
     assert found.ended == ""
     assert found.overshoot <= limit
@@ -166,18 +164,18 @@ def test_nonlinear_step(point: Point, limit: float) -> None:
         (Point(0.33, 0.33, 20.0, 1.0, dc="regulated"), 0.20),
     ],
 )
-def test_nonlinear_step_beside_the_rigs_source(point: Point, limit: float) -> None:
+def test_nonlinear_step_beside_the_rigs_source(point, limit):
     found = step_run(point, RIG_LAW)
     assert found.ended == ""
     assert 0.0 < found.ripple < found.overshoot <= limit
     assert step_run(point, LAW).overshoot > 0.2  # the law for the other source
 
 
-def test_nonlinear_bench_tells_a_trip() -> None:
+def test_nonlinear_bench_tells_a_trip():
     assert "over" in step_run(Point(0.1, 0.1, 0.8, 5.0), "mimo-gfm").ended
 
 
-def test_search_tells_what_breaks_and_demands_all_of_the_rig_alone() -> None:
+def test_search_tells_what_breaks_and_demands_all_of_the_rig_alone():
     box = Box((1.0,), (1.0,), (0.8, 20.0), (1.0, 5.0), (0.5,), ("regulated",))
     rows_2_3 = free_gains(law_file(RIG_LAW), only=["k_21", "k_22", "k_31"])
     hard = Wanted(gamma=np.inf, alpha=30.0, rig_alpha=None)
@@ -190,7 +188,7 @@ def test_search_tells_what_breaks_and_demands_all_of_the_rig_alone() -> None:
     assert np.isinf(Wanted().overshoot(Point(dc="regulated")))
 
 
-def test_cost_is_gamma_where_all_holds() -> None:
+def test_cost_is_gamma_where_all_holds():
     paper = PaperProblem(law_file(LAW), gains())
     corner = [Point(0.1, 0.1, 20.0, 5.0)]
     easy = Wanted(gamma=2.0, alpha=1.0, strong=0.05, weak=0.2)

@@ -1,9 +1,6 @@
 """examples/paper/deployable: what its commands print and write."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +11,7 @@ Capture = pytest.CaptureFixture[str]
 SMALL = ("--box", "R_f=1", "--box", "R_g=1", "--box", "L_g=1,3", "--box", "delay=1", "--box")
 
 
-def test_box_beside_the_rigs_source(capsys: Capture) -> None:
+def test_box_beside_the_rigs_source(capsys):
     options = ("--random", "5", "--json", *SMALL, "dc=regulated", "--bench")
     assert main(["check", "--law", "mimo-gfm-deployable-rig", *options]) == 0
     out = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
@@ -28,7 +25,7 @@ def test_box_beside_the_rigs_source(capsys: Capture) -> None:
     assert out["gamma"] != rows["gamma with this source"]["worst"]  # row 1 is the law's there
 
 
-def test_box_as_a_table(capsys: Capture) -> None:
+def test_box_as_a_table(capsys):
     arguments = ["--random", "5", *SMALL, "dc=controlled"]
     assert main(["check", "--law", "mimo-gfm-deployable", *arguments]) == 0
     said = capsys.readouterr().out
@@ -36,7 +33,7 @@ def test_box_as_a_table(capsys: Capture) -> None:
     assert "regulated" not in said
 
 
-def test_deploy_writes_what_it_was_asked(capsys: Capture, tmp_path: Path) -> None:
+def test_deploy_writes_what_it_was_asked(capsys, tmp_path):
     path = tmp_path / "mine.toml"
     assert main([
         "tune", "--law", "mimo-gfm-deployable-rig", "--out", str(path),
@@ -78,7 +75,7 @@ def test_deploy_writes_what_it_was_asked(capsys: Capture, tmp_path: Path) -> Non
         ),
     ],
 )
-def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+def test_refuses_in_one_line(arguments, words, capsys):
     assert main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line

@@ -1,7 +1,5 @@
 """examples/paper/law_comparison: rows, tables, law files, going on, what it refuses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -25,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_rows(folder: Path) -> None:
+def test_rows(folder):
     vsg, droop = json.loads((folder / "law_comparison.json").read_text())["laws"]
     assert (vsg["law"], droop["law"]) == ("vsg-2", "droop-1")  # by gamma, none last
     assert vsg["gamma"] == pytest.approx(15.973, rel=1e-3)
@@ -38,7 +36,7 @@ def test_rows(folder: Path) -> None:
     assert "bench" not in droop
 
 
-def test_a_run_that_oscillates_has_no_figures_in_the_table() -> None:
+def test_a_run_that_oscillates_has_no_figures_in_the_table():
     done = {
         "status": "completed",
         "reason": "",
@@ -53,7 +51,7 @@ def test_a_run_that_oscillates_has_no_figures_in_the_table() -> None:
     assert cells[1:4] == ["oscillates", "–", "1.50"]
 
 
-def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Capture) -> None:
+def test_the_law_file_loads_and_has_the_gamma_it_names(folder, capsys):
     path = folder / "laws" / "vsg-2-tuned.toml"
     row = json.loads((folder / "law_comparison.json").read_text())["laws"][0]
     assert gfmhil(["design", "gamma", "--law", str(path), "--json"]) == 0
@@ -63,7 +61,7 @@ def test_the_law_file_loads_and_has_the_gamma_it_names(folder: Path, capsys: Cap
     assert {n: file.parameters[n].value for n in row["gains"]} == row["gains"]
 
 
-def test_tables(folder: Path) -> None:
+def test_tables(folder):
     assert (
         "| vsg-2 | 3 | 2 | 15.97 | 15.97 | **15.97** |"
         in (folder / "law_comparison_gamma.md").read_text()
@@ -72,7 +70,7 @@ def test_tables(folder: Path) -> None:
     assert "50.7" in (folder / "law_comparison_unstable.md").read_text()
 
 
-def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
+def test_what_is_done_is_kept(folder, capsys):
     def written() -> dict[str, int]:
         return {p.name: p.stat().st_mtime_ns for p in (folder / "rows").iterdir()}
 
@@ -84,7 +82,7 @@ def test_what_is_done_is_kept(folder: Path, capsys: Capture) -> None:
     assert all(written()[name] > before[name] for name in before)
 
 
-def test_an_experiment_measures_the_bench() -> None:
+def test_an_experiment_measures_the_bench():
     run = experiment("p_ref", "mimo-gfm")
     trace = run["trace"]
     at = round(AT / 1e-4) // TRACE_EVERY
@@ -94,14 +92,14 @@ def test_an_experiment_measures_the_bench() -> None:
     assert run["overshoot_pct"] == pytest.approx(overshoot, abs=0.5)
 
 
-def test_an_experiment_that_ends_early() -> None:
+def test_an_experiment_that_ends_early():
     run = experiment("late", "mimo-gfm")  # unstable with one sample of delay
     assert run["status"] == "tripped"
     assert 0.0 < run["end_s"] < 4.5
     assert "overshoot_pct" not in run
 
 
-def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
+def test_mimo_gfm_with_other_gains_is_not_searched():
     assert as_shipped("mimo-gfm-deployable")
     assert not as_shipped("mimo-gfm")
     assert not as_shipped("vsg-2")
@@ -111,7 +109,7 @@ def test_mimo_gfm_with_other_gains_is_not_searched() -> None:
     ("value", "text"),
     [(None, "–"), (0.0, "0"), (1.42879, "1.43"), (-0.00132, "−0.00132"), (987.98, "988")],
 )
-def test_numbers(value: float | None, text: str) -> None:
+def test_numbers(value, text):
     assert number(value) == text
 
 
@@ -126,7 +124,7 @@ def test_numbers(value: float | None, text: str) -> None:
         (["--evaluations", "0"], "at least 1"),
     ],
 )
-def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+def test_refuses_in_one_line(arguments, words, capsys):
     assert main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line

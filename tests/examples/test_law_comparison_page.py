@@ -1,7 +1,5 @@
 """The page's tables match the shipped laws."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,7 @@ def rows(name: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells}
 
 
-def test_every_law_has_a_row() -> None:
+def test_every_law_has_a_row():
     rated, not_rated = set(rows("law_comparison_gamma")), set(rows("law_comparison_unstable"))
     assert rated | not_rated | set(LEFT_OUT) == set(law_names())
     assert not rated & not_rated
@@ -33,7 +31,7 @@ def test_every_law_has_a_row() -> None:
 
 
 @pytest.mark.parametrize("name", tuned_names())
-def test_gamma_of_a_tuned_law_is_the_page_s(name: str) -> None:
+def test_gamma_of_a_tuned_law_is_the_page_s(name):
     found = as_it_is(law_file(name))
     assert not isinstance(found.after, LeastStable)
     own, late = (rows("law_comparison_gamma")[name.removesuffix("-tuned")][k] for k in (2, 4))
@@ -43,7 +41,7 @@ def test_gamma_of_a_tuned_law_is_the_page_s(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", tuned_names())
-def test_a_tuned_law_holds_one_sample_late(name: str) -> None:
+def test_a_tuned_law_holds_one_sample_late(name):
     file = law_file(name)
     problem = PaperProblem(file, free_gains(file))
     at = np.array([[g.start for g in problem.gains]])

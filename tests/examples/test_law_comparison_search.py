@@ -1,7 +1,5 @@
 """One law of the comparison: its search, the mode in its way, what its sampled loop stands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -26,7 +24,7 @@ from ..support.loops import reference_loop
 SHORT = {"seed": 0, "evaluations": 64, "starts": 1}
 
 
-def test_a_law_that_nothing_stabilises_names_the_mode_and_its_states() -> None:
+def test_a_law_that_nothing_stabilises_names_the_mode_and_its_states():
     found = search(law_file("droop-1"), **SHORT)
     assert found.gains is None
     assert isinstance(found.before, LeastStable)
@@ -37,7 +35,7 @@ def test_a_law_that_nothing_stabilises_names_the_mode_and_its_states() -> None:
     assert "50.7" in found.after.words()
 
 
-def test_participation_is_how_far_the_mode_moves_with_a_state() -> None:
+def test_participation_is_how_far_the_mode_moves_with_a_state():
     # p_k = d lambda / d A_kk, the definition by sensitivity
     file = law_file("droop-1")
     problem = PaperProblem(file, free_gains(file))
@@ -55,7 +53,7 @@ def test_participation_is_how_far_the_mode_moves_with_a_state() -> None:
     np.testing.assert_allclose([share for _, share in found.states], shares[:4], rtol=1e-3)
 
 
-def test_channels_that_the_structure_fixes_do_not_hide_the_others() -> None:
+def test_channels_that_the_structure_fixes_do_not_hide_the_others():
     # no gain of droop-2 moves p or q + V/D_q at rest: W_11 and W_41 stay where they are
     found = search(law_file("droop-2"), **SHORT)
     assert set(found.fixed) == {(1, 1), (4, 1)}
@@ -74,7 +72,7 @@ def test_channels_that_the_structure_fixes_do_not_hide_the_others() -> None:
     assert max(after[c] for c in rest) <= 1.005 * max(ideal[c] for c in rest)
 
 
-def test_a_law_as_it_is() -> None:
+def test_a_law_as_it_is():
     found = as_it_is(law_file("mimo-gfm"))
     assert not isinstance(found.after, LeastStable)
     assert gamma(found.after) == pytest.approx(2.0209, rel=5e-5)
@@ -82,7 +80,7 @@ def test_a_law_as_it_is() -> None:
     assert found.gains["k_pdc"] == law_file("mimo-gfm").parameters["k_pdc"].value
 
 
-def test_what_a_loop_stands() -> None:
+def test_what_a_loop_stands():
     found = stands(law_file("vsg-2"), {})
     assert found.sigma < 0.0
     assert 1e6 * found.delay.seconds == pytest.approx(1014, abs=2)  # as `design margins` says
@@ -90,7 +88,7 @@ def test_what_a_loop_stands() -> None:
     assert found.R is not None and found.R.low.factor == pytest.approx(0.904, abs=0.01)
 
 
-def test_a_loop_that_one_sample_is_too_much_for() -> None:
+def test_a_loop_that_one_sample_is_too_much_for():
     found = stands(law_file("mimo-gfm"), {})  # as printed: its LC mode is lost after 52 us
     assert found.sigma > 0.0
     assert found.worst.ratio < 0.0
@@ -99,7 +97,7 @@ def test_a_loop_that_one_sample_is_too_much_for() -> None:
 
 
 @pytest.mark.parametrize("name", ["mimo-gfm", "vsg-5", "dvoc", "matching-2"])
-def test_the_stacked_late_loop_is_the_exact_one(name: str) -> None:
+def test_the_stacked_late_loop_is_the_exact_one(name):
     file = law_file(name)
     problem = PaperProblem(file, free_gains(file))
     at = np.array([g.start for g in problem.gains])
@@ -109,7 +107,7 @@ def test_the_stacked_late_loop_is_the_exact_one(name: str) -> None:
     np.testing.assert_allclose(LateProblem(problem).sigma(np.array([at, at])), sigma, atol=1e-6)
 
 
-def test_gains_that_cannot_be_run_cost_as_much_as_unstable_ones() -> None:
+def test_gains_that_cannot_be_run_cost_as_much_as_unstable_ones():
     file = law_file("mimo-gfm")
     problem = PaperProblem(file, free_gains(file))
     printed = np.array([g.start for g in problem.gains])
@@ -118,7 +116,7 @@ def test_gains_that_cannot_be_run_cost_as_much_as_unstable_ones() -> None:
     assert late(printed) == pytest.approx(UNSTABLE + ALPHA + late.sigma(printed[None])[0])
 
 
-def test_the_search_ends_at_gains_that_can_be_run() -> None:
+def test_the_search_ends_at_gains_that_can_be_run():
     file = law_file("vsg-5")
     found = search(file, seed=0, evaluations=64, starts=1)
     assert found.gains is not None
@@ -128,7 +126,7 @@ def test_the_search_ends_at_gains_that_can_be_run() -> None:
     assert gamma(found.ideal) <= gamma(found.after) < 1.2 * gamma(found.ideal)
 
 
-def test_the_least_stable_late_mode_names_the_states_of_the_sampled_loop() -> None:
+def test_the_least_stable_late_mode_names_the_states_of_the_sampled_loop():
     found = least_stable(late_loop(law_file("mimo-gfm"), {}))
     assert found.mode.frequency_hz == pytest.approx(1180, abs=2)
     assert found.mode.sigma == pytest.approx(22.6, abs=0.1)

@@ -1,7 +1,5 @@
 """One reader for each parser, its corpus, and the requirements on every reader."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """Inputs near valid ones: text changed word by word, bytes changed bit by bit."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The parsers of files: scenarios, laws, campaigns, run folders and shared memory."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """The parsers of messages from the other side: frames, handshake, CAN."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import time

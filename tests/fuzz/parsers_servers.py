@@ -1,7 +1,5 @@
 """The parsers of operators' input: Modbus requests, scope messages, commands to a side."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

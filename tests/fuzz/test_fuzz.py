@@ -3,8 +3,6 @@
 Hypothesis' profile sets the number of generated inputs, see CONTRIBUTING.md.
 """
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st

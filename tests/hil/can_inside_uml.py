@@ -3,8 +3,6 @@
 GFMHIL_TEST_BUS: an endpoint to use instead, to compile everything where that is faster.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

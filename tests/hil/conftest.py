@@ -1,7 +1,5 @@
 """Scenarios made in one line, runs in this process, and the command as a separate process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

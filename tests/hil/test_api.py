@@ -1,7 +1,5 @@
 """The public API: what ten lines in a notebook do, in memory and silent."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """``gfmhil bench``: its files and its errors. The tests judge no figure."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -40,7 +38,7 @@ def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, An
 
 
 @pytest.mark.apt
-def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -> None:
+def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
     found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02")
     rows = found["results"]
     assert {r["link"] for r in rows} - {"iceoryx2"} == {"shm", "zmq"}
@@ -60,7 +58,7 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path: Path, capsys: Any) -
 
 
 @pytest.mark.apt
-def test_the_message_is_the_frame_unless_told_otherwise() -> None:
+def test_the_message_is_the_frame_unless_told_otherwise():
     payload = parser("bench").parse_args(["bench", "latency"]).payload
     there, back = (messages(role, payload) for role in ("plant", "controller"))
     assert (there.shape[1], back.shape[1]) == (payload, 48) == (FRAME, 48)
@@ -68,7 +66,7 @@ def test_the_message_is_the_frame_unless_told_otherwise() -> None:
     assert messages("controller", 100).shape[1] == 100
 
 
-def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path: Path) -> None:
+def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path):
     """All laws, float64 and float32, on inputs that drive each output into its limits."""
     limited: list[list[int]] = []
     for real in ("float64", "float32"):
@@ -80,7 +78,7 @@ def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.apt
-def test_kernel_is_timed_beside_c(tmp_path: Path, capsys: Any) -> None:
+def test_kernel_is_timed_beside_c(tmp_path, capsys):
     rows = bench(tmp_path, capsys, "kernel", "--laws", "mimo-gfm,droop-1")["kernel"]
     assert {(r["law"], r["real"]) for r in rows} == {
         (law, real) for law in ("mimo-gfm", "droop-1") for real in ("float64", "float32")
@@ -91,16 +89,14 @@ def test_kernel_is_timed_beside_c(tmp_path: Path, capsys: Any) -> None:
         assert row["ratio"]["median"] > 0
 
 
-def test_kernel_without_a_compiler(
-    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernel_without_a_compiler(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     found = bench(tmp_path, capsys, "kernel", "--laws", "droop-1")
     assert all(r["numba_ns"]["median"] > 0 and r["ratio"] is None for r in found["kernel"])
     assert any("no C compiler" in remark for remark in found["remarks"])
 
 
-def test_jitter_shows_every_way_to_wait(tmp_path: Path, capsys: Any) -> None:
+def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
     options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
     rows = bench(tmp_path, capsys, *options)["jitter"]
     assert {r["wait"] for r in rows} == {"sleep+spin", "spin", "nanosleep"}
@@ -110,7 +106,7 @@ def test_jitter_shows_every_way_to_wait(tmp_path: Path, capsys: Any) -> None:
         assert row["lost_pct"] == pytest.approx(100 * row["lost"] / row["ticks"], abs=1e-3)
 
 
-def test_loop_runs_the_product_over_a_link(tmp_path: Path, capsys: Any) -> None:
+def test_loop_runs_the_product_over_a_link(tmp_path, capsys):
     loop = bench(
         tmp_path, capsys, "loop", "--links", "shm", "--laws", "mimo-gfm", "--seconds", "0.3",
         "--load", "idle", "--rounds", "1",
@@ -129,16 +125,14 @@ def test_loop_runs_the_product_over_a_link(tmp_path: Path, capsys: Any) -> None:
         assert row["allocations_per_tick"] == 0
 
 
-def test_loop_that_trips_is_not_timed(tmp_path: Path, capsys: Any) -> None:
+def test_loop_that_trips_is_not_timed(tmp_path, capsys):
     line = ["bench", "loop", "--laws", "dvoc", "--mode", "lockstep", "--rounds", "1"]
     line += ["--links", "shm", "--seconds", "0.1"]
     assert main([*line, "--out", str(tmp_path / "bench")]) == 2
     assert capsys.readouterr().err.startswith("gfmhil: dvoc: tripped or safe at tick ")
 
 
-def test_without_a_compiler_the_links_are_measured_alone(
-    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_compiler_the_links_are_measured_alone(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     found = bench(
         tmp_path, capsys, "latency", "--links", "shm", "--seconds", "0.02", "--load", "idle"
@@ -162,7 +156,7 @@ def processes_with(mark: str) -> int:
     ("kind", "everyone"),  # with the parent: two processes, the CPU load; the product's two sides
     [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
 )
-def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_nothing_behind(kind, everyone, tmp_path):
     mark = f"GFMHIL_TEST={uuid.uuid4()}"
     line = ["bench", kind, "--links", "shm", "--seconds", "8", "--mode", "realtime"]
     process = subprocess.Popen(
@@ -184,7 +178,7 @@ def test_ctrl_c_leaves_nothing_behind(kind: str, everyone: int, tmp_path: Path) 
     assert processes_with(mark) == 0
 
 
-def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path: Path) -> None:
+def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path):
     """The load's processes are stopped when their parent is killed: SIGTERM would not end them."""
     mark = f"GFMHIL_TEST={uuid.uuid4()}"
     program = "from gfm_hil.bench.cpu_load import cpu_load\nwith cpu_load():\n    input('ready')"
@@ -220,9 +214,7 @@ def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path: Path) -> None:
         (["all", "--links", "inproc"], "inproc"),
     ],
 )
-def test_wrong_input_starts_nothing(
-    options: list[str], named: str, tmp_path: Path, capsys: Any
-) -> None:
+def test_wrong_input_starts_nothing(options, named, tmp_path, capsys):
     assert main(["bench", *options, "--out", str(tmp_path / "bench")]) == 2
     said = capsys.readouterr()
     assert named in said.err

@@ -1,7 +1,5 @@
 """Causes of missed ticks, on synthetic timing with one fault at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -35,12 +33,12 @@ def found(timing: dict[str, np.ndarray], *events: int) -> list[str]:
     return [CAUSES[k] for k in attribute(timing, T, events)]
 
 
-def test_a_run_without_misses_has_no_causes() -> None:
+def test_a_run_without_misses_has_no_causes():
     assert found(good()) == []
     assert counts(attribute(good(), T)) == dict.fromkeys(CAUSES, 0)
 
 
-def test_late_wake_up() -> None:
+def test_late_wake_up():
     timing = good()
     timing["plant_woke"][7] += 90_000
     timing["plant_sent"][7] += 90_000
@@ -50,7 +48,7 @@ def test_late_wake_up() -> None:
     assert found(timing) == ["late wake-up"]
 
 
-def test_frame_that_never_came_is_the_links() -> None:
+def test_frame_that_never_came_is_the_links():
     timing = good()
     for name in ("controller_received", "controller_computed", "controller_sent", "plant_received"):
         timing[name][7] = -1
@@ -58,7 +56,7 @@ def test_frame_that_never_came_is_the_links() -> None:
 
 
 @pytest.mark.parametrize("role", ["plant", "controller"])
-def test_role_that_stood_still_while_it_looked(role: str) -> None:
+def test_role_that_stood_still_while_it_looked(role):
     timing = good()
     timing[f"{role}_stall"][7] = 85_000
     if role == "controller":
@@ -68,21 +66,21 @@ def test_role_that_stood_still_while_it_looked(role: str) -> None:
     assert found(timing) == ["stalled host"]
 
 
-def test_work_that_is_too_long_for_the_tick() -> None:
+def test_work_that_is_too_long_for_the_tick():
     timing = good()
     timing["controller_sent"][::5] += 95_000  # every fifth tick: not an outlier
     timing["plant_received"][::5] = -1
     assert found(timing) == ["own work"] * (TICKS // 5)
 
 
-def test_work_that_was_interrupted_is_a_stall() -> None:
+def test_work_that_was_interrupted_is_a_stall():
     timing = good()
     timing["controller_sent"][7] += 95_000
     timing["plant_received"][7] = -1
     assert found(timing) == ["stalled host"]
 
 
-def test_event_on_the_tick_is_own_work() -> None:
+def test_event_on_the_tick_is_own_work():
     timing = good()
     timing["plant_woke"][7] += 90_000
     timing["plant_sent"][7] += 90_000
@@ -90,7 +88,7 @@ def test_event_on_the_tick_is_own_work() -> None:
     assert found(timing, 7) == ["own work"]
 
 
-def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
+def test_ticks_that_follow_have_the_cause_of_the_first():
     """The controller stalls for three ticks, then processes the queued frames."""
     timing = good()
     back = timing["plant_scheduled"][7] + 3 * T + 20_000
@@ -102,7 +100,7 @@ def test_ticks_that_follow_have_the_cause_of_the_first() -> None:
     assert found(timing) == ["stalled host"] * 3
 
 
-def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> None:
+def test_frames_lost_while_the_controller_stood_still_are_not_the_links():
     """It stalled for six ticks; the ring had room for two of the frames sent meanwhile."""
     timing = good()
     back = timing["plant_scheduled"][12] + 95_000
@@ -117,7 +115,7 @@ def test_frames_lost_while_the_controller_stood_still_are_not_the_links() -> Non
     assert found(timing) == ["stalled host"] * 6
 
 
-def test_answer_that_was_held_up_with_its_sender_is_not_the_links() -> None:
+def test_answer_that_was_held_up_with_its_sender_is_not_the_links():
     """The controller stalls after its send of u, before the link's own thread has sent it."""
     timing = good()
     back = timing["plant_scheduled"][9] + 80_000
@@ -129,7 +127,7 @@ def test_answer_that_was_held_up_with_its_sender_is_not_the_links() -> None:
     assert found(timing) == ["stalled host"] * 2
 
 
-def test_wait_that_was_longer_than_the_gap_in_it() -> None:
+def test_wait_that_was_longer_than_the_gap_in_it():
     """y arrives 50 µs after a gap of 600 µs: the gap caused all nine misses."""
     timing = good()
     back = timing["plant_scheduled"][7] + 750_000
@@ -141,7 +139,7 @@ def test_wait_that_was_longer_than_the_gap_in_it() -> None:
     assert found(timing) == ["stalled host"] * 8
 
 
-def test_plant_that_is_behind_does_not_blame_its_timer() -> None:
+def test_plant_that_is_behind_does_not_blame_its_timer():
     timing = good()
     timing["plant_stall"][7] = 2 * T
     for k, late in ((8, 190_000), (9, 95_000)):
@@ -152,7 +150,7 @@ def test_plant_that_is_behind_does_not_blame_its_timer() -> None:
 
 
 @given(st.sets(st.integers(0, TICKS - 1)))
-def test_every_miss_has_one_cause_and_is_in_one_burst(ticks: set[int]) -> None:
+def test_every_miss_has_one_cause_and_is_in_one_burst(ticks):
     timing = good()
     timing["plant_received"][sorted(ticks)] = -1
     assert sum(counts(attribute(timing, T)).values()) == len(ticks)

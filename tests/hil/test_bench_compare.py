@@ -1,11 +1,8 @@
 """The verdict on two results: the rank test against SciPy's, and synthetic results."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,18 +19,18 @@ VALUES = st.floats(0.1, 100.0)
 
 
 @given(st.lists(VALUES, min_size=1, max_size=8), st.lists(VALUES, min_size=1, max_size=8))
-def test_rank_test_is_scipys_exact_one_without_ties(a: list[float], b: list[float]) -> None:
+def test_rank_test_is_scipys_exact_one_without_ties(a, b):
     assume(len({*a, *b}) == len(a) + len(b))
     expected = mannwhitneyu(a, b, method="exact").pvalue
     assert rank_test(a, b) == pytest.approx(expected, abs=1e-12)
 
 
-def test_rank_test_of_few_with_ties_by_hand() -> None:
+def test_rank_test_of_few_with_ties_by_hand():
     """Ranks 1, 2.5 and 2.5, 4: 4 of 6 assignments are as far from the mean, 2 are not."""
     assert rank_test([1, 2], [2, 3]) == pytest.approx(4 / 6)
 
 
-def test_holm_by_hand() -> None:
+def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert holm([0.5, 0.9]) == [1.0, 1.0]
 
@@ -54,7 +51,7 @@ def noisy(median: float, rounds: int, seed: int) -> np.ndarray:
     return median * np.random.default_rng(seed).lognormal(0.0, 0.03, rounds)
 
 
-def test_real_change_is_told_from_noise() -> None:
+def test_real_change_is_told_from_noise():
     a = result({"same": noisy(40, 10, 1), "slower": noisy(40, 10, 2)})
     b = result({"same": noisy(40, 10, 3), "slower": noisy(50, 10, 4)})
     same, slower = compare(a, b, by_limit=False)
@@ -64,19 +61,19 @@ def test_real_change_is_told_from_noise() -> None:
     assert slower["ratio"] == pytest.approx(1.25, rel=0.05)
 
 
-def test_machine_that_became_slower_is_no_change_of_ours() -> None:
+def test_machine_that_became_slower_is_no_change_of_ours():
     a = result({"shm": noisy(0.5, 10, 1)}, limit=0.4)
     b = result({"shm": noisy(2.0, 10, 2)}, limit=1.6)
     assert compare(a, b, by_limit=False)[0]["verdict"] == "real change"
     assert compare(a, b, by_limit=True)[0]["verdict"] == "noise"
 
 
-def test_too_few_rounds_are_said_to_be_too_few() -> None:
+def test_too_few_rounds_are_said_to_be_too_few():
     a, b = result({"shm": [1.0, 1.1, 1.2]}), result({"shm": [2.0, 2.1, 2.2]})
     assert compare(a, b, by_limit=False)[0]["verdict"] == "too few rounds to tell"
 
 
-def test_noise_is_rarely_taken_for_a_change() -> None:
+def test_noise_is_rarely_taken_for_a_change():
     """200 rows of pure noise: Holm's method keeps the risk of any false alarm below 5 %."""
     names = [f"row {k}" for k in range(200)]
     a = result({n: noisy(40, 20, k) for k, n in enumerate(names)})
@@ -84,7 +81,7 @@ def test_noise_is_rarely_taken_for_a_change() -> None:
     assert {row["verdict"] for row in compare(a, b, by_limit=False)} == {"noise"}
 
 
-def test_compare_command_reads_files_and_folders(tmp_path: Path, capsys: Any) -> None:
+def test_compare_command_reads_files_and_folders(tmp_path, capsys):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "bench.json").write_text(json.dumps(result({"shm": noisy(1, 8, 1)})))
     (tmp_path / "b.json").write_text(json.dumps(result({"shm": noisy(2, 8, 2)})))
@@ -98,9 +95,7 @@ def test_compare_command_reads_files_and_folders(tmp_path: Path, capsys: Any) ->
     ("content", "named"),
     [(None, "cannot be read"), ("{", "cannot be read"), ("{}", "not a result"), ("[]", "not a")],
 )
-def test_what_is_no_result_is_refused(
-    content: str | None, named: str, tmp_path: Path, capsys: Any
-) -> None:
+def test_what_is_no_result_is_refused(content, named, tmp_path, capsys):
     path = tmp_path / "x.json"
     if content is not None:
         path.write_text(content)
@@ -108,7 +103,7 @@ def test_what_is_no_result_is_refused(
     assert named in capsys.readouterr().err
 
 
-def test_results_of_different_benchmarks_cannot_be_compared(tmp_path: Path, capsys: Any) -> None:
+def test_results_of_different_benchmarks_cannot_be_compared(tmp_path, capsys):
     for name in "ab":
         (tmp_path / name).write_text(json.dumps(result({name: [1.0, 2.0]})))
     assert main(["bench", "compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
@@ -129,7 +124,7 @@ print(json.dumps({"format": int(sys.argv[3]), "results": [row]}))
 """
 
 
-def test_interleaved_installations_take_turns(tmp_path: Path, capsys: Any) -> None:
+def test_interleaved_installations_take_turns(tmp_path, capsys):
     fake = tmp_path / "fake.py"
     fake.write_text(FAKE)
 
@@ -155,9 +150,7 @@ def test_interleaved_installations_take_turns(tmp_path: Path, capsys: Any) -> No
         (["--interleave", "2"], "no such command"),
     ],
 )
-def test_wrong_interleaving_starts_nothing(
-    more: list[str], named: str, tmp_path: Path, capsys: Any
-) -> None:
+def test_wrong_interleaving_starts_nothing(more, named, tmp_path, capsys):
     line = ["bench", "compare", "no-such-gfmhil", "no-such-gfmhil", *more]
     assert main([*line, "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert named in capsys.readouterr().err

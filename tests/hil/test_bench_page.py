@@ -1,7 +1,5 @@
 """bench.html: all of a result in one file that needs no network."""
 
-from __future__ import annotations
-
 import base64
 import re
 import xml.etree.ElementTree as ET
@@ -104,7 +102,7 @@ def read(content: dict[str, Any], folder: Path) -> Outline:
     return page
 
 
-def test_page_holds_every_table_and_figure(content: dict[str, Any], tmp_path: Path) -> None:
+def test_page_holds_every_table_and_figure(content, tmp_path):
     page = read(content, tmp_path)
     drawn = [table for _, table in all_tables(content)]
     assert page.tables == len(drawn) == 10
@@ -117,7 +115,7 @@ def test_page_holds_every_table_and_figure(content: dict[str, Any], tmp_path: Pa
     assert content["environment"]["cpu"] in page.text
 
 
-def test_page_needs_nothing_else(content: dict[str, Any], tmp_path: Path) -> None:
+def test_page_needs_nothing_else(content, tmp_path):
     page = read(content, tmp_path)
     for link in page.links:
         assert link.startswith("data:image/svg+xml;base64,")
@@ -129,7 +127,7 @@ def test_page_needs_nothing_else(content: dict[str, Any], tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("kept", ["results", "jitter", "loop", "kernel"])
-def test_page_of_one_part(content: dict[str, Any], kept: str, tmp_path: Path) -> None:
+def test_page_of_one_part(content, kept, tmp_path):
     part = {k: v for k, v in content.items() if k not in ("jitter", "loop", "kernel")}
     part |= {"results": []} if kept != "results" else {}
     part[kept] = content[kept]
@@ -138,19 +136,17 @@ def test_page_of_one_part(content: dict[str, Any], kept: str, tmp_path: Path) ->
     assert page.links
 
 
-def test_link_that_was_silent_has_a_row_and_no_curve(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
+def test_link_that_was_silent_has_a_row_and_no_curve(content, tmp_path):
     content["results"][1] |= summary([])
     page = read(content, tmp_path)
     assert "–" in page.text
 
 
-def test_figures_are_the_same_bytes_for_the_same_result(content: dict[str, Any]) -> None:
+def test_figures_are_the_same_bytes_for_the_same_result(content):
     assert figures(content) == figures(content)
 
 
-def test_caveats_follow_the_badge() -> None:
+def test_caveats_follow_the_badge():
     ideal = {
         "virtual_machine": "no", "steal_pct": 0.0, "sched_fifo": True, "isolated_cpus": "2-3",
         "governor": "performance", "cpus": 4, "load_average": [0.1, 0.1, 0.1],

@@ -1,7 +1,5 @@
 """The example of a bare-metal board, in QEMU with its UART on a pseudo terminal."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -24,7 +22,7 @@ QEMU = ("qemu-system-arm", "-machine", "mps2-an386", "-display", "none", "-monit
 
 @pytest.mark.compilers
 @pytest.mark.timeout(300)
-def test_a_board_controls_the_plant_over_its_uart(tmp_path: Path) -> None:
+def test_a_board_controls_the_plant_over_its_uart(tmp_path):
     """Each u on the line has the bits of the float32 kernel at the y that the plant sent."""
     place = tmp_path / "board"
     shutil.copytree(BOARD, place, ignore=shutil.ignore_patterns("law", "*.elf"))

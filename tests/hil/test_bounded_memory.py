@@ -1,7 +1,5 @@
 """A peer's messages take no more memory than the longest valid message."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

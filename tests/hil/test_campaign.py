@@ -1,7 +1,5 @@
 """Campaigns: determinism over workers, resuming, single runs, and wrong input."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -105,7 +103,7 @@ def stored(folder: Path) -> list[str]:
 
 
 @pytest.mark.full
-def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
+def test_one_worker_and_two_give_the_same_bits(whole):
     arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "one")]
     assert main([*arguments, "--workers", "1", "--quiet"]) == 0
     lines = stored(whole / "two")
@@ -114,7 +112,7 @@ def test_one_worker_and_two_give_the_same_bits(whole: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: Path) -> None:
+def test_a_resumed_campaign_equals_an_uninterrupted_one(whole, tmp_path):
     folder = tmp_path / "resumed"
     shutil.copytree(whole / "two", folder)
     lines = (folder / "runs.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
@@ -125,7 +123,7 @@ def test_a_resumed_campaign_equals_an_uninterrupted_one(whole: Path, tmp_path: P
     assert stored(folder) == stored(whole / "two")
 
 
-def test_what_is_complete_is_not_run_again(whole: Path) -> None:
+def test_what_is_complete_is_not_run_again(whole):
     before = (whole / "two" / "runs.jsonl").stat()
     arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "two")]
     assert main([*arguments, "--resume", "--quiet"]) == 0
@@ -140,13 +138,7 @@ def test_what_is_complete_is_not_run_again(whole: Path) -> None:
         ({"duration = 0.3": "duration = 0.4"}, "belongs to another campaign"),
     ],
 )
-def test_a_changed_file_is_refused(
-    file: Callable[..., Path],
-    whole: Path,
-    capsys: pytest.CaptureFixture[str],
-    changed: dict[str, str],
-    words: str,
-) -> None:
+def test_a_changed_file_is_refused(file, whole, capsys, changed, words):
     arguments = ["campaign", str(file(**changed)), "--out", str(whole / "two")]
     before = (whole / "two" / "runs.jsonl").read_bytes()
     assert main([*arguments, "--resume"]) == 2
@@ -156,15 +148,13 @@ def test_a_changed_file_is_refused(
     assert (whole / "two" / "runs.jsonl").read_bytes() == before
 
 
-def test_more_runs_go_on_with_the_same_draws(file: Callable[..., Path], whole: Path) -> None:
+def test_more_runs_go_on_with_the_same_draws(file, whole):
     more = load_campaign(str(file(**{"runs = 10": "runs = 11"})))
     store = Store(whole / "two", more, resume=True)
     assert store.missing(more) == [(10, "mimo-gfm"), (10, "vsg-2")]
 
 
-def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(whole, tmp_path):
     found = gfmhil.campaign(whole / "small.toml")
     assert [json.dumps(r) for r in found.records] == stored(whole / "two")[1:]
     table = found.to_pandas()
@@ -198,7 +188,7 @@ def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(
         gfmhil.campaign(content, workers=0)
 
 
-def test_folder_of_a_campaign(whole: Path) -> None:
+def test_folder_of_a_campaign(whole):
     names = {path.name for path in (whole / "two").iterdir()}
     assert names == {"campaign.toml", "campaign.json", "runs.jsonl", "map.png"}
     assert (whole / "two" / "campaign.toml").read_text(encoding="utf-8") == TEXT
@@ -211,7 +201,7 @@ def test_folder_of_a_campaign(whole: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> None:
+def test_a_run_alone_is_that_of_the_campaign(whole, tmp_path):
     arguments = ["campaign", str(whole / "small.toml"), "--only", "5"]
     assert main([*arguments, "--out", str(tmp_path / "alone")]) == 0
     records = [json.loads(line) for line in stored(whole / "two")[1:]]
@@ -225,7 +215,7 @@ def test_a_run_alone_is_that_of_the_campaign(whole: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.full
-def test_dask_gives_the_same_bits(whole: Path) -> None:
+def test_dask_gives_the_same_bits(whole):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, dashboard_address=None
@@ -235,12 +225,7 @@ def test_dask_gives_the_same_bits(whole: Path) -> None:
     assert stored(whole / "dask") == stored(whole / "two")
 
 
-def test_dask_without_the_package_says_so(
-    file: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_dask_without_the_package_says_so(file, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "distributed", None)
     out = tmp_path / "out"
     assert main(["campaign", str(file()), "--out", str(out), "--dask", "tcp://127.0.0.1:9"]) == 2
@@ -249,7 +234,7 @@ def test_dask_without_the_package_says_so(
 
 
 @pytest.mark.full
-def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]) -> None:
+def test_a_killed_worker_is_reported_and_the_rest_kept(file):
     campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
     jobs = [[(k + j, "mimo-gfm") for j in range(CHUNK)] for k in range(0, 2000, CHUNK)]
     kept: list[Record] = []
@@ -265,9 +250,7 @@ def test_a_killed_worker_is_reported_and_the_rest_kept(file: Callable[..., Path]
     assert kept
 
 
-def test_an_error_in_a_run_names_the_run(
-    file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_in_a_run_names_the_run(file, monkeypatch):
     def fail(*_: Any) -> None:
         raise ZeroDivisionError("as if there were a mistake")
 
@@ -278,7 +261,7 @@ def test_an_error_in_a_run_names_the_run(
 
 
 @pytest.mark.full
-def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -> None:
+def test_ctrl_c_keeps_what_is_there(file, tmp_path):
     path, out = file(**{"runs = 10": "runs = 2000"}), tmp_path / "out"
     command = [sys.executable, "-m", "gfm_hil", "campaign", str(path), "--out", str(out)]
     with subprocess.Popen(
@@ -297,7 +280,7 @@ def test_ctrl_c_keeps_what_is_there(file: Callable[..., Path], tmp_path: Path) -
     assert result["missing"] == 4000 - done
 
 
-def test_no_steady_state_is_a_result(file: Callable[..., Path]) -> None:
+def test_no_steady_state_is_a_result(file):
     # lines too long to transmit P_ref
     path = file(**{"low = 0.5\nhigh = 10.0": "low = 150.0\nhigh = 160.0"})
     campaign = load_campaign(str(path))
@@ -312,7 +295,7 @@ def test_no_steady_state_is_a_result(file: Callable[..., Path]) -> None:
     assert said == "no steady state"
 
 
-def test_shipped_campaign_is_valid() -> None:
+def test_shipped_campaign_is_valid():
     campaign = load_campaign("rig_mimo_gfm")
     assert campaign.file.laws == ["mimo-gfm", "vsg-2"]
     assert pickle_size(campaign) < 20_000  # it is sent with every task
@@ -356,13 +339,7 @@ def pickle_size(campaign: Campaign) -> int:
         ({"[set]": "[set"}, "small.toml: "),
     ],
 )
-def test_wrong_files(
-    file: Callable[..., Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    changed: dict[str, str],
-    words: str,
-) -> None:
+def test_wrong_files(file, tmp_path, capsys, changed, words):
     out = tmp_path / "out"
     assert main(["campaign", str(file(**changed)), "--out", str(out)]) == 2
     said = capsys.readouterr().err
@@ -382,14 +359,12 @@ def test_wrong_files(
         (["--x", "plant.factors.R_f", "--y", "plant.factors.R_f"], "both are"),
     ],
 )
-def test_wrong_options(
-    file: Callable[..., Path], capsys: pytest.CaptureFixture[str], options: list[str], words: str
-) -> None:
+def test_wrong_options(file, capsys, options, words):
     assert main(["campaign", str(file()), *options]) == 2
     assert words in capsys.readouterr().err
 
 
-def test_unknown_campaign_names_those_that_ship() -> None:
+def test_unknown_campaign_names_those_that_ship():
     with pytest.raises(UserError, match=r"no such file; shipped are .*'rig_mimo_gfm'"):
         load_campaign("rig")
 
@@ -397,12 +372,7 @@ def test_unknown_campaign_names_those_that_ship() -> None:
 @pytest.mark.attack(
     "9.5", "a campaign whose checks take seconds", "not a word on the terminal until they end"
 )
-def test_checks_that_take_long_show_how_far_they_are(
-    file: Callable[..., Path],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    attack_now: Callable[[str], None],
-) -> None:
+def test_checks_that_take_long_show_how_far_they_are(file, capsys, monkeypatch, attack_now):
     path, seen = str(file()), []
     load_campaign(path, tell=lambda done, of: seen.append((done, of)))
     assert seen == [(k, 18) for k in range(18)]  # 4 times 2 ends, 10 runs

@@ -1,9 +1,6 @@
 """A campaign's draws: within bounds, with the set distribution, a function of seed and run."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +20,7 @@ def bounded(low: float, high: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("kind", "least"), [(Uniform, -1e12), (LogUniform, 1e-12)])
 @given(data=st.data(), u=shares)
-def test_a_value_stays_within_its_bounds(kind: Any, least: float, data: Any, u: float) -> None:
+def test_a_value_stays_within_its_bounds(kind, least, data, u):
     low, high = bounded(*(data.draw(st.floats(least, 1e12)) for _ in range(2)))
     if low < high:
         named = kind.model_fields["type"].annotation.__args__[0]
@@ -31,9 +28,7 @@ def test_a_value_stays_within_its_bounds(kind: Any, least: float, data: Any, u: 
 
 
 @given(numbers, st.floats(1e-6, 1e6), st.floats(-6, 6), st.floats(-6, 6), shares)
-def test_normal_stays_within_its_bounds(
-    mean: float, sigma: float, a: float, b: float, u: float
-) -> None:
+def test_normal_stays_within_its_bounds(mean, sigma, a, b, u):
     low, high = (mean + sigma * limit for limit in bounded(a, b))
     try:
         normal = Normal(type="normal", path="x", mean=mean, sigma=sigma, low=low, high=high)
@@ -43,18 +38,18 @@ def test_normal_stays_within_its_bounds(
 
 
 @given(st.lists(st.integers() | st.text(), min_size=1), shares)
-def test_choice_is_one_of_its_values(values: list[Any], u: float) -> None:
+def test_choice_is_one_of_its_values(values, u):
     assert Choice(type="choice", path="x", values=values).quantile(u) in values
 
 
 @given(shares, shares)
-def test_quantiles_rise(u: float, v: float) -> None:
+def test_quantiles_rise(u, v):
     low, high = bounded(u, v)
     normal = Normal(type="normal", path="x", mean=1.0, sigma=0.1, low=0.7, high=1.2)
     assert normal.quantile(low) <= normal.quantile(high)
 
 
-def test_draws_have_the_distribution() -> None:
+def test_draws_have_the_distribution():
     kinds = [
         Uniform(type="uniform", path="a", low=2.0, high=4.0),
         LogUniform(type="loguniform", path="b", low=0.1, high=10.0),
@@ -69,7 +64,7 @@ def test_draws_have_the_distribution() -> None:
     assert np.abs(np.corrcoef(drawn.T) - np.eye(4)).max() < 0.06
 
 
-def test_a_run_depends_on_seed_and_number_only() -> None:
+def test_a_run_depends_on_seed_and_number_only():
     kinds = [Uniform(type="uniform", path="a", low=0.0, high=1.0)]
     children = np.random.SeedSequence(9).spawn(4)
     for run in (3, 0):

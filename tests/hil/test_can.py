@@ -1,7 +1,5 @@
 """Both sides over a CAN bus on the loopback device, in two threads of this process."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import threading

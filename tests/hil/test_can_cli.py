@@ -1,9 +1,5 @@
 """gfmhil dbc."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from gfm_hil.cli import main
@@ -49,7 +45,7 @@ def test_an_inner_stage_must_fit_the_bus_too(make):
         (["--budget", "--T_s", "0"], "--T_s 0: must be more than 0 s"),
     ],
 )
-def test_wrong_input_is_one_line(arguments, said, capsys, tmp_path: Path, monkeypatch):
+def test_wrong_input_is_one_line(arguments, said, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["dbc", *arguments]) == 2
     assert capsys.readouterr().err == f"gfmhil: {said}\n"

@@ -1,9 +1,5 @@
 """A virtual bus with a real bus's delays: the order of frames, and when each is delivered."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -127,7 +123,7 @@ def test_it_keeps_no_more_than_it_has_places_for():
 
 
 @pytest.mark.parametrize("portable", [True, False])
-def test_a_link_waits_for_what_is_on_the_bus(tmp_path: Path, portable):
+def test_a_link_waits_for_what_is_on_the_bus(tmp_path, portable):
     """A segment of the handshake, 13 ms at 10 kbit/s."""
     slow = {"fd": False, "bitrate": 10_000, "every": 50, "emulate": True, "portable": portable}
     endpoint = link_kind("can").fresh(tmp_path)

@@ -1,7 +1,5 @@
 """CAN frames: they match the DBC and cantools' packing, and every damage is detected."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cantools.database.can import Database

@@ -1,7 +1,5 @@
 """Buses and files that a CAN link accepts, its errors for others, and our loopback bus."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frame times: the longest of all frames, found by brute force; and what fits a period."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

@@ -4,8 +4,6 @@ Needs Debian's packages ``user-mode-linux``, ``kmod`` and ``iproute2``. The kern
 the user, but the tests inside write to the host's files, so they run only with GFMHIL_UML=1.
 """
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """The command line: what each command prints, writes and returns."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -331,6 +329,13 @@ def test_unknown_options_are_refused_with_the_one_that_was_meant(capsys):
     assert capsys.readouterr().err == "gfmhil: --zzz 3: gfmhil run does not know it\n"
     assert main(["firmware", "export", "vsg-1", "--reel", "float32", "-o", "x"]) == 2
     assert "does not know it; did you mean '--real'?" in capsys.readouterr().err
+    assert main(["design", "poles", "own.toml"]) == 2
+    assert "--law own.toml" in capsys.readouterr().err
+    assert main(["run", "virtual", "P_ref=0.8"]) == 2
+    assert "a scenario's file says such values" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["design", "pole"])
+    assert "did you mean 'poles'?" in capsys.readouterr().err
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():
@@ -351,9 +356,7 @@ def own_law(folder: Path, name: str, **gains: float) -> Path:
     return gfmhil.Law.load("vsg-2").with_gains(name, **gains).save(path)
 
 
-def test_results_call_a_law_by_its_name_and_never_by_its_path(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_call_a_law_by_its_name_and_never_by_its_path(tmp_path, capsys):
     own = str(own_law(tmp_path, "mine", D_p=0.011))
     content = {
         "title": "own", "duration": 0.03, "law": own, "link": {"type": "inproc"},
@@ -381,7 +384,7 @@ def test_results_call_a_law_by_its_name_and_never_by_its_path(
     assert [*gfmhil.compare(file, [own, "vsg-2"])] == ["mine", "vsg-2"]
 
 
-def test_laws_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def test_laws_of_one_name_are_told_apart(tmp_path):
     own = str(own_law(tmp_path, "vsg-2"))
     again = tmp_path / "file.toml"
     again.write_text(Path(own).read_text())
@@ -389,9 +392,7 @@ def test_laws_of_one_name_are_told_apart(tmp_path: Path) -> None:
     assert [*titles.values()] == ["vsg-2 (file.toml)", "vsg-2", "vsg-2 (file.toml, 2)", "mine"]
 
 
-def test_an_unstable_law_is_told_with_its_mode(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     """By run, compare and laws show; of a stable one they say nothing."""
     own = str(own_law(tmp_path, "mine", k_34=50.0))
     words = r"the linear loop of mine has an unstable mode: [\d.]+ Hz, \+[\d.e+]+ 1/s "
@@ -412,9 +413,7 @@ def test_an_unstable_law_is_told_with_its_mode(
     assert "an unstable mode" not in capsys.readouterr().out
 
 
-def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(capsys):
     assert main([]) == 0
     assert "run a scenario and leave a run folder" in capsys.readouterr().out
     assert main(["runn", "pref_step"]) == 2
@@ -431,9 +430,7 @@ def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(
         ({"type": "law", "law": 3}, "events.0.law: must be a valid string, not 3"),
     ],
 )
-def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(
-    event: dict[str, Any], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(event, line, capsys):
     assert main(["run", scenario(events=[{"t": 0.1, **event}])]) == 2
     error = capsys.readouterr().err
     assert line in error and error.count("\n") == 1

@@ -1,7 +1,5 @@
 """What is compiled when: nothing by an import, everything by a warm-up, and runs say so."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

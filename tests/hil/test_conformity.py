@@ -1,7 +1,5 @@
 """Conformity tests: judged on runs made by formula, run against closed forms, and as a command."""
 
-from __future__ import annotations
-
 import cmath
 import json
 import math
@@ -119,9 +117,7 @@ def failing(verdicts: list[Verdict]) -> set[str]:
     return {v.kind for v in verdicts if v.verdict == FAIL}
 
 
-def test_an_ideal_answer_passes_every_clause_of_the_phase_jumps(
-    miso: tuple[Case, Scenario],
-) -> None:
+def test_an_ideal_answer_passes_every_clause_of_the_phase_jumps(miso):
     case, scenario = miso
     verdicts = judge(phase_jumps(scenario), case.test.criteria, UNDER)
     assert {v.verdict for v in verdicts} == {PASS}
@@ -150,9 +146,7 @@ def test_an_ideal_answer_passes_every_clause_of_the_phase_jumps(
         ({"cut": 20}, "no_trip", {0.0}),
     ],
 )
-def test_each_mutation_fails_its_own_clause_and_no_other(
-    miso: tuple[Case, Scenario], mutation: dict[str, Any], kind: str, at: set[float]
-) -> None:
+def test_each_mutation_fails_its_own_clause_and_no_other(miso, mutation, kind, at):
     case, scenario = miso
     verdicts = judge(phase_jumps(scenario, **mutation), case.test.criteria, UNDER)
     assert failing(verdicts) == {kind}
@@ -163,7 +157,7 @@ def test_each_mutation_fails_its_own_clause_and_no_other(
             assert "cut" in mutation and v.stop == 22.0 and "over-current" in v.text
 
 
-def test_what_a_trip_cuts_off_cannot_be_judged(miso: tuple[Case, Scenario]) -> None:
+def test_what_a_trip_cuts_off_cannot_be_judged(miso):
     case, scenario = miso
     verdicts = judge(phase_jumps(scenario, cut=60_000), case.test.criteria, UNDER)
     assert worst([v.verdict for v in verdicts]) == FAIL
@@ -171,7 +165,7 @@ def test_what_a_trip_cuts_off_cannot_be_judged(miso: tuple[Case, Scenario]) -> N
     assert {v.verdict for v in verdicts if v.stop <= 16.0} == {PASS}
 
 
-def test_a_twin_that_trips_fails_the_clause_of_the_plant(miso: tuple[Case, Scenario]) -> None:
+def test_a_twin_that_trips_fails_the_clause_of_the_plant(miso):
     case, scenario = miso
     twin = {"twin": phase_jumps(scenario, cut=20)}
     verdicts = judge(phase_jumps(scenario), case.test.criteria, UNDER, twin)
@@ -194,9 +188,7 @@ def ramp() -> Scenario:
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_energy_of_the_swing_equation_is_the_inertia_constant(
-    ramp: Scenario, factor: float, sign: int
-) -> None:
+def test_energy_of_the_swing_equation_is_the_inertia_constant(ramp, factor, sign):
     """P = -2 H / f_n df/dt while the frequency moves."""
     H, rate, t = factor * 2.5, -sign * 1.0, np.arange(50_000) * 1e-4
     p = 0.1 - 2 * H / 50 * rate * ((t >= 2.0) & (t < 2.5))
@@ -216,9 +208,7 @@ def test_energy_of_the_swing_equation_is_the_inertia_constant(
         (0.5, 0.98, FAIL),
     ],
 )
-def test_droop_is_that_of_the_declaration_within_the_declared_power(
-    ramp: Scenario, p: float, omega_u: float, verdict: str
-) -> None:
+def test_droop_is_that_of_the_declaration_within_the_declared_power(ramp, p, omega_u, verdict):
     t = np.arange(50_000) * 1e-4
     late = t >= 2.3
     run = run_of(ramp, p=np.where(late, p, 0.5), omega_u=np.where(late, omega_u, 1.0))
@@ -229,7 +219,7 @@ def test_droop_is_that_of_the_declaration_within_the_declared_power(
 
 
 @pytest.mark.parametrize("beyond", [0.09, 0.12])
-def test_a_limit_may_be_passed_for_a_time(ramp: Scenario, beyond: float) -> None:
+def test_a_limit_may_be_passed_for_a_time(ramp, beyond):
     """The mean over a cycle crosses the middle between 1 and 1.2 half a cycle late, both ways."""
     t = np.arange(50_000) * 1e-4
     V = np.where((t >= 2.5) & (t < 2.5 + beyond), 1.2, 1.0)
@@ -243,9 +233,7 @@ def test_a_limit_may_be_passed_for_a_time(ramp: Scenario, beyond: float) -> None
 
 @pytest.mark.parametrize(("level", "verdict"), [(0.84, PASS), (0.76, FAIL)])
 @pytest.mark.parametrize("power", [0.5, -0.5])
-def test_limits_may_be_parts_of_what_was_before(
-    ramp: Scenario, level: float, verdict: str, power: float
-) -> None:
+def test_limits_may_be_parts_of_what_was_before(ramp, level, verdict, power):
     t = np.arange(50_000) * 1e-4
     p = np.where(t < 2.5, power, level * power)
     asked = one("stays_within", low=0.8, of_before=True)
@@ -253,7 +241,7 @@ def test_limits_may_be_parts_of_what_was_before(
     assert found.verdict == verdict
 
 
-def test_a_window_that_cannot_be_judged_says_why(ramp: Scenario) -> None:
+def test_a_window_that_cannot_be_judged_says_why(ramp):
     run = run_of(ramp, p=np.full(50_000, 0.5))
     for asked, why in (
         (one("rise_within", within=0.01, direction="up"), "by 0 p.u. only"),
@@ -265,7 +253,7 @@ def test_a_window_that_cannot_be_judged_says_why(ramp: Scenario) -> None:
         assert found.verdict == CANNOT and why in found.text
 
 
-def test_damping_is_judged_after_the_ramp(ramp: Scenario) -> None:
+def test_damping_is_judged_after_the_ramp(ramp):
     t = np.arange(50_000) * 1e-4
     p = 0.5 + 0.5 * np.clip((t - 2.0) / 0.5, 0.0, 1.0) + 0.05 * answer(t - 2.5, 0.3, 3.0, 0.0)
     run = run_of(ramp, p=p)
@@ -288,8 +276,8 @@ parameters.H = {{ value = {H}, unit = "s", source = "here" }}
 @pytest.mark.full
 @pytest.mark.parametrize(("D", "H", "scr"), [(50.0, 4.0, 3.0), (20.0, 5.0, 3.0), (100.0, 8.0, 5.0)])
 def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_come_back(
-    D: float, H: float, scr: float, tmp_path: Path
-) -> None:
+    D, H, scr, tmp_path
+):
     """dP = V^2 sin(theta) / (X_p + 1/SCR), with X_p of the filter inductor alone. The circuit has
     next to no capacitor, and the resistance that lets the line's own mode decay.
     """
@@ -323,7 +311,7 @@ def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_co
     assert pytest.approx([D, H], rel=0.01) == [unit.D, unit.H]
 
 
-def test_another_frequency_and_rating_keep_the_elements_per_unit() -> None:
+def test_another_frequency_and_rating_keep_the_elements_per_unit():
     paper = load_converter("paper")
     twin = scaled(paper, 60.0, 0.5)
     assert twin.pu() == pytest.approx({**paper.pu(), "C_dc": twin.pu()["C_dc"]})
@@ -333,9 +321,7 @@ def test_another_frequency_and_rating_keep_the_elements_per_unit() -> None:
     )
 
 
-def test_a_converter_of_ones_own_lies_beside_its_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_converter_of_ones_own_lies_beside_its_file(tmp_path, monkeypatch):
     text = files("gfm_plant").joinpath("converters/paper.toml").read_text("utf-8")
     (tmp_path / "mine.toml").write_text(text.replace("S_n = 4000.0", "S_n = 5000.0"))
     own = 'droop = 0.05\nP_max = 1.0\nP_min = 0.0\n[plant]\nconverter = "mine.toml"\n'
@@ -351,7 +337,7 @@ def test_a_converter_of_ones_own_lies_beside_its_file(
         load_under_test(tmp_path / "own.toml")
 
 
-def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> None:
+def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path):
     cases = load_cases(["all"])
     sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "rte", "withstand"}
     assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
@@ -364,7 +350,7 @@ def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path: Path) -> Non
 
 
 @pytest.mark.full  # compiles the loop of two converters
-def test_twins_share_what_the_last_machine_gave_by_their_equal_droop() -> None:
+def test_twins_share_what_the_last_machine_gave_by_their_equal_droop():
     """Both answer by the same x in p.u. of their own rating, and the balance of powers gives x: the
     load is a series R-L, which draws P at nominal voltage and frequency, and V is at the terminal
     behind 0.15 p.u., so that the load's own voltage lies within 5 % of it."""
@@ -425,9 +411,7 @@ def lab(tmp_path: Path) -> Path:
     return folder
 
 
-def test_command_writes_report_results_and_junit(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_report_results_and_junit(lab, capsys):
     out = lab.parent / "out"
     asked = ["conform", "--law", "droop-3", "--against", str(lab), "-o", str(out)]
     assert main([*asked, "--workers", "1"]) == 0
@@ -454,7 +438,7 @@ def test_command_writes_report_results_and_junit(
     assert "is not empty" in capsys.readouterr().err
 
 
-def test_control_characters_leave_junit_well_formed(lab: Path) -> None:
+def test_control_characters_leave_junit_well_formed(lab):
     bad = NONE.replace("nobody built it", r"nobody \u0007\u001b[2J\uffff built it")
     (lab / "jump.toml").write_text(LAB + bad)
     out = lab.parent / "out"
@@ -466,7 +450,7 @@ def test_control_characters_leave_junit_well_formed(lab: Path) -> None:
 
 
 @pytest.mark.processes
-def test_two_workers_find_what_one_does(lab: Path) -> None:
+def test_two_workers_find_what_one_does(lab):
     (lab / "strict.toml").write_text(STRICT)
     found = []
     for workers in ("1", "2"):
@@ -477,9 +461,7 @@ def test_two_workers_find_what_one_does(lab: Path) -> None:
     assert found[0] == found[1]
 
 
-def test_exit_code_tells_failed_from_not_judged_and_every_clause_that_fails_is_printed(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exit_code_tells_failed_from_not_judged_and_every_clause_that_fails_is_printed(lab, capsys):
     low = '[[criteria]]\nkind = "stays_within"\nclause = "low"\nsignal = "V"\nhigh = 0.5\n'
     (lab / "strict.toml").write_text(f"{STRICT}\n{low}")
     (lab / "none.toml").write_text(LAB + NONE)
@@ -500,7 +482,7 @@ def test_exit_code_tells_failed_from_not_judged_and_every_clause_that_fails_is_p
     assert len(wrong) == 2 and all(" ".join(text.split()) in words for text in wrong)
 
 
-def test_several_laws_give_a_matrix(lab: Path) -> None:
+def test_several_laws_give_a_matrix(lab):
     laws = ["droop-3", gfmhil.Law.load("vsg-2").with_gains("stiff", D_p=0.05)]
     (lab / "strict.toml").write_text(STRICT)
     found = gfmhil.conform(laws, lab, lab.parent / "out")
@@ -520,7 +502,7 @@ def test_several_laws_give_a_matrix(lab: Path) -> None:
 
 
 @pytest.mark.full  # all shipped tests
-def test_a_good_law_passes_the_documented_default(tmp_path: Path) -> None:
+def test_a_good_law_passes_the_documented_default(tmp_path):
     """What no law can be judged by is informative, says why, and counts for nothing."""
     out = tmp_path / "out"
     asked = ["conform", "--law", "vsg-2", "--inner", "virtual-stator", "--no-figures", "--quiet"]
@@ -537,7 +519,7 @@ def test_a_good_law_passes_the_documented_default(tmp_path: Path) -> None:
     assert {verdict for *_, verdict in clauses} == {PASS, INFORMATIVE}
 
 
-def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
+def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
     text = LAB.replace("scr = 5.0", "scr = 0.5").replace("P_ref = 0.5", "P_ref = 1.0")
     (lab / "jump.toml").write_text(text)
     found = gfmhil.conform("droop-3", lab)
@@ -569,9 +551,7 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab: Path) -> None:
         ),
     ],
 )  # fmt: skip
-def test_wrong_test_files_are_told_in_one_line(
-    lab: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, says: str
-) -> None:
+def test_wrong_test_files_are_told_in_one_line(lab, capsys, old, new, says):
     (lab / "jump.toml").write_text(LAB.replace(old, new))
     assert main(["conform", "--law", "droop-3", "--against", str(lab)]) == 2
     error = capsys.readouterr().err
@@ -594,13 +574,7 @@ def test_wrong_test_files_are_told_in_one_line(
         (["--controller", "c:own.so", "--inner", "none"], "choose --inner virtual-stator"),
     ],
 )
-def test_wrong_arguments_are_told_in_one_line(
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    says: str,
-) -> None:
+def test_wrong_arguments_are_told_in_one_line(capsys, tmp_path, monkeypatch, arguments, says):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.so").touch()
     assert main(["conform", *arguments]) == 2
@@ -611,9 +585,7 @@ def test_wrong_arguments_are_told_in_one_line(
 
 @pytest.mark.compilers
 @pytest.mark.timeout(300)
-def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
     (lab / "strict.toml").write_text(STRICT)
     built = str(lab.parent / "dll")
     asked = ["firmware", "dll", "vsg-2", "--inner", "virtual-stator", "--real", "float64"]
@@ -651,7 +623,7 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(
 @pytest.mark.compilers
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("target", ["host", pytest.param("m4f", marks=pytest.mark.apt)])
-def test_the_firmware_of_a_law_gets_the_verdicts_of_the_law(lab: Path, target: str) -> None:
+def test_the_firmware_of_a_law_gets_the_verdicts_of_the_law(lab, target):
     name = f"pil:{target}"
     found = gfmhil.conform("vsg-2", lab, inner="virtual-stator", controller=name)
     assert found.laws == ["vsg-2", name] and found.passed
@@ -681,7 +653,7 @@ def nfp_of(**more: Any) -> Nfp:
         ({"high": 51.0, "from_hz": 1.1, "to_hz": 1.9}, CANNOT, None),
     ],
 )
-def test_a_plot_is_judged_in_its_bands(band: dict[str, Any], verdict: str, at: Any) -> None:
+def test_a_plot_is_judged_in_its_bands(band, verdict, at):
     """A gain of 50 behind a lag at 10 Hz: 50/(1 + (f/10)^2)^0.5 and -atan(f/10)."""
     hz = np.array([0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0])
     nfp = 50.0 / (1.0 + 1j * hz / 10.0)
@@ -710,7 +682,7 @@ points = 3
 """
 
 
-def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
+def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path):
     """dp/dw_g = -K w_b / (s + K w_b D_p / (1 + s T)), K = 1 / X (1 + s^2/w_b^2), X = X_p + 1/SCR:
     the swing of a droop behind its low-pass, on a line that is a state of its own. Resistances, the
     filter capacitor and the delay are within 1 %."""
@@ -731,7 +703,7 @@ def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path: Path) -> None:
     assert "gfmhil scan" in report
 
 
-def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path: Path) -> None:
+def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path):
     (tmp_path / "plot.toml").write_text(NFP + 'unknown = "nobody knows them"')
     found = gfmhil.conform("droop-3", tmp_path, tmp_path / "out")
     (part,) = found.of("droop-3", f"{tmp_path.name}/plot")
@@ -763,8 +735,8 @@ def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path: Path) ->
     ("factor", "verdict"), [(1.0, PASS), (1.02, PASS), (2.0, FAIL), (0.1, FAIL), (-1.0, FAIL)]
 )
 def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
-    event: dict[str, Any], answer: Any, factor: float, verdict: str
-) -> None:
+    event, answer, factor, verdict
+):
     """On p as it is; the mean over a cycle moves it by less than the envelope is wide."""
     unit = envelopes.Unit(D=150.0, H=5.0, X_eff=0.6 - 1 / 3)
     under = UNDER.model_copy(update={"unit": unit, "droop": math.inf})
@@ -788,7 +760,7 @@ def test_the_expected_answer_stays_in_its_envelope_and_another_does_not(
     assert other.verdict == CANNOT and "not that of an event" in other.text
 
 
-def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp: Scenario) -> None:
+def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp):
     under = UNDER.model_copy(update={"unit": envelopes.Unit(D=150.0, H=5.0, X_eff=0.3)})
     t = np.arange(ramp.ticks) * ramp.T_s
     omega_g = 1.0 - 0.01 * np.clip((t - 2.0) / 0.5, 0.0, 1.0)
@@ -805,7 +777,7 @@ def test_the_envelope_of_a_ramp_is_not_for_a_converter_with_droop(ramp: Scenario
     assert other.verdict in (PASS, FAIL)
 
 
-def test_an_envelope_without_finite_limits_is_no_verdict() -> None:
+def test_an_envelope_without_finite_limits_is_no_verdict():
     """Of a unit almost without inertia: limits that are no numbers let any p pass."""
     scenario = Scenario.model_validate(
         {
@@ -820,9 +792,7 @@ def test_an_envelope_without_finite_limits_is_no_verdict() -> None:
     assert found.verdict == CANNOT and "no finite limits at H = 1e-09 s" in found.text
 
 
-def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
-    lab: Path,
-) -> None:
+def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(lab):
     criterion = '[[criteria]]\nkind = "in_envelope"\nclause = "as expected"\n'
     (lab / "jump.toml").write_text(LAB.split("[[criteria]]")[0] + criterion)
     asked = {"law": "vsg-2", "against": lab, "inner": "virtual-stator"}
@@ -841,14 +811,14 @@ def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(
     assert light.matrix == {("vsg-2", "lab/jump"): FAIL}
 
 
-def test_parts_without_a_criterion_are_refused() -> None:
+def test_parts_without_a_criterion_are_refused():
     with pytest.raises(ValueError, match="neither scenario nor criteria"):
         TestPart(name="a", cannot="why", scenario={"duration": 1.0})
     with pytest.raises(UserError, match="must be one of"):
         load_cases(["nowhere"])
 
 
-def test_the_gate_fails_a_test_with_each_part_and_the_report(lab: Path) -> None:
+def test_the_gate_fails_a_test_with_each_part_and_the_report(lab):
     (lab / "strict.toml").write_text(STRICT)
     folders = iter([lab.parent / "first", lab.parent / "second"])
     conform = gate(lab.parent, lambda: next(folders))
@@ -898,9 +868,9 @@ def two_reports(place: Path, old: Iterable[dict[str, Any]], new: Any) -> list[st
     ],
 )
 def test_a_report_is_worse_if_a_verdict_is_or_a_proof_is_gone(
-    old: list[str], new: list[str], changes: list[str], code: int, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    old, new, changes, code, tmp_path,
+    capsys
+):  # fmt: skip
     files = two_reports(tmp_path, map(clause_of, old), map(clause_of, new))
     page = tmp_path / "diff.html"
     assert main(["conform", "diff", *files, "--json", "--html", str(page)]) == code
@@ -924,18 +894,16 @@ def test_a_report_is_worse_if_a_verdict_is_or_a_proof_is_gone(
     ],
 )
 def test_a_value_moves_by_a_share_of_the_larger(
-    old: float | None, new: float | None, share: str, moved: bool, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    old, new, share, moved, tmp_path,
+    capsys
+):  # fmt: skip
     files = two_reports(tmp_path, [clause_of(PASS, old)], [clause_of(PASS, new)])
     assert main(["conform", "diff", *files, "--share", share]) == 0  # no verdict changed
     said = capsys.readouterr().out
     assert ("1 moved, 0 as before" in said) is moved and ("1 as before" in said) is not moved
 
 
-def test_a_law_of_another_name_and_a_test_that_is_gone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_law_of_another_name_and_a_test_that_is_gone(tmp_path, capsys):
     old = results_of(tmp_path / "old", clause_of(PASS), law="mine")
     new = results_of(tmp_path / "new", clause_of(PASS), law="mine-2", inner="cascaded")
     assert main(["conform", "diff", str(old), str(new)]) == 0
@@ -948,9 +916,7 @@ def test_a_law_of_another_name_and_a_test_that_is_gone(
     assert "1 gone, 1 new, 0 as before" in capsys.readouterr().out
 
 
-def test_a_report_as_the_command_writes_it_is_read_again(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_report_as_the_command_writes_it_is_read_again(lab, capsys):
     (lab / "none.toml").write_text(LAB + NONE)
     for law, name in (("droop-3", "old"), ("vsg-2", "new")):
         gfmhil.conform(law, lab, lab.parent / name)
@@ -963,7 +929,7 @@ def test_a_report_as_the_command_writes_it_is_read_again(
     assert main(["conform", "diff", str(lab), str(lab.parent / "new"), "--share", "2"]) == 2
 
 
-def test_the_list_is_also_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_is_also_json(capsys):
     assert main(["conform", "--against", "miso", "--list", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert [row["test"] for row in listed] == [case.id for case in load_cases(["miso"])]

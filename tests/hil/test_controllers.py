@@ -1,10 +1,7 @@
 """Models that are not ours as the controller: real-code DLLs and FMUs, and how they fail."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +87,7 @@ def run(tmp_path: Path, model: str, *options: str, **content: Any) -> Run:
 @pytest.mark.parametrize(
     ("kind", "inner"), [("dll", "cascaded"), ("dll", "none"), ("fmu", "cascaded")]
 )
-def test_our_own_model_gives_the_run_of_the_law(
-    exported: Any, kind: str, inner: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_our_own_model_gives_the_run_of_the_law(exported, kind, inner, tmp_path, monkeypatch):
     """Bit for bit, with the law settled at the first measurement, as the model settles itself."""
     content = {"law": "vsg-2", "inner": inner, "events": [STEP]}
     found = run(tmp_path, exported(kind, "vsg-2", inner), **content)
@@ -126,7 +121,7 @@ def test_our_own_model_gives_the_run_of_the_law(
 @pytest.mark.apt
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kind", ["dll", "fmu"])
-def test_a_reset_starts_the_model_anew(exported: Any, kind: str, tmp_path: Path) -> None:
+def test_a_reset_starts_the_model_anew(exported, kind, tmp_path):
     """A dip to nothing trips; the run after the reset has the bits of the run from its start."""
     falls = [{"type": "grid-voltage", "tick": 200, "V_g": 0.0}, {"type": "reset", "tick": 500}]
     content = {"after_trip": "wait", "events": falls}
@@ -141,7 +136,7 @@ def test_a_reset_starts_the_model_anew(exported: Any, kind: str, tmp_path: Path)
 
 @pytest.mark.apt
 @pytest.mark.timeout(300)
-def test_a_model_of_others_by_its_map(foreign: Path, tmp_path: Path) -> None:
+def test_a_model_of_others_by_its_map(foreign, tmp_path):
     """Its arithmetic, done again here from what the run recorded, step by step."""
     (tmp_path / "map.toml").write_text(MAP + "parameters.droop = 2e-4\n")
     options = ["--map", str(tmp_path / "map.toml")]
@@ -175,9 +170,7 @@ def test_a_model_of_others_by_its_map(foreign: Path, tmp_path: Path) -> None:
         (5, "dll droop of others: blocks the bridge: block = 1"),
     ],
 )
-def test_a_model_that_fails_is_named_and_the_run_is_kept(
-    foreign: Path, tmp_path: Path, what: int, reason: str
-) -> None:
+def test_a_model_that_fails_is_named_and_the_run_is_kept(foreign, tmp_path, what, reason):
     wrong = f"parameters.at = {FAILS_AT}\nparameters.what = {what}\n"
     (tmp_path / "map.toml").write_text(MAP + wrong)
     link = {"type": "shm", "peer_timeout_s": 4.0 if what == 3 else 20.0 - 18.0 * (what == 4)}
@@ -211,9 +204,9 @@ def test_a_model_that_fails_is_named_and_the_run_is_kept(
     ],
 )
 def test_what_a_run_with_a_model_refuses(
-    foreign: Path, tmp_path: Path, event: Any, map_: str, message: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    foreign, tmp_path, event, map_, message,
+    capsys
+):  # fmt: skip
     (tmp_path / "map.toml").write_text(map_)
     file = write(tmp_path, law="vsg-2", link={"type": "shm"}, events=[event])
     command = ["controller", file, "--endpoint", "shm://none", "--model", f"dll:{foreign}"]
@@ -226,7 +219,7 @@ def test_what_a_run_with_a_model_refuses(
 # --- without a compiler ---
 
 
-def test_ports_are_found_by_name_and_by_map() -> None:
+def test_ports_are_found_by_name_and_by_map():
     ref, y = np.arange(1.0, 6.0), np.arange(11.0, 16.0)
     ports = PortMap.model_validate(
         {
@@ -273,7 +266,7 @@ def test_ports_are_found_by_name_and_by_map() -> None:
         ),
     ],
 )
-def test_ports_that_do_not_fit_are_refused(ports: Any, outputs: list[str], message: str) -> None:
+def test_ports_that_do_not_fit_are_refused(ports, outputs, message):
     with pytest.raises(UserError) as refused:
         wire("model", PortMap.model_validate(ports), ["p"], outputs, inner=False)
     assert message in str(refused.value) and str(refused.value).startswith("model: ")
@@ -288,7 +281,7 @@ def test_ports_that_do_not_fit_are_refused(ports: Any, outputs: list[str], messa
         (None, "No such file"),
     ],
 )
-def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path: Path) -> None:
+def test_a_map_that_is_wrong_is_refused(text, message, tmp_path):
     if text is not None:
         (tmp_path / "map.toml").write_text(text)
     with pytest.raises(UserError, match=message):
@@ -306,7 +299,7 @@ def test_a_map_that_is_wrong_is_refused(text: str | None, message: str, tmp_path
         ("fmu:{text}", "is no FMU that FMPy reads"),
     ],
 )
-def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_model_is_refused(model, message, tmp_path):
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
         open_controller(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
@@ -316,12 +309,7 @@ def test_a_file_that_is_no_model_is_refused(model: str, message: str, tmp_path: 
     "16.5", "an FMU of 3 GB when unpacked, or a pipe", "3 GB written; waits for ever"
 )
 @pytest.mark.parametrize("kind", ["bomb", "members", "description"])
-def test_an_fmu_is_unpacked_within_limits(
-    kind: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    attack_now: Callable[[str], None],
-) -> None:
+def test_an_fmu_is_unpacked_within_limits(kind, tmp_path, monkeypatch, attack_now):
     file, scratch = tmp_path / "x.fmu", tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
@@ -342,9 +330,7 @@ def test_an_fmu_is_unpacked_within_limits(
     attack_now("refused before it is unpacked")
 
 
-def test_the_command_refuses_what_makes_no_sense(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_refuses_what_makes_no_sense(tmp_path, capsys):
     file = write(tmp_path, law="vsg-2", link={"type": "inproc"})
     out = ["--out", str(tmp_path / "run")]
     for options, message in (

@@ -1,7 +1,5 @@
 """Both servers beside one run: hundreds of silent pages, thousands of half-open connections."""
 
-from __future__ import annotations
-
 import json
 import resource
 import signal
@@ -96,7 +94,7 @@ class Page(threading.Thread):
     f"{PAGES} mute pages and {CONNECTIONS} half-open Modbus connections, {DESCRIPTORS} descriptors",
     "Modbus ends for good, the scope tells of no event, the operator is locked out",
 )
-def test_the_operator_goes_on_in_a_crowd(lab, attack_now) -> None:
+def test_the_operator_goes_on_in_a_crowd(lab, attack_now):
     folder, (_, scope, modbus) = lab
     look, control = addresses(iter(scope.stdout))
     port = int(modbus.stdout.readline().partition(",")[0].rpartition(":")[2])

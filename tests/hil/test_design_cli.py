@@ -1,9 +1,6 @@
 """gfmhil design gamma and tune: their output, files and errors."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import control
 import numpy as np
@@ -23,7 +20,7 @@ def said(capsys: Capture, *arguments: str, code: int = 0) -> dict:
     return json.loads(capsys.readouterr().out)
 
 
-def test_gamma(capsys: Capture) -> None:
+def test_gamma(capsys):
     out = said(capsys, "gamma", "--law", "mimo-gfm")
     assert out["gamma"] == pytest.approx(2.0209, rel=5e-5)
     assert [(c["i"], c["j"]) for c in out["channels"]] == [
@@ -32,7 +29,7 @@ def test_gamma(capsys: Capture) -> None:
     assert set(out["channels"][0]) == {"i", "j", "norm", "omega_rad_s"}
 
 
-def test_gamma_of_other_gains_as_data_and_as_a_table(capsys: Capture) -> None:
+def test_gamma_of_other_gains_as_data_and_as_a_table(capsys):
     gains = ("gamma", "--law", "vsg-2", "--gains", "k_34=1.9048, k_22=5.9801")  # k_35 is tied
     assert said(capsys, *gains)["gamma"] == pytest.approx(15.97, rel=1e-3)
     assert main(["design", *gains]) == 0
@@ -41,13 +38,13 @@ def test_gamma_of_other_gains_as_data_and_as_a_table(capsys: Capture) -> None:
     assert sampled == pytest.approx(15.97, rel=0.2)  # 10 kHz is fast for this loop
 
 
-def test_an_unstable_loop_has_no_gamma(capsys: Capture) -> None:
+def test_an_unstable_loop_has_no_gamma(capsys):
     out = said(capsys, "gamma", "--law", "vsg-2", "--gains", "k_34=50", code=3)
     assert out["gamma"] is None
     assert "unstable" in out["reason"]
 
 
-def test_weights_of_ones_own(capsys: Capture, tmp_path: Path) -> None:
+def test_weights_of_ones_own(capsys, tmp_path):
     path = tmp_path / "w.toml"
     path.write_text("[W_21]\nnum = [2.0]\nden = [1.0]\n")
     out = said(capsys, "gamma", "--law", "mimo-gfm", "--weights", str(path))
@@ -55,7 +52,7 @@ def test_weights_of_ones_own(capsys: Capture, tmp_path: Path) -> None:
     assert out["gamma"] == pytest.approx(2.0, rel=0.2)  # p follows P_ref, with little overshoot
 
 
-def test_tune(capsys: Capture, tmp_path: Path) -> None:
+def test_tune(capsys, tmp_path):
     path = tmp_path / "mine.toml"
     options = ("--starts", "1", "--evaluations", "640", "--seed", "4", "--quiet")
     out = said(capsys, "tune", "--law", "vsg-2", *options, "--out", str(path))
@@ -66,7 +63,7 @@ def test_tune(capsys: Capture, tmp_path: Path) -> None:
     assert law_file(str(path)).parameters["k_22"].value == out["gains"]["k_22"]
 
 
-def test_tune_names_the_gain_at_its_bound(capsys: Capture) -> None:
+def test_tune_names_the_gain_at_its_bound(capsys):
     options = ("--starts", "1", "--evaluations", "40", "--quiet")
     assert main(["design", "tune", "--law", "vsg-5", *options]) == 0
     assert "k_qp is at its bound 0.1" in capsys.readouterr().out
@@ -74,7 +71,7 @@ def test_tune_names_the_gain_at_its_bound(capsys: Capture) -> None:
     assert out["at_bounds"] == {"k_qp": 0.1}
 
 
-def test_a_weight_that_is_largest_at_infinite_frequency_is_named(capsys: Capture) -> None:
+def test_a_weight_that_is_largest_at_infinite_frequency_is_named(capsys):
     assert main(["design", "gamma", "--law", "droop-5"]) == 0  # P_ref acts on omega_u at once
     out = capsys.readouterr().out
     assert "W_31 T_31 is largest at infinite frequency" in out and "inf\n" not in out
@@ -82,7 +79,7 @@ def test_a_weight_that_is_largest_at_infinite_frequency_is_named(capsys: Capture
     assert "infinite" not in capsys.readouterr().out
 
 
-def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
+def test_none_to_be_found_names_the_mode(capsys):
     options = ("--starts", "1", "--evaluations", "320", "--quiet")
     out = said(capsys, "tune", "--law", "droop-1", *options, code=3)
     assert out["gamma"] is None
@@ -90,7 +87,7 @@ def test_none_to_be_found_names_the_mode(capsys: Capture) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bode", "nyquist"])
-def test_a_loop_is_drawn_with_its_margins(kind: str, capsys: Capture, tmp_path: Path) -> None:
+def test_a_loop_is_drawn_with_its_margins(kind, capsys, tmp_path):
     figure = tmp_path / "loop.png"
     out = said(capsys, kind, "--law", "vsg-2", "--at", "E_u,V", "--out", str(figure))
     assert list(out["at"]) == ["E_u", "V"]
@@ -100,7 +97,7 @@ def test_a_loop_is_drawn_with_its_margins(kind: str, capsys: Capture, tmp_path: 
     assert out["mode"]["frequency_hz"] == pytest.approx(49.5, abs=0.1)
 
 
-def test_poles_and_a_step(capsys: Capture, tmp_path: Path) -> None:
+def test_poles_and_a_step(capsys, tmp_path):
     out = said(capsys, "poles", "--law", "vsg-2", "--scenario", "rig_pref_step")
     assert not out["stable"] and out["modes"][0]["frequency_hz"] == pytest.approx(49.5, abs=0.1)
     figure = tmp_path / "step.svg"
@@ -114,7 +111,7 @@ def test_poles_and_a_step(capsys: Capture, tmp_path: Path) -> None:
 STAGED = ("--law", "vsg-2", "--inner", "virtual-stator")
 
 
-def test_gamma_and_poles_behind_an_inner_stage(capsys: Capture) -> None:
+def test_gamma_and_poles_behind_an_inner_stage(capsys):
     out = said(capsys, "gamma", *STAGED)
     # python-control's own norm of the loop, with the paper's weights by Tustin
     loop = Law.load("vsg-2").with_inner("virtual-stator").closed_loop(LATE)
@@ -136,7 +133,7 @@ def test_gamma_and_poles_behind_an_inner_stage(capsys: Capture) -> None:
     assert step["y"]["p"]["end"] == pytest.approx(1.0, abs=0.01)
 
 
-def test_tune_behind_an_inner_stage(capsys: Capture, tmp_path: Path) -> None:
+def test_tune_behind_an_inner_stage(capsys, tmp_path):
     path = tmp_path / "mine.toml"
     before = said(capsys, "gamma", "--law", "mimo-gfm-practical", "--inner", "virtual-stator")
     options = ("--inner", "virtual-stator", "--starts", "1", "--evaluations", "64", "--quiet")
@@ -177,7 +174,7 @@ def test_tune_behind_an_inner_stage(capsys: Capture, tmp_path: Path) -> None:
         (["box", "--law", "mimo-gfm"], "python -m deployable check takes the same options"),
     ],
 )
-def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+def test_refuses_in_one_line(arguments, words, capsys):
     assert_refused(capsys, arguments, words)
 
 
@@ -190,7 +187,7 @@ def assert_refused(capsys: Capture, arguments: list[str], words: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["gamma", "tune"])
-def test_refuses_an_improper_weight(kind: str, capsys: Capture, tmp_path: Path) -> None:
+def test_refuses_an_improper_weight(kind, capsys, tmp_path):
     path = tmp_path / "w.toml"
     path.write_text("[W_11]\nnum = [1.0, 1.0]\nden = [1.0]\n")
     arguments = [kind, "--law", "vsg-2", "--weights", str(path)]
@@ -225,9 +222,7 @@ a = { value = 0.5, unit = "p.u.", source = "s", free = [-2.0, 2.0] }
         ("[-2.0, 2.0]", "[1.0, 2.0]", "start 0.5 lies outside [1, 2]"),
     ],
 )
-def test_refuses_a_problem_that_is_none(
-    was: str, becomes: str, words: str, capsys: Capture, tmp_path: Path
-) -> None:
+def test_refuses_a_problem_that_is_none(was, becomes, words, capsys, tmp_path):
     path = tmp_path / "own.toml"
     path.write_text(OWN.replace(was, becomes))
     assert_refused(capsys, ["tune", "--law", str(path)], words)

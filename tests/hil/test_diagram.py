@@ -1,10 +1,7 @@
 """The single-line diagram shows what the scenario has."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
@@ -30,7 +27,7 @@ def breakers(scenario: Scenario) -> list[bool]:
     return [p.get_facecolor()[0] < 0.5 for p in small if p.get_width() == pytest.approx(0.22)]
 
 
-def test_one_converter_at_its_grid(make: Make) -> None:
+def test_one_converter_at_its_grid(make):
     plant = {"grid": {"scr": 4.0, "x_over_r": 3.0, "omega_g": 0.99, "load_R": 40.0, "load_L": 0.01}}
     shown = texts(make(law="vsg-2", plant=plant))
     assert "vsg-2, 4 kVA" in shown
@@ -41,7 +38,7 @@ def test_one_converter_at_its_grid(make: Make) -> None:
     assert not any("fault" in text for text in shown)
 
 
-def test_a_fault_is_marked_at_its_place(make: Make) -> None:
+def test_a_fault_is_marked_at_its_place(make):
     places = []
     for position in (0.0, 0.25, 0.5):
         axes = fill_diagram(Figure(), make(events=[{**FAULT, "position": position, "R": 0.1}]))
@@ -52,7 +49,7 @@ def test_a_fault_is_marked_at_its_place(make: Make) -> None:
     assert places[2] - places[0] == pytest.approx(2 * (places[1] - places[0]))
 
 
-def test_a_transformer_and_a_second_inductor_are_drawn(make: Make) -> None:
+def test_a_transformer_and_a_second_inductor_are_drawn(make):
     unit = {"node": "low", "plant": {"lcl": {"L": 0.08, "R": 0.01}}}
     step_up = {"start": "low", "end": "high", "S": 2.0, "X": 0.12, "X_m": 100.0, "closed": False}
     network = {"grid": "high", "converters": {"A": unit}, "transformers": {"T": step_up}}
@@ -68,7 +65,7 @@ def test_a_transformer_and_a_second_inductor_are_drawn(make: Make) -> None:
     assert "LG fault of c, 0.02 s" in texts(make(events=[lg]))
 
 
-def test_a_network_has_all_its_parts() -> None:
+def test_a_network_has_all_its_parts():
     scenario = load_scenario("three_share_a_load")
     shown = texts(scenario)
     named = ["A: vsg-2, 4 kVA", "B: droop-3, 4 kVA", "C: mimo-gfm-deployable, 4 kVA", "bus", "far"]
@@ -81,7 +78,7 @@ def test_a_network_has_all_its_parts() -> None:
     assert len(circles) == 3  # two DC sources and the machine
 
 
-def test_a_network_at_a_finite_grid(make: Make) -> None:
+def test_a_network_at_a_finite_grid(make):
     """Banks are at their node, and the node of the grid is the last one."""
     network = {
         "grid": "town",
@@ -97,9 +94,7 @@ def test_a_network_at_a_finite_grid(make: Make) -> None:
     assert at["farm"] < at["bank\nQ 0.1 p.u."] and breakers(scenario) == [True, True]
 
 
-def test_a_component_without_a_symbol_is_a_box_with_its_name(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_component_without_a_symbol_is_a_box_with_its_name(monkeypatch):
     class Shunt(Component):
         node: str
 
@@ -122,7 +117,7 @@ def test_a_component_without_a_symbol_is_a_box_with_its_name(
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())
-def test_every_shipped_scenario_is_drawn_within_its_picture(name: str) -> None:
+def test_every_shipped_scenario_is_drawn_within_its_picture(name):
     figure = Figure()
     axes = fill_diagram(figure, load_scenario(name))
     figure.draw_without_rendering()
@@ -131,7 +126,7 @@ def test_every_shipped_scenario_is_drawn_within_its_picture(name: str) -> None:
         assert box.x0 >= 0 and box.x1 <= 1 and box.y0 >= 0 and box.y1 <= 1, text.get_text()
 
 
-def test_the_report_shows_it(make: Make, tmp_path: Path) -> None:
+def test_the_report_shows_it(make, tmp_path):
     one = gfmhil.run(make(events=[FAULT]), folder=tmp_path / "run")
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert 'alt="network" src="data:image/svg+xml;base64,' in report

@@ -1,7 +1,5 @@
 """gfmhil doctor: its findings, its advice, its exit codes, and that it changes nothing."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Frames with a good CRC and wrong content: the reader refuses and counts each, and uses none."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -3,8 +3,6 @@
 One side runs its real loop; a lying peer plays the other side.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 import time

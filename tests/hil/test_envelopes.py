@@ -5,8 +5,6 @@ verification (c) RTE and Grupo AIA, MPL-2.0, commit b7576cb0: docs/GFM_envelopes
 and tests/dycov/gfm/resources. Their columns: time, expected, and the two limits.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -105,7 +103,7 @@ def lines(text: str) -> list[list[float]]:
     ],
     ids=["overdamped", "underdamped", "amplitude"],
 )
-def test_envelopes_are_the_published_ones_to_their_digits(made, curve) -> None:
+def test_envelopes_are_the_published_ones_to_their_digits(made, curve):
     found: Envelope = made()
     for t, expected, *limits in lines(curve):
         k = round(t / (T[1] - T[0]))
@@ -125,7 +123,7 @@ def test_envelopes_are_the_published_ones_to_their_digits(made, curve) -> None:
     ],
     ids=["RoCoF", "SCR"],
 )
-def test_envelopes_of_ramps_and_scr_jumps_are_the_published_ones(made, curve) -> None:
+def test_envelopes_of_ramps_and_scr_jumps_are_the_published_ones(made, curve):
     step = 6.0 / 2999
     t = 3.334e-4 + step * np.arange(2499)  # DyCoV's from -1 to 5 s, from the event on
     found: Envelope = made(t)
@@ -135,7 +133,7 @@ def test_envelopes_of_ramps_and_scr_jumps_are_the_published_ones(made, curve) ->
         assert values == pytest.approx(printed, rel=5e-4, abs=5e-5), at  # of the last digit
 
 
-def test_an_underdamped_unit_stays_in_its_own_envelopes() -> None:
+def test_an_underdamped_unit_stays_in_its_own_envelopes():
     """And twice the answer, or a tenth of it, does not."""
     t = np.linspace(0.0, 5.0, 3000)
     unit = Unit(60.0, 5.0, 0.3)
@@ -158,7 +156,7 @@ def test_an_underdamped_unit_stays_in_its_own_envelopes() -> None:
             assert bool(beyond.max() < 2e-3) is inside, factor
 
 
-def test_a_ramp_of_frequency_is_the_published_one() -> None:
+def test_a_ramp_of_frequency_is_the_published_one():
     # S_Rocof1, OC1: 0.5 Hz/s at SCR 2; each value is late by 9 samples of 2 ms
     t = np.linspace(-1.0, 5.0, 3000)
     p = rocof_response(OVERDAMPED, t, 0.5 / 50, 2.0)
@@ -168,7 +166,7 @@ def test_a_ramp_of_frequency_is_the_published_one() -> None:
         assert p[k] == pytest.approx(printed, rel=5e-4)
 
 
-def test_a_step_of_scr_is_the_published_one() -> None:
+def test_a_step_of_scr_is_the_published_one():
     # SCRJump_S_SCRup1_OC1: at 0.2 s, with 20 ms of delay
     unit = Unit(133.0, 10.0, 0.25)
     at = np.array([0.2501, 0.3001, 0.3501, 0.3741])
@@ -176,7 +174,7 @@ def test_a_step_of_scr_is_the_published_one() -> None:
     assert p == pytest.approx([1.061, 1.004, 0.9151, 0.8667], abs=5.1e-4)
 
 
-def test_a_ramp_ends_where_inertia_and_damping_lead() -> None:
+def test_a_ramp_ends_where_inertia_and_damping_lead():
     unit = Unit(80.0, 6.0, 0.3)
     t = np.linspace(0.0, 20.0, 2000)
     p = rocof_response(unit, t, 0.02, 5.0, T_pll=0.02, lasts=10.0)
@@ -184,14 +182,14 @@ def test_a_ramp_ends_where_inertia_and_damping_lead() -> None:
     assert abs(p[-1]) < 1e-4
 
 
-def test_a_response_is_judged_against_its_envelope() -> None:
+def test_a_response_is_judged_against_its_envelope():
     found = phase_jump(OVERDAMPED, T, JUMP, 10.0, 0.5)
     assert found.outside(T, found.expected).max() == 0.0
     assert found.outside([1.0], [0.7])[0] == pytest.approx(0.7 - np.interp(1.0, T, found.upper))
 
 
 @pytest.mark.parametrize(("D", "H", "X"), [(60.0, 4.0, 0.3), (20.0, 6.0, 0.15), (300.0, 2.0, 0.5)])
-def test_the_fit_finds_a_swing_equation_again(D: float, H: float, X: float) -> None:
+def test_the_fit_finds_a_swing_equation_again(D, H, X):
     jump = math.radians(5.0)
 
     def swing(t: float, z: np.ndarray) -> list[float]:
@@ -205,7 +203,7 @@ def test_the_fit_finds_a_swing_equation_again(D: float, H: float, X: float) -> N
 
 
 @pytest.mark.parametrize("law", ["vsg-1", "vsg-2", "droop-5"])
-def test_the_inertia_of_a_ramp_is_that_of_the_law_less_the_lag_of_the_line(law: str) -> None:
+def test_the_inertia_of_a_ramp_is_that_of_the_law_less_the_lag_of_the_line(law):
     rate = 0.02  # Hz/s
     run = gfmhil.run(
         {
@@ -225,7 +223,7 @@ def test_the_inertia_of_a_ramp_is_that_of_the_law_less_the_lag_of_the_line(law: 
     assert abs(H - (H_law - D**2 * X / (2 * OMEGA_B))) <= 0.05
 
 
-def test_a_law_makes_a_unit_of_its_converter() -> None:
+def test_a_law_makes_a_unit_of_its_converter():
     unit = measure_unit("vsg-2", plant__grid={"scr": 3.0, "x_over_r": 10.0})
     damping, inertia = unit.D, unit.H
     assert damping == pytest.approx(100.0, rel=0.02) and inertia == pytest.approx(8.361, rel=0.02)
@@ -234,7 +232,7 @@ def test_a_law_makes_a_unit_of_its_converter() -> None:
     assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
 
 
-def test_a_law_without_inertia_makes_a_unit_of_almost_none() -> None:
+def test_a_law_without_inertia_makes_a_unit_of_almost_none():
     at = {"plant__grid": {"scr": 10.0, "x_over_r": 10.0}, "references__P_ref": 0.0}
     unit = measure_unit("droop-1", inner="virtual-stator", **at)
     assert pytest.approx(100.0, rel=0.15) == unit.D and unit.H < 0.05
@@ -251,6 +249,6 @@ def test_a_law_without_inertia_makes_a_unit_of_almost_none() -> None:
         (lambda: measure_unit("vsg-2", degrees=0.0), "must lie in"),
     ],
 )
-def test_mistakes(call, message: str) -> None:
+def test_mistakes(call, message):
     with pytest.raises(gfmhil.UserError, match=message):
         call()

@@ -1,7 +1,5 @@
 """A scenario's expected end: status, reason and time; each can fail alone."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

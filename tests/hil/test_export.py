@@ -1,7 +1,5 @@
 """Runs exported to files of other tools, read back by those tools' libraries."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """CAN frames rebuilt from a recording, against those that a third node received."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Deliberate faults on every link, in lockstep: each is counted, none changes a result."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from functools import cache

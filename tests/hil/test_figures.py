@@ -1,7 +1,5 @@
 """Figures of recordings that are complete, cut short, or lack a side."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

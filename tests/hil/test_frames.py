@@ -1,7 +1,5 @@
 """Frames: each arrives unchanged or not at all, every fault counts under its name; their CRC."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np
@@ -146,13 +144,13 @@ CHECKED = [bytes(range(44)), bytes(range(60)), b"\xff" * 44, b"\x00" * 60]
 @example(message=CHECKED[1], after=b"\x01")
 @example(message=CHECKED[2], after=b"")
 @example(message=CHECKED[3], after=b"")
-def test_the_crc_is_that_of_zlib(crc, message: bytes, after: bytes) -> None:
+def test_the_crc_is_that_of_zlib(crc, message, after):
     room = np.frombuffer(message + after, np.uint8)
     assert crc(room, len(message)) == zlib.crc32(message)
 
 
 @pytest.mark.parametrize("crc", [crc32, crc32_by_tables])
-def test_the_crc_of_every_length_and_the_published_check(crc) -> None:
+def test_the_crc_of_every_length_and_the_published_check(crc):
     noise = np.random.default_rng(1).integers(0, 256, 600, np.uint8)
     for count in range(600):
         assert crc(noise, count) == zlib.crc32(noise[:count].tobytes())

@@ -1,7 +1,5 @@
 """The parsers in C: equal to the bench's own, and under a fuzzer with sanitizers."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os
@@ -95,7 +93,7 @@ greetings = st.binary(max_size=100).map(lambda rest: b"GFMHIL " + rest)
 
 
 @given(many=st.lists(messages | greetings, max_size=4))
-def test_a_line_in_c_stuffs_and_unstuffs_as_the_bench(header: Any, many: list[bytes]) -> None:
+def test_a_line_in_c_stuffs_and_unstuffs_as_the_bench(header, many):
     to, found = ctypes.create_string_buffer(LONGEST + 8), []
     for message in many:
         size = header.stuff(message, ctypes.c_size_t(len(message)), to)
@@ -116,7 +114,7 @@ def taken(header: Any, line: bytes) -> list[bytes]:
 
 
 @given(line=st.binary(max_size=300) | st.lists(st.integers(0, 4), max_size=60).map(bytes))
-def test_a_damaged_line_gives_c_what_it_gives_the_bench(header: Any, line: bytes) -> None:
+def test_a_damaged_line_gives_c_what_it_gives_the_bench(header, line):
     bench, found = Unstuffer(), []
     bench.feed(line + b"\0")
     while (message := bench.next()) is not None:
@@ -129,9 +127,7 @@ def test_a_damaged_line_gives_c_what_it_gives_the_bench(header: Any, line: bytes
     tick=st.integers(0, 2**63 - 1),
     damage=st.integers(0, 64 * 8),
 )
-def test_frames_in_c_are_those_of_the_bench(
-    header: Any, values: list[float], tick: int, damage: int
-) -> None:
+def test_frames_in_c_are_those_of_the_bench(header, values, tick, damage):
     y = bytearray(FrameWriter("y").pack(tick, 2, 0, np.array(values)))
     size, zero = ctypes.c_size_t(len(y)), ctypes.c_uint32(0)
     assert header.is_y(bytes(y), size, zero)
@@ -148,9 +144,7 @@ def test_frames_in_c_are_those_of_the_bench(
 
 
 @given(fields=st.permutations(list(HELLO)), tight=st.booleans())
-def test_the_answer_to_a_hello_in_any_order_is_a_hello(
-    header: Any, fields: list[str], tight: bool
-) -> None:
+def test_the_answer_to_a_hello_in_any_order_is_a_hello(header, fields, tight):
     apart = {"separators": (",", ":")} if tight else {}
     hello = b"GFMHIL " + json.dumps({name: HELLO[name] for name in fields}, **apart).encode()
     to = ctypes.create_string_buffer(LONGEST)
@@ -164,7 +158,7 @@ def test_the_answer_to_a_hello_in_any_order_is_a_hello(
     assert header.is_greeting(hello, b"hello") and not header.is_greeting(hello, b"start")
 
 
-def test_an_answer_that_has_no_room_is_none(header: Any) -> None:
+def test_an_answer_that_has_no_room_is_none(header):
     to = ctypes.create_string_buffer(LONGEST)
     hello = b"GFMHIL " + json.dumps({**HELLO, "laws": "x" * 250}).encode()
     sizes = [header.answer(hello, b"n" * k, to) for k in range(120)]
@@ -200,7 +194,7 @@ def message_seeds() -> list[bytes]:
     return [hello + b"".join(frames) + end + hello, hello, *frames, end, b"\0\x08" + bytes(16)]
 
 
-def test_fuzzing_the_board_finds_nothing(tmp_path: Path) -> None:
+def test_fuzzing_the_board_finds_nothing(tmp_path):
     exported(tmp_path, "float32", "unrolled", "vsg-2")
     for file in (*DRIVERS.glob("*.[ch]"), EXAMPLES / "board_c" / "main.c"):
         shutil.copy(file, tmp_path)
@@ -208,7 +202,7 @@ def test_fuzzing_the_board_finds_nothing(tmp_path: Path) -> None:
     fuzz(tmp_path, message_seeds(), "board.c", "-ffp-contract=off", "gfm_vsg_2.c")
 
 
-def test_fuzzing_the_example_of_a_controller_finds_nothing(tmp_path: Path) -> None:
+def test_fuzzing_the_example_of_a_controller_finds_nothing(tmp_path):
     example = EXAMPLES / "own_controller_c"
     for file in DRIVERS.glob("*.[ch]"):
         shutil.copy(file, tmp_path)
@@ -220,9 +214,7 @@ def test_fuzzing_the_example_of_a_controller_finds_nothing(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("real", "staged"), [("float32", False), ("float64", True)])
-def test_fuzzing_the_program_of_a_processor_in_the_loop_finds_nothing(
-    tmp_path: Path, real: str, staged: bool
-) -> None:
+def test_fuzzing_the_program_of_a_processor_in_the_loop_finds_nothing(tmp_path, real, staged):
     of = {n: STAGED[n] for n in ("vsg-2 cascaded", "no stage")} if staged else {
         n: LAWS[n] for n in ("vsg-2", "hybrid-angle")
     }  # fmt: skip

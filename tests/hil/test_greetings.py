@@ -1,7 +1,5 @@
 """Messages in place of a greeting: refused with a notice and counted, and the wait continues."""
 
-from __future__ import annotations
-
 import json
 import socket
 import time

@@ -1,7 +1,5 @@
 """The start of a run: what both sides agree on, and the refusal of each mismatch."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

@@ -3,8 +3,6 @@
 ``GFMHIL_HOSTILE_FOLDERS=500 python -m pytest tests/hil/test_hostile_folders.py`` tries 500.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """The measured admittance: against the linear model, closed forms, and the poles of other grids."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -37,13 +35,13 @@ def measured() -> gfmhil.FrequencyScan:
     return gfmhil.scan(law, "pref_step", start_hz=100, stop_hz=1000, points=7)
 
 
-def test_agrees_with_the_linear_model(measured: gfmhil.FrequencyScan) -> None:
+def test_agrees_with_the_linear_model(measured):
     assert measured.name == "droop-2" and len(measured.frequency) == 7
     assert measured.deviation is not None and measured.deviation.max() < 0.01
     assert measured.nfp == pytest.approx(measured.nfp_model, rel=0.01)
 
 
-def test_is_the_filter_alone_where_the_law_is_slow(measured: gfmhil.FrequencyScan) -> None:
+def test_is_the_filter_alone_where_the_law_is_slow(measured):
     pu, hz = load_converter("paper").pu(), measured.frequency
     omega_b = 100 * math.pi
     choke = np.linalg.inv(line_impedance(hz, pu["R_f"], pu["L_f"], omega_b))
@@ -53,7 +51,7 @@ def test_is_the_filter_alone_where_the_law_is_slow(measured: gfmhil.FrequencySca
     assert fast.any() and off[fast].max() < 0.02
 
 
-def test_stage_delay_sensors_and_frequency() -> None:
+def test_stage_delay_sensors_and_frequency():
     found = gfmhil.scan(
         "droop-5", gfmhil.load_scenario(REAL), inner="virtual-stator",
         start_hz=100, stop_hz=900, points=6, settle_s=1.0,
@@ -66,7 +64,7 @@ def test_stage_delay_sensors_and_frequency() -> None:
     ("law", "inner"),
     [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")],
 )
-def test_one_percent_from_1_hz_to_1_khz(law: str, inner: str) -> None:
+def test_one_percent_from_1_hz_to_1_khz(law, inner):
     found = gfmhil.scan(law, inner=inner)
     assert len(found.frequency) == 40
     assert found.frequency[[0, -1]] == pytest.approx([1.0, 1000.0], rel=0.01)
@@ -75,7 +73,7 @@ def test_one_percent_from_1_hz_to_1_khz(law: str, inner: str) -> None:
 
 
 @pytest.mark.full
-def test_judges_other_grids_as_their_poles_do() -> None:
+def test_judges_other_grids_as_their_poles_do():
     law = gfmhil.Law.load("droop-5").with_inner("cascaded").with_gains("steep", D_p=0.3)
     plant = {"grid": {"scr": 2.0, "x_over_r": 10.0}}
     found = gfmhil.scan(
@@ -89,7 +87,7 @@ def test_judges_other_grids_as_their_poles_do() -> None:
 
 
 @pytest.mark.processes
-def test_measures_a_controller_that_is_a_program(tmp_path: Path) -> None:
+def test_measures_a_controller_that_is_a_program(tmp_path):
     command = f"{sys.executable} {OWN} {{endpoint}} {{scenario}}"
     options = ["--controller", command, "--from", "40", "--to", "400", "--points", "4"]
     options += ["--settle", "0.5", "-o", str(tmp_path / "out"), "--grid", "2:6", "--quiet"]
@@ -114,7 +112,7 @@ def test_measures_a_controller_that_is_a_program(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_folder(tmp_path, capsys):
     options = ["--from", "100", "--to", "800", "--points", "4", "--settle", "1", "--grid", "5:10"]
     folder = tmp_path / "out"
     assert main(["scan", "droop-2", *options, "-o", str(folder), "--quiet"]) == 0
@@ -151,13 +149,13 @@ def test_the_command_writes_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["pref_step", "--controller", "true", "--scenario", "x"], "goes with a law"),
     ],
 )
-def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes(arguments, message, capsys):
     assert main(["scan", *arguments, "--quiet"]) == 2
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
 
 
-def test_a_limit_that_acts_is_found() -> None:
+def test_a_limit_that_acts_is_found():
     limited = {**REAL["plant"], "i_peak": 0.31}
     scenario = gfmhil.load_scenario({**REAL, "law": "droop-5", "plant": limited})
     with pytest.raises(gfmhil.UserError, match=r"plant.i_peak or plant.modulation acts"):
@@ -165,14 +163,14 @@ def test_a_limit_that_acts_is_found() -> None:
                         amplitude=1e-2)  # fmt: skip
 
 
-def test_an_unstable_loop_is_refused() -> None:
+def test_an_unstable_loop_is_refused():
     plant = {"delay": {"samples": 2}}
     scenario = gfmhil.load_scenario("pref_step", law="droop-5", plant=plant)
     with pytest.raises(gfmhil.UserError, match="droop-5 is unstable on this grid: a mode at"):
         gfmhil.scan(None, scenario, inner="cascaded")
 
 
-def test_tones_have_whole_periods_in_their_window() -> None:
+def test_tones_have_whole_periods_in_their_window():
     for start, stop, points in ((1.0, 1000.0, 40), (0.3, 4400.0, 200), (49.0, 51.0, 5)):
         bands = _bands(start, stop, points, 1e-4, 0.2)
         hz = np.concatenate([band.hz for band in bands])

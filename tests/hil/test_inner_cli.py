@@ -1,7 +1,5 @@
 """Inner stages from the command line and from Python: chosen, shown, changed, refused."""
 
-from __future__ import annotations
-
 import json
 from importlib.resources import files
 from pathlib import Path

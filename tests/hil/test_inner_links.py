@@ -1,7 +1,5 @@
 """Runs with an inner stage over every exact link give the bits of the run in process."""
 
-from __future__ import annotations
-
 import io
 import json
 from importlib.resources import files

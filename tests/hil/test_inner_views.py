@@ -1,7 +1,5 @@
 """What people see of a run with an inner stage: figures, report, summary, scope, exports."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Both sides in one process: a steady state stays, events have their effects, reasons of ends."""
 
-from __future__ import annotations
-
 import math
 from importlib import resources
 

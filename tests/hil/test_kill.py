@@ -5,8 +5,6 @@ selects other rounds, and GFMHIL_KILLS_REPORT=file writes a line per round: link
 ticks recorded, and the time in s from the last frame of the killed side to the end of the other.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

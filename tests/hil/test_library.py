@@ -1,7 +1,5 @@
 """Controllers in shared libraries that measure and command phase voltages and currents."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import shutil
@@ -61,9 +59,7 @@ def phases(amplitude: float, angle: float) -> list[float]:
 
 
 @pytest.mark.parametrize(("step_ticks", "delay"), [(1, 0.0), (1, 1.3), (4, 0.5)])
-def test_phases_are_those_of_the_turning_frame(
-    step_ticks: int, delay: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_phases_are_those_of_the_turning_frame(step_ticks, delay, tmp_path, monkeypatch):
     """A controller that gives a voltage of constant amplitude and speed, and makes up for the delay
     that it is told, is in the frame a constant but for the steps in which it is held."""
     rig, speed = BenchContext(1e-4, True, Bases(), delay), 1.01
@@ -104,15 +100,13 @@ def test_phases_are_those_of_the_turning_frame(
         (BenchContext(inner=True), PortMap(step_s=1.5e-4), "must be a multiple of the run's T_s"),
     ],
 )
-def test_what_does_not_fit_is_refused(
-    rig: BenchContext, ports: PortMap, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_does_not_fit_is_refused(rig, ports, message, tmp_path, monkeypatch):
     monkeypatch.setattr(library, "_loaded", lambda path: Fake(None))
     with pytest.raises(UserError, match=message):
         library.LibraryController(tmp_path / "x.so", ports, rig)
 
 
-def test_the_headers_folder_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_headers_folder_is_told(capsys):
     assert main(["firmware", "include"]) == 0
     assert (Path(capsys.readouterr().out.strip()) / "gfmhil_controller.h").is_file()
 
@@ -147,9 +141,7 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("scenario", "p_end"),
     [("rig_pref_step", 1.0), ("ride_through_fault", 0.5), ("phase_jump_within_rating", 0.5)],
 )
-def test_the_example_holds_the_plant(
-    example: Path, scenario: str, p_end: float, tmp_path: Path
-) -> None:
+def test_the_example_holds_the_plant(example, scenario, p_end, tmp_path):
     found = run(tmp_path, example, scenario, "--mode", "lockstep")
     p, i = found.columns["true_p"][:], found.columns["true_i"][:]
     first = found.scenario.sorted_events()[0].at(found.scenario.T_s)
@@ -173,9 +165,7 @@ def test_the_example_holds_the_plant(
         ("crash", "the controller was ended by SIGSEGV"),
     ],
 )
-def test_a_library_that_fails_is_named_and_the_run_is_kept(
-    what: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_library_that_fails_is_named_and_the_run_is_kept(what, reason, tmp_path, monkeypatch):
     done = cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm")
     assert (done.returncode, done.stderr) == (0, "")
     monkeypatch.setenv("FOREIGN_WHAT", what)
@@ -191,9 +181,7 @@ def test_a_library_that_fails_is_named_and_the_run_is_kept(
 
 
 @pytest.mark.apt
-def test_in_lockstep_a_library_may_take_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_lockstep_a_library_may_take_seconds(tmp_path, monkeypatch):
     assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
     monkeypatch.setenv("FOREIGN_WHAT", "pause")
     found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2"))
@@ -203,9 +191,7 @@ def test_in_lockstep_a_library_may_take_seconds(
 
 @pytest.mark.apt
 @pytest.mark.skipif(processors() < 2, reason="every process has one processor")
-def test_in_lockstep_a_library_and_its_threads_share_a_processor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_lockstep_a_library_and_its_threads_share_a_processor(tmp_path, monkeypatch):
     """A processor that sleeps takes long to wake: no thread waits for another processor."""
     assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
     monkeypatch.setenv("FOREIGN_WHAT", "where")
@@ -214,9 +200,7 @@ def test_in_lockstep_a_library_and_its_threads_share_a_processor(
 
 
 @pytest.mark.apt
-def test_in_real_time_a_library_that_takes_too_long_ends_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_real_time_a_library_that_takes_too_long_ends_the_run(tmp_path, monkeypatch):
     assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
     monkeypatch.setenv("FOREIGN_WHAT", "slow")
     late = {"mode": "realtime", "T_s": 1e-3, "late_policy": {"hold": 50}, "duration": 5.0}
@@ -228,9 +212,7 @@ def test_in_real_time_a_library_that_takes_too_long_ends_the_run(
 
 
 @pytest.mark.apt
-def test_what_is_no_such_library_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_such_library_is_refused(tmp_path, monkeypatch):
     rig = BenchContext(inner=True)
     (tmp_path / "text.so").write_text("no library")
     (tmp_path / "other.c").write_text("int other(void) { return 0; }\n")
@@ -288,7 +270,7 @@ def adapted(folder: Path, firmware: str) -> Path:
 
 
 @pytest.mark.apt
-def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path) -> None:
+def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path):
     path = adapted(tmp_path / "tasks", "other.c")
     rig, ports = BenchContext(1e-4, True, MEGAWATT), PortMap(step_s=2e-4)
     model = library.LibraryController(path, ports, rig)
@@ -327,7 +309,7 @@ def test_a_firmware_sees_the_start_as_if_it_had_been_there_before(tmp_path: Path
 
 
 @pytest.mark.apt
-def test_the_firmware_of_the_example_holds_the_plant(tmp_path: Path) -> None:
+def test_the_firmware_of_the_example_holds_the_plant(tmp_path):
     path = adapted(tmp_path / "tasks", "firmware.c")
     scenario = tmp_path / "tasks" / "short.toml"
     text = (path.parent / "events.toml").read_text()

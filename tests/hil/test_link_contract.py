@@ -1,7 +1,5 @@
 """What every link of the registry keeps: ours, one behind impairments, one of another package."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

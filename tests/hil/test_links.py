@@ -1,7 +1,5 @@
 """Both sides over a real ZeroMQ link, in two threads of this process."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from typing import Any

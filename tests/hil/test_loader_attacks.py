@@ -1,7 +1,5 @@
 """Attacks on the loaders: every file yields a value, or one line per mistake."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import os

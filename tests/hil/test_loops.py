@@ -4,8 +4,6 @@ No test depends on the machine's speed: the misses are read from the recording, 
 hold for them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Metrics of signals with known values."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

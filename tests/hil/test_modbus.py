@@ -1,7 +1,5 @@
 """The SunSpec server in use: a run, the server and its clients as separate processes."""
 
-from __future__ import annotations
-
 import json
 import socket
 import ssl

@@ -1,7 +1,5 @@
 """The Modbus server among many clients: silent, half-open and flooding ones."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import resource
@@ -97,7 +95,7 @@ def among(work: Callable[[Bench, Server, Callable[[], Awaitable[Streams]]], Awai
     "4.5", "600 half-open connections beside one that commands and one that reads",
     "each takes a descriptor until there is none",
 )  # fmt: skip
-def test_half_open_connections_take_no_place_from_those_that_speak(attack_now) -> None:
+def test_half_open_connections_take_no_place_from_those_that_speak(attack_now):
     async def work(bench: Bench, server: Server, connect: Any) -> int:
         commander, reader = await connect(), await connect()
         assert await ask(commander, write_law(bench, 2)) == write_law(bench, 2)
@@ -117,7 +115,7 @@ def test_half_open_connections_take_no_place_from_those_that_speak(attack_now) -
 @pytest.mark.attack(
     "4.6", "200 clients that read once and then stay", "each takes a descriptor for good"
 )
-def test_the_most_silent_client_makes_room_but_not_the_one_that_commands(attack_now) -> None:
+def test_the_most_silent_client_makes_room_but_not_the_one_that_commands(attack_now):
     async def work(bench: Bench, server: Server, connect: Any) -> int:
         commander = await connect()
         assert await ask(commander, write_law(bench, 2)) == write_law(bench, 2)
@@ -136,7 +134,7 @@ def test_the_most_silent_client_makes_room_but_not_the_one_that_commands(attack_
     attack_now(f"{count} of 201 are left, the one that commands among them")
 
 
-def test_silent_connections_end_by_themselves(monkeypatch) -> None:
+def test_silent_connections_end_by_themselves(monkeypatch):
     monkeypatch.setattr(connection, "HALF_OPEN_S", 0.2)
     monkeypatch.setattr(connection, "IDLE_S", 0.2)
 
@@ -156,7 +154,7 @@ def test_silent_connections_end_by_themselves(monkeypatch) -> None:
     "4.7", "a Modbus client that asks without end and reads no answer",
     "answers pile up in the server's memory without end",
 )  # fmt: skip
-def test_a_client_that_never_reads_is_dropped(monkeypatch, caplog, attack_now) -> None:
+def test_a_client_that_never_reads_is_dropped(monkeypatch, caplog, attack_now):
     monkeypatch.setattr(connection, "SEND_S", 0.3)
 
     async def work(bench: Bench, server: Server, connect: Any) -> None:
@@ -180,7 +178,7 @@ def test_a_client_that_never_reads_is_dropped(monkeypatch, caplog, attack_now) -
     attack_now("dropped, nothing of it stays; the other client is answered")
 
 
-def test_nothing_stays_of_a_client_that_speaks_no_modbus() -> None:
+def test_nothing_stays_of_a_client_that_speaks_no_modbus():
     async def work(bench: Bench, server: Server, connect: Any) -> None:
         for _ in range(5):
             streams = await connect()
@@ -194,7 +192,7 @@ def test_nothing_stays_of_a_client_that_speaks_no_modbus() -> None:
 
 
 @pytest.mark.attack("10.5", "500 writes at once from one Modbus client", "500 commands carried out")
-def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now) -> None:
+def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now):
     standing = partial(connection.Rate, clock=lambda: 0.0)  # on a machine of any speed
     monkeypatch.setattr(connection, "Rate", standing)
 
@@ -219,7 +217,7 @@ def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now) -> None:
     "4.8", "the look at the run and the clock of the Modbus server raise EMFILE",
     "the server ends as if the run were over",
 )  # fmt: skip
-def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, attack_now) -> None:
+def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, attack_now):
     for where in ("core.supervised.PAUSE_S", "ports.port.PAUSE_S", "ports.port._LOOK_S"):
         monkeypatch.setattr(f"gfm_hil.{where}", 0.01)
     full = OSError(errno.EMFILE, "Too many open files")
@@ -243,7 +241,7 @@ def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, a
     attack_now("5 of 5 reported; clock and look go on to the end of the run")
 
 
-def test_a_listener_takes_a_quarter_of_the_descriptors_at_most(monkeypatch) -> None:
+def test_a_listener_takes_a_quarter_of_the_descriptors_at_most(monkeypatch):
     monkeypatch.setattr(resource, "getrlimit", lambda what: (20, 20))
     with Listener("127.0.0.1", 0, 64, 10.0, 10.0) as listener, ExitStack() as stack:
         listener.listen()

@@ -1,7 +1,5 @@
 """The SunSpec device with a simulated run and clock: the effect of writes, in every order."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 

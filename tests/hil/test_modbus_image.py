@@ -1,7 +1,5 @@
 """The whole register image: content, scale factors, page, and the server's errors."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import struct

@@ -1,7 +1,5 @@
 """Runs of several converters in one network."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re
@@ -43,7 +41,7 @@ def content(**changes: Any) -> dict[str, Any]:
     return made | changes
 
 
-def test_two_equal_ones_share_a_load_and_the_frequency() -> None:
+def test_two_equal_ones_share_a_load_and_the_frequency():
     run = gfmhil.run_network(content())
     assert run.status == "completed"
     a, b = run["A"].signals, run["B"].signals
@@ -53,7 +51,7 @@ def test_two_equal_ones_share_a_load_and_the_frequency() -> None:
     assert a["p"][:1900] == pytest.approx(a["p"][0], abs=1e-6)  # at rest until the load comes
 
 
-def test_two_share_by_their_droops() -> None:
+def test_two_share_by_their_droops():
     """The change of power of each is that of the frequency over its droop."""
     given = content(duration=6.0)
     given["network"]["converters"]["B"]["law"] = "vsg-2"
@@ -74,7 +72,7 @@ def test_two_share_by_their_droops() -> None:
         assert slopes[name] == pytest.approx(expected, rel=0.01)
 
 
-def test_the_rig_as_a_network_of_one_has_the_bits_of_the_rig() -> None:
+def test_the_rig_as_a_network_of_one_has_the_bits_of_the_rig():
     rig = load_scenario("pref_step", in_process=True).model_dump(exclude_none=True)
     alone = gfmhil.run(copy.deepcopy(rig))
     rig["network"] = {"converters": {"A": {"node": "g"}}, "grid": "g"}
@@ -86,7 +84,7 @@ def test_the_rig_as_a_network_of_one_has_the_bits_of_the_rig() -> None:
         )
 
 
-def test_one_that_trips_leaves_the_load_to_the_other() -> None:
+def test_one_that_trips_leaves_the_load_to_the_other():
     given = content(duration=3.0, events=[])
     given["network"]["converters"]["A"] |= {
         "plant": {"protection": {"over_current": {"threshold": 0.33}}}, "expect": "tripped",
@@ -113,7 +111,7 @@ def with_a_reset(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("inner", [None, "virtual-stator"])
-def test_a_reset_converter_starts_on_the_voltage_that_the_other_keeps(inner: str | None) -> None:
+def test_a_reset_converter_starts_on_the_voltage_that_the_other_keeps(inner):
     """The common equilibrium is that of the start, as it is the only one; the start itself draws no
     current."""
     run = gfmhil.run_network(with_a_reset(inner=inner))
@@ -136,7 +134,7 @@ def test_a_reset_converter_starts_on_the_voltage_that_the_other_keeps(inner: str
     assert [e["label"] for e in run["B"].summary["events"]] == []
 
 
-def test_a_reset_converter_waits_for_a_voltage_that_it_can_start_on(tmp_path: Path) -> None:
+def test_a_reset_converter_waits_for_a_voltage_that_it_can_start_on(tmp_path):
     """Without B the bus is dead; the log says what A waits for."""
     given = with_a_reset()
     given["duration"] = 0.8
@@ -155,7 +153,7 @@ def test_a_reset_converter_waits_for_a_voltage_that_it_can_start_on(tmp_path: Pa
     )
 
 
-def test_events_find_their_converter_and_everyone_sees_those_of_the_network() -> None:
+def test_events_find_their_converter_and_everyone_sees_those_of_the_network():
     given = content()
     given["events"].append({"type": "reference", "t": 0.1, "V_ref": 1.02, "converter": "B"})
     run = gfmhil.run_network(given)
@@ -164,7 +162,7 @@ def test_events_find_their_converter_and_everyone_sees_those_of_the_network() ->
     assert run["A"].signals["ref_V_ref"][-1] == 1.0 and run["B"].signals["ref_V_ref"][-1] == 1.02
 
 
-def test_an_inner_stage_of_one_gives_all_its_signals() -> None:
+def test_an_inner_stage_of_one_gives_all_its_signals():
     given = content(events=[])
     given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
     run = gfmhil.run_network(given)
@@ -173,9 +171,7 @@ def test_an_inner_stage_of_one_gives_all_its_signals() -> None:
     assert "u_E_q" in run["A"].columns and "u_E_q" in run["B"].columns
 
 
-def test_a_run_on_disk_is_that_in_memory(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_on_disk_is_that_in_memory(tmp_path, capsys):
     file = tmp_path / "two.toml"
     text = find_scenario("loss_of_the_last_machine").read_text("utf-8")
     text = text.replace("duration = 4.0", "duration = 1.2")
@@ -257,13 +253,13 @@ def test_a_run_on_disk_is_that_in_memory(
          "plant.grid.scr = 1.5: is for one converter alone; network.lines say how strong the grid"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line_that_names_it(change: dict[str, Any], message: str) -> None:
+def test_what_is_wrong_is_one_line_that_names_it(change, message):
     with pytest.raises(UserError, match=message) as caught:
         load_scenario(content(**change))
     assert "\n" not in str(caught.value)
 
 
-def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path: Path) -> None:
+def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path):
     shipped = Path(gfm_plant.__file__).with_name("converters") / "paper.toml"
     file = tmp_path / "mine.toml"
     file.write_text(re.sub("(?m)^L_f.*$", "", shipped.read_text()))
@@ -273,9 +269,7 @@ def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path: Path) -> N
         load_scenario(content(**change))
 
 
-def test_a_law_that_reaches_no_converter_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_law_that_reaches_no_converter_is_refused(tmp_path, capsys):
     """Also an inner stage; --converter names the one that gets it."""
     out = ["--out", str(tmp_path / "run"), "--quiet", "--no-figures"]
     run = ["run", "three_share_a_load", *out]
@@ -301,7 +295,7 @@ def test_a_law_that_reaches_no_converter_is_refused(
     assert [laws[name]["laws"] for name in "AB"] == [["droop-3"], ["droop-5"]]
 
 
-def test_a_law_for_all_reaches_those_that_name_none() -> None:
+def test_a_law_for_all_reaches_those_that_name_none():
     given = content()
     assert [load_scenario(given, law="vsg-2").of(name).law for name in "AB"] == ["vsg-2"] * 2
     given["network"]["converters"]["B"]["law"] = "droop-5"
@@ -312,7 +306,7 @@ def test_a_law_for_all_reaches_those_that_name_none() -> None:
         load_scenario(given, inner="virtual-stator")
 
 
-def test_what_takes_one_converter_says_so() -> None:
+def test_what_takes_one_converter_says_so():
     with pytest.raises(UserError, match="network: this takes one converter"):
         gfmhil.run(content())
     with pytest.raises(UserError, match="'three_share_a_load': has a network; this takes one"):
@@ -326,7 +320,7 @@ def test_what_takes_one_converter_says_so() -> None:
         gfmhil.run_network(content(duration=0.01, events=[]))["C"]
 
 
-def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
+def test_two_converters_keep_the_load_when_the_last_machine_is_lost():
     run = gfmhil.run_network("loss_of_the_last_machine")
     assert run.status == "completed"
     for one in run.values():
@@ -338,7 +332,7 @@ def test_two_converters_keep_the_load_when_the_last_machine_is_lost() -> None:
     assert a["omega_u"][-1] == pytest.approx(b["omega_u"][-1], abs=1e-6)
 
 
-def test_a_machine_and_a_converter_share_a_load_by_their_droops() -> None:
+def test_a_machine_and_a_converter_share_a_load_by_their_droops():
     given = content(duration=8.0)
     given["network"]["converters"] = {"A": {**BUS, "law": "vsg-2"}}
     given["network"]["machines"] = {"M": {**BUS, "S": 2.0, "H": 3.0, "P": 0.2}}
@@ -353,7 +347,7 @@ def test_a_machine_and_a_converter_share_a_load_by_their_droops() -> None:
     assert off < -1e-3 and rise + machine == pytest.approx(0.4 * V**2, rel=0.05)
 
 
-def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole() -> None:
+def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole():
     given = content()
     given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
     whole = load_scenario(given)
@@ -364,7 +358,7 @@ def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole() -> Non
     assert (part.of("A").law, part.of("A").inner) == ("droop-3", None)
 
 
-def test_a_load_of_constant_power_draws_it_at_any_voltage() -> None:
+def test_a_load_of_constant_power_draws_it_at_any_voltage():
     """And a resistor draws with the square of it."""
     taken = {}
     for kind in ("constant_power", "loads"):

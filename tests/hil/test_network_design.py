@@ -1,9 +1,6 @@
 """The design commands on a scenario with several converters, and the same from Python."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +26,7 @@ def said(capsys: Capture, *arguments: str, code: int = 0) -> dict[str, Any]:
     return dict(json.loads(capsys.readouterr().out))
 
 
-def test_modes_with_their_participations(capsys: Capture, tmp_path: Path) -> None:
+def test_modes_with_their_participations(capsys, tmp_path):
     figure = tmp_path / "poles.svg"
     found = said(capsys, "poles", "--scenario", THREE, "--out", str(figure))
     loop = gfmhil.design.network_loop(THREE)
@@ -42,7 +39,7 @@ def test_modes_with_their_participations(capsys: Capture, tmp_path: Path) -> Non
     assert "A 50 %, B 50 %" in capsys.readouterr().out
 
 
-def test_a_step_of_all_and_of_one(capsys: Capture, tmp_path: Path) -> None:
+def test_a_step_of_all_and_of_one(capsys, tmp_path):
     arguments = "step", "--scenario", THREE, "--seconds", "8"
     whole = said(capsys, *arguments, "--of", "C.P_ref", "--out", str(tmp_path / "step.png"))
     own = said(capsys, *arguments, "--converter", "C")
@@ -55,7 +52,7 @@ def test_a_step_of_all_and_of_one(capsys: Capture, tmp_path: Path) -> None:
     assert abs(sum(ends.values())) < 0.02
 
 
-def test_margins_are_those_of_one_with_the_others_closed(capsys: Capture, tmp_path: Path) -> None:
+def test_margins_are_those_of_one_with_the_others_closed(capsys, tmp_path):
     found = said(capsys, "margins", "--scenario", THREE, "--converter", "C")
     margins = gfmhil.design.loop_margins(gfmhil.design.network_loop(THREE).converter("C"))
     assert found["law"] == "C (mimo-gfm-deployable)"
@@ -66,7 +63,7 @@ def test_margins_are_those_of_one_with_the_others_closed(capsys: Capture, tmp_pa
     assert drawn["at"] == found["u"]
 
 
-def test_another_law_for_one_converter(capsys: Capture) -> None:
+def test_another_law_for_one_converter(capsys):
     other = said(capsys, "poles", "--scenario", THREE, "--converter", "C", "--law", "vsg-2")
     assert other["law"] == "A (vsg-2), B (droop-3), C (vsg-2)"
     loop = gfmhil.Law.load("vsg-2").closed_loop(THREE, converter="C")
@@ -77,7 +74,7 @@ def test_another_law_for_one_converter(capsys: Capture) -> None:
     )
 
 
-def test_an_unstable_network_has_modes_and_no_margins(capsys: Capture) -> None:
+def test_an_unstable_network_has_modes_and_no_margins(capsys):
     """A load of constant power whose negative conductance outweighs all damping of its node."""
     load = {"node": "bus", "P": 1.5, "tau_s": 0.0005}
     loop = gfmhil.design.network_loop(
@@ -105,7 +102,7 @@ PAIR: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_tuning_one_converter_damps_the_network_as_the_bench_shows(tmp_path: Path) -> None:
+def test_tuning_one_converter_damps_the_network_as_the_bench_shows(tmp_path):
     on = gfmhil.load_scenario(PAIR)
     worst = gfmhil.design.network_loop(on).modes()[0]
     assert worst.sigma > 0.0 and 1100.0 < worst.frequency_hz < 1250.0
@@ -130,7 +127,7 @@ def test_tuning_one_converter_damps_the_network_as_the_bench_shows(tmp_path: Pat
     assert gfmhil.run_network(PAIR, network__converters__B__law=file).status == "completed"
 
 
-def test_a_decay_is_that_of_all_modes_of_the_network(tmp_path: Path) -> None:
+def test_a_decay_is_that_of_all_modes_of_the_network(tmp_path):
     """The slowest mode of the island is almost C's own. Tuned with a decay of 2.5 1/s none is
     slower, which leaves the swing of A against B, and the bench comes to rest sooner."""
     weights = [w for w in PAPER_WEIGHTS if (w.i, w.j) != (1, 1)]  # the loads decide p, not P_ref
@@ -151,7 +148,7 @@ def test_a_decay_is_that_of_all_modes_of_the_network(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", [None, "virtual-stator"])
-def test_a_norm_with_a_decay_is_that_beside_the_axis(stage: str | None) -> None:
+def test_a_norm_with_a_decay_is_that_beside_the_axis(stage):
     """Of the continuous and of the sampled loop, against the transfer function on a line of
     complex frequencies."""
     file = gfmhil.Law.load("vsg-2").file
@@ -174,7 +171,7 @@ def test_a_norm_with_a_decay_is_that_beside_the_axis(stage: str | None) -> None:
     assert problem(values) == pytest.approx(max(c.norm for c in problem.channels(values)), rel=1e-3)
 
 
-def test_the_command_tunes_one_converter(capsys: Capture, tmp_path: Path) -> None:
+def test_the_command_tunes_one_converter(capsys, tmp_path):
     scenario, law = tmp_path / "pair.toml", tmp_path / "tuned.toml"
     write_scenario(tmp_path, gfmhil.load_scenario(PAIR))
     (tmp_path / "scenario.toml").rename(scenario)
@@ -187,7 +184,7 @@ def test_the_command_tunes_one_converter(capsys: Capture, tmp_path: Path) -> Non
     assert none["gamma"] is None and "unstable" in none["reason"]
 
 
-def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop() -> None:
+def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop():
     law = gfmhil.Law.load("mimo-gfm-deployable")
     loop = law.closed_loop("rig_pref_step")
     assert loop.T_s is not None
@@ -223,13 +220,13 @@ def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop() -> N
         (["poles", "--scenario", THREE, "--converter", "A", "--law", "no-such"], "no-such"),
     ],
 )
-def test_refuses_in_one_line(arguments: list[str], words: str, capsys: Capture) -> None:
+def test_refuses_in_one_line(arguments, words, capsys):
     assert main(["design", *arguments]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
 
 
-def test_python_refuses_in_one_line() -> None:
+def test_python_refuses_in_one_line():
     law = gfmhil.Law.load("vsg-2")
     for call, words in (
         (lambda: law.closed_loop(THREE), "converter = None: must be one of"),

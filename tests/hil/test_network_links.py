@@ -1,7 +1,5 @@
 """Networks over links: one plant process, and a controller process for each converter."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -90,7 +88,7 @@ def started(folder: Path, given: dict[str, Any]) -> Iterator[subprocess.Popen[st
 
 
 @pytest.mark.parametrize("link", ["zmq", "shm"])
-def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
+def test_over_links_a_run_is_that_in_process(link, tmp_path):
     """Over two links at a time, and with a trip on the way, after which the other goes on until the
     converter is reset."""
     trip = {"plant": {"protection": {"over_current": {"threshold": 0.55, "delay_s": 0.05}}}}
@@ -117,7 +115,7 @@ def test_over_links_a_run_is_that_in_process(link: str, tmp_path: Path) -> None:
     assert {line["tick"] for line in log(tmp_path / "run" / "B", "recovered")} == {4000}
 
 
-def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path: Path) -> None:
+def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path):
     folder = tmp_path / "run"
     with started(folder, content(duration=150.0, link=over("shm", 3.0))) as process:
         os.kill(roles_of(folder / "B")["controller"], signal.SIGKILL)
@@ -143,7 +141,7 @@ def log_of_plant(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [line for line in read_log(folder / "events_plant.jsonl") if line["event"] == kind]
 
 
-def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_path: Path) -> None:
+def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_path):
     """On a busy machine A may be late for as long as it likes."""
     folder = tmp_path / "run"
     patient = {"hold": 10**6}
@@ -162,7 +160,7 @@ def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_pat
     assert summary(folder / "B")["status"] == "safe"
 
 
-def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path: Path) -> None:
+def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path):
     folder = tmp_path / "run"
     with started(folder, content(duration=150.0, events=[])) as process:
         with pytest.raises(UserError, match=r"is of a network; name the folder of a converter"):
@@ -203,7 +201,7 @@ def by_hand(tmp_path: Path, file: Path, *more: str) -> dict[str, subprocess.Pope
     }
 
 
-def test_roles_started_by_hand_meet(tmp_path: Path) -> None:
+def test_roles_started_by_hand_meet(tmp_path):
     file = tmp_path / "two.toml"
     file.write_text(toml_text(content(link=over("zmq"), duration=0.3)), "utf-8")
     ended = {name: end(process) for name, process in by_hand(tmp_path, file).items()}
@@ -216,7 +214,7 @@ def test_roles_started_by_hand_meet(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found[key], column[:], err_msg=key)
 
 
-def test_a_controller_of_another_scenario_is_refused(tmp_path: Path) -> None:
+def test_a_controller_of_another_scenario_is_refused(tmp_path):
     file = tmp_path / "two.toml"
     file.write_text(toml_text(content(link=over("zmq", 3.0))), "utf-8")
     processes = by_hand(tmp_path, file, "--seed", "7")
@@ -241,9 +239,7 @@ def test_a_controller_of_another_scenario_is_refused(tmp_path: Path) -> None:
         (["run", "--scope"], "--scope: looks at one converter; start gfmhil scope beside"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_said_before_anything_starts(
-    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_wrong_is_said_before_anything_starts(words, message, tmp_path, capsys):
     file = tmp_path / "two.toml"
     file.write_text(toml_text(content(link=over("zmq"))), "utf-8")
     command, *more = words

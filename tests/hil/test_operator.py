@@ -1,7 +1,5 @@
 """Commands to runs in progress, with two real processes."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The command server: arbitrary messages to its socket, and situations like the end of a run."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -71,7 +69,7 @@ def ask(folder: Path, *messages: bytes) -> list[dict[str, Any]]:
 P_REF = {"type": "reference", "P_ref": 0.6}
 
 
-def test_no_command_ends_the_command_server(ends, tmp_path) -> None:
+def test_no_command_ends_the_command_server(ends, tmp_path):
     digits = b"9" * 400
     messages = [
         b'{"type": []}',
@@ -96,7 +94,7 @@ def test_no_command_ends_the_command_server(ends, tmp_path) -> None:
     "3.5", "a command that raises what the command server does not expect",
     "its thread ends: no command passes any more",
 )  # fmt: skip
-def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, attack_now) -> None:
+def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, attack_now):
     def fails(self: Any, content: Any) -> Any:
         raise KeyError("a mistake of ours")
 
@@ -112,9 +110,7 @@ def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, a
     "4.4", "no descriptor left (EMFILE) where a server looks whether the run goes on",
     "taken for the end of the run: Modbus ends, with its heartbeat and timers, as if regular",
 )  # fmt: skip
-def test_no_descriptor_left_is_not_the_end_of_a_run(
-    ends, run, tmp_path, monkeypatch, attack_now
-) -> None:
+def test_no_descriptor_left_is_not_the_end_of_a_run(ends, run, tmp_path, monkeypatch, attack_now):
     record = open_recording(run().folder)
     record.folder = tmp_path
     assert present(tmp_path) == ["controller"] and record.ended() is None
@@ -132,7 +128,7 @@ def test_no_descriptor_left_is_not_the_end_of_a_run(
     attack_now("reported as what it is, 3 of 3 times; then the run goes on")
 
 
-def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
+def test_only_a_folder_that_is_gone_is_gone(tmp_path):
     with scratch.temporary("gfmhil-commands-") as place:
         assert scratch.held(place)
         (tmp_path / "commands_plant.json").write_text("[1]", encoding="utf-8")
@@ -144,7 +140,7 @@ def test_only_a_folder_that_is_gone_is_gone(tmp_path) -> None:
 @pytest.mark.attack(
     "10.3", "1,000 commands at once to the command server, then a stop", "1,000 carried out"
 )
-def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_now) -> None:
+def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_now):
     ends.server._rate._clock = lambda: ends.server._rate._since  # on a machine of any speed
     answers = ask(tmp_path, *[json.dumps(P_REF).encode()] * 1000, b'{"type": "stop"}')
     refused = [a["error"] for a in answers if not a["ok"]]
@@ -154,7 +150,7 @@ def test_the_command_server_has_a_limit_and_stop_passes(ends, tmp_path, attack_n
 
 
 @pytest.mark.attack("10.4", "who told the run to stop?", "nothing in events.jsonl")
-def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now) -> None:
+def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now):
     operator = Operator(tmp_path, through="command")
     operator.command(P_REF)
     operator.stop()
@@ -167,7 +163,7 @@ def test_the_log_says_who_told_and_who_stopped(ends, tmp_path, attack_now) -> No
     attack_now(f"`{json.dumps(end['operator'])}`")
 
 
-def test_events_of_the_scenario_have_no_operator(make, tmp_path) -> None:
+def test_events_of_the_scenario_have_no_operator(make, tmp_path):
     event = {"type": "reference", "tick": 0, "P_ref": 0.6}
     timeline = Timeline(make_bench(make(events=[event])), tmp_path / "log", ("controller",))
     timeline.carry_out(0)
@@ -179,7 +175,7 @@ def test_events_of_the_scenario_have_no_operator(make, tmp_path) -> None:
     assert told["operator"] == {"through": "python"}
 
 
-def test_a_rate_lets_a_burst_through_and_fills_up_again() -> None:
+def test_a_rate_lets_a_burst_through_and_fills_up_again():
     now = [0.0]
     rate = Rate("a page", per_s=10.0, burst=3, clock=lambda: now[0])
 

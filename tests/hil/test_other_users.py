@@ -3,8 +3,6 @@
 The other user is a second uid, for which the tests must run as root.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

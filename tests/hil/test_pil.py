@@ -1,7 +1,5 @@
 """The laws of a run on another processor: the bits of the kernel, and how it fails."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -79,9 +77,7 @@ def assert_same(found: Run, near: Run) -> None:
         ("host", {"law": "mimo-gfm-scheduled", "events": [STEP]}),
     ],
 )
-def test_a_run_has_the_bits_of_the_kernel(
-    target: str, content: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_has_the_bits_of_the_kernel(target, content, tmp_path, monkeypatch):
     found = run(tmp_path, target, **content)
     assert found.summary["controller"] == f"gfmhil on {target}"
     near = in_process(found, TARGETS[target].real, monkeypatch)
@@ -101,9 +97,7 @@ def test_a_run_has_the_bits_of_the_kernel(
 @qemu
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", ["rig_pref_step", "switchover"])
-def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_path, monkeypatch):
     """The paper's experiments on the rig on a Cortex-M4F, with their event after 20 ms."""
     text = find_scenario(name).read_text(encoding="utf-8").split("\n")
     short = {"t": "t = 0.02", "duration": "duration = 0.06"}
@@ -136,12 +130,8 @@ def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(
     ],
 )
 def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
-    number: signal.Signals,
-    link: Any,
-    reason: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    number, link, reason, tmp_path, monkeypatch
+):
     scratch = Path(tempfile.mkdtemp(prefix="pil-"))  # short: a socket is to be made there
     monkeypatch.setenv("TMPDIR", str(scratch))
     machines: list[int] = []
@@ -158,9 +148,7 @@ def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
 
 @qemu
 @pytest.mark.timeout(300)
-def test_a_machine_that_answers_after_seconds_completes_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_that_answers_after_seconds_completes_the_run(tmp_path, monkeypatch):
     scratch = Path(tempfile.mkdtemp(prefix="pil-"))
     monkeypatch.setenv("TMPDIR", str(scratch))
     machines: list[int] = []
@@ -233,9 +221,7 @@ while request := os.read(to, {asks}):
         ),
     ],
 )
-def test_a_wrong_answer_is_named(
-    does: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_answer_is_named(does, reason, tmp_path, monkeypatch):
     """Another program in the machine's place."""
     machine = tmp_path / "qemu-system-arm"
     asks, size = 4 * (3 + 5 + 5), 4 * (4 + 3 + 3 + 1 + 2)
@@ -253,7 +239,7 @@ def test_a_wrong_answer_is_named(
 
 @qemu
 @pytest.mark.timeout(300)
-def test_what_it_cannot_do_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_it_cannot_do_is_refused(tmp_path, capsys):
     file = write(tmp_path, law="vsg-2", link={"type": "shm"})
     command = ["controller", file, "--endpoint", "shm://none", "--out", str(tmp_path / "run")]
     assert main([*command, "--model", "pil:m4f", "--mode", "realtime"]) == 2
@@ -264,9 +250,7 @@ def test_what_it_cannot_do_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
 @qemu
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("content", [{"events": [STEP, CHANGE]}, {"inner": "cascaded"}])
-def test_a_program_with_other_bits_is_refused_before_tick_0(
-    content: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_a_program_with_other_bits_is_refused_before_tick_0(content, tmp_path, monkeypatch, capsys):
     """A compiler that fuses multiply-add, which the processor can do."""
     instead(tmp_path, "arm-none-eabi-gcc", 'exec {real} "$@" -ffp-contract=fast', monkeypatch)
     file = write(tmp_path, **{"law": "vsg-2", "link": SHM, **content})
@@ -298,9 +282,7 @@ def test_a_program_with_other_bits_is_refused_before_tick_0(
         ("yes > from", r"answers a golden row with 175704697, which no law does"),
     ],
 )
-def test_what_is_no_such_machine_is_refused_with_what_it_says(
-    does: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_such_machine_is_refused_with_what_it_says(does, reason, tmp_path, monkeypatch):
     instead(tmp_path, "qemu-system-arm", does, monkeypatch)
     monkeypatch.setattr(pil, "_START_S", 0.5 if "sleep" in does else 30.0)
     model = open_controller("pil:m4f", PortMap(), BenchContext())
@@ -321,9 +303,7 @@ def instead(folder: Path, name: str, does: str, monkeypatch: pytest.MonkeyPatch)
 # --- without a compiler ---
 
 
-def test_a_missing_tool_and_a_wrong_target_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_tool_and_a_wrong_target_are_named(tmp_path, monkeypatch):
     with pytest.raises(
         UserError, match=r"pil:m0: must be pil: and one of host, clang, m4f, m7, m3, rv"
     ):

@@ -1,14 +1,11 @@
 """What all ports have in common: beside one run with their real clients, and what they refuse."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
 import socket
 import struct
 import subprocess
-from pathlib import Path
 
 import pytest
 from pymodbus.client import ModbusTcpClient
@@ -31,7 +28,7 @@ pytestmark = pytest.mark.processes
     "23.6", "`run --scope --modbus --stream`, as in normal use",
     "nine lines of a traceback: a dictionary changed its size",
 )  # fmt: skip
-def test_every_port_serves_one_run(tmp_path: Path, attack_now) -> None:
+def test_every_port_serves_one_run(tmp_path, attack_now):
     (tmp_path / "served.toml").write_text(SCENARIO, encoding="utf-8")
     folder = tmp_path / "run"
     command = [*GFMHIL, "run", str(tmp_path / "served.toml"), "--out", str(folder), "--quiet"]
@@ -79,7 +76,7 @@ def test_every_port_serves_one_run(tmp_path: Path, attack_now) -> None:
 
 
 @pytest.mark.parametrize("name", PORTS)
-def test_a_port_in_use_is_refused_before_anything_starts(name: str, tmp_path, capsys) -> None:
+def test_a_port_in_use_is_refused_before_anything_starts(name, tmp_path, capsys):
     out = tmp_path / "run"
     with socket.socket(type=make_port(name).socket) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -92,7 +89,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(name: str, tmp_path, ca
 
 
 @pytest.mark.parametrize("name", [name for name in PORTS if make_port(name).commands])
-def test_a_run_in_process_takes_no_commands(name: str, capsys) -> None:
+def test_a_run_in_process_takes_no_commands(name, capsys):
     assert main(["run", "pref_step", "--link", "inproc", f"--{name}"]) == 2
     assert f"--{name}: a run in process takes no commands" in capsys.readouterr().err
 

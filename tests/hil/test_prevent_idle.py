@@ -1,7 +1,5 @@
 """A thread of idle priority keeps a processor busy, and ends with its context."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path
@@ -29,7 +27,7 @@ def used_s(thread: threading.Thread) -> float:
     return (int(stat[11]) + int(stat[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
+def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile():
     policy, affinity = os.sched_getscheduler(0), os.sched_getaffinity(0)
     with prevent_idle(HERE, "always") as busy:
         assert busy
@@ -52,14 +50,14 @@ def test_a_thread_of_idle_priority_spins_on_that_processor_meanwhile() -> None:
         (None, "always", "KVM", False),
     ],
 )
-def test_where_it_is_wanted(processor, wanted, machine, busy, monkeypatch) -> None:
+def test_where_it_is_wanted(processor, wanted, machine, busy, monkeypatch):
     monkeypatch.setattr(module, "virtual_machine", lambda: machine)
     with prevent_idle(processor, wanted) as found:
         assert found is busy
         assert (spinner() is not None) is busy
 
 
-def test_without_the_policy_it_goes_on_without(monkeypatch) -> None:
+def test_without_the_policy_it_goes_on_without(monkeypatch):
     monkeypatch.setattr(module, "_spin", lambda flags: None)  # as if refused
     monkeypatch.setattr(module, "warm_up", lambda: None)
     with prevent_idle(HERE, "always") as busy:

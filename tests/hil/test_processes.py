@@ -1,7 +1,5 @@
 """Two real processes: they start, connect, run, and end together, however one of them ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -192,6 +190,20 @@ def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, 
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     other = "plant" if role == "controller" else "controller"
     assert [e["role"] for e in events if e["event"] == "end"] == [other]
+    assert roles_of(folder) == {}
+
+
+def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(start, tmp_path):
+    """The plant stands still before its handshake, as one does that has to compile."""
+    scenario = write(tmp_path, **LONG, link={"start_timeout_s": 1.0})
+    folder = tmp_path / "run"
+    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+    wait_for(lambda: "plant" in roles_of(folder), process)
+    os.kill(roles_of(folder)["plant"], signal.SIGSTOP)
+    code, out, _ = end(process)
+    found = json.loads(out)
+    assert (code, found["status"]) == (3, "safe")
+    assert "the plant did not come within 1 s" in found["reason"]
     assert roles_of(folder) == {}
 
 

@@ -1,7 +1,5 @@
 """Courses of the grid from CSV files: what the plant makes of them, and wrong files."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 its authors compare with PSCAD (commit d94d74e7d), and Dynawo's three grid-forming converters. The
 CSV files lie beside the scenarios."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +38,7 @@ def machine() -> gfmhil.Run:
     return gfmhil.run("psid_virtual_machine")
 
 
-def test_case_23_starts_where_the_authors_start(droop: gfmhil.Run) -> None:
+def test_case_23_starts_where_the_authors_start(droop):
     """test23_x0_init of test/results/results_initial_conditions.jl."""
     i = complex(*(droop.columns[f"true_i_{part}"][0] for part in ("re", "im")))
     assert droop.columns["true_delta"][0] == pytest.approx(0.19786411039169016, abs=1e-6)
@@ -49,7 +47,7 @@ def test_case_23_starts_where_the_authors_start(droop: gfmhil.Run) -> None:
     assert abs(i) == pytest.approx(abs(complex(0.49251498484008666, 0.07939912055435007)), abs=1e-6)
 
 
-def test_case_23_passes_the_authors_own_test(droop: gfmhil.Run) -> None:
+def test_case_23_passes_the_authors_own_test(droop):
     """test/test_case23_droop.jl asks for a norm of at most 3e-2 over all 801 points."""
     t, theta = published("psid_case_23_theta.csv").T
     away = ours(droop, "true_delta", t) - theta
@@ -57,7 +55,7 @@ def test_case_23_passes_the_authors_own_test(droop: gfmhil.Run) -> None:
     assert np.abs(away).max() <= 2.5e-3  # rad
 
 
-def test_case_23_swings_as_the_authors_eigenvalues_say() -> None:
+def test_case_23_swings_as_the_authors_eigenvalues_say():
     """test23_eigvals of test/results/results_eigenvalues.jl: the swing, and the integrals of the
     current loops."""
     law = gfmhil.Law.load(FOLDER / "published" / "psid_droop.toml")
@@ -79,7 +77,7 @@ def after_the_step(seconds: float) -> tuple[np.ndarray, np.ndarray]:
     return t[after] - 1.0, omega[after] - 1.0
 
 
-def test_case_8_of_the_authors_equations_is_what_they_published(equations: dict[str, Any]) -> None:
+def test_case_8_of_the_authors_equations_is_what_they_published(equations):
     """test/test_case_VirtualSynchMachine.jl asks for a norm of at most 1e-4 over all points."""
     t, omega = after_the_step(3.0)
     found = equations["omega"](t, equations["THEIRS"]) - 1.0
@@ -89,9 +87,7 @@ def test_case_8_of_the_authors_equations_is_what_they_published(equations: dict[
     assert start[0] == pytest.approx(0.1978641793142158, abs=1e-6)  # test08_x0_init
 
 
-def test_case_8_differs_from_the_published_by_the_pll(
-    machine: gfmhil.Run, equations: dict[str, Any]
-) -> None:
+def test_case_8_differs_from_the_published_by_the_pll(machine, equations):
     """With our PLL, the authors' equations give our curve and not theirs; with their PLL, more than
     half of the distance of the peaks is there once the law reads the integral alone."""
     t, omega = after_the_step(1.0)
@@ -106,9 +102,7 @@ def test_case_8_differs_from_the_published_by_the_pll(
     assert machine.columns["true_delta"][0] == pytest.approx(0.1978641793142158, abs=1e-6)
 
 
-def test_files_beside_a_scenario_are_found_from_anywhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_beside_a_scenario_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scenario = load_scenario(FOLDER / "psid_droop_inverter.toml")
     assert scenario.law == str((FOLDER / "published" / "psid_droop.toml").absolute())
@@ -153,13 +147,13 @@ def rms(x: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(x**2, axis=1))
 
 
-def test_dynawo_s_equations_are_what_it_published(dynawo: Dynawo) -> None:
+def test_dynawo_s_equations_are_what_it_published(dynawo):
     omega, i = dynawo.solved("THEIRS")
     assert (rms(omega - dynawo.omega) <= [1e-4, 1e-4, 5e-4]).all()
     assert (rms(i - dynawo.i) <= 0.01).all()
 
 
-def test_dynawo_rests_where_the_bench_rests(dynawo: Dynawo) -> None:
+def test_dynawo_rests_where_the_bench_rests(dynawo):
     """Before the line opens, after it, and in the short circuit."""
     omega, i = dynawo.bench
     for at in (0.49, 1.49, 1.64):
@@ -169,7 +163,7 @@ def test_dynawo_rests_where_the_bench_rests(dynawo: Dynawo) -> None:
 
 
 @pytest.mark.full
-def test_dynawo_differs_by_its_dvoc_and_by_its_lines(dynawo: Dynawo) -> None:
+def test_dynawo_differs_by_its_dvoc_and_by_its_lines(dynawo):
     """An angle that counts once takes Dynawo's equations as far from its points as the bench is;
     with our control they differ from the bench until the lines' currents have settled, and with
     inductive lines, too, by no more than what the sampling of 20 us does."""

@@ -1,7 +1,5 @@
 """Run folders after kills and full disks: complete, or completed by ``gfmhil recover``."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

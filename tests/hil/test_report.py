@@ -1,7 +1,5 @@
 """The report of a run: in words, in light and dark, on a screen and on a phone."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -24,14 +22,14 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.save(tmp_path_factory.mktemp("report") / "run") / "report.html"
 
 
-def test_it_is_in_words(report: Path) -> None:
+def test_it_is_in_words(report):
     text = report.read_text("utf-8")
     assert "controller: 12 lost, 1 crc; plant: none" in text and "{'" not in text
     assert "2026-11-24 03:15:21 UTC" in text
     assert text.count("<svg") == 9  # six panels and three of the waveforms
 
 
-def test_names_of_signals_are_printed_in_the_notation_of_the_field() -> None:
+def test_names_of_signals_are_printed_in_the_notation_of_the_field():
     names = ("f_hz", "omega_u", "omega_g", "delta", "v_dc", "p")
     assert [printed(name) for name in names] == ["f", "ω_u", "ω_g", "δ", "v_dc", "p"]
 
@@ -41,7 +39,7 @@ def test_names_of_signals_are_printed_in_the_notation_of_the_field() -> None:
 @pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver")
 @pytest.mark.parametrize("dark", [False, True])
 @pytest.mark.parametrize("width", [390, 1200])
-def test_it_is_readable_in_a_browser(report: Path, width: int, dark: bool) -> None:
+def test_it_is_readable_in_a_browser(report, width, dark):
     with Browser(width, 900, dark=dark, phone=width < 500) as page:
         page.driver.get(report.as_uri())
         assert page.js("return document.documentElement.scrollWidth <= innerWidth")

@@ -1,7 +1,5 @@
 """Runs that wait after a trip or a safe state, and what a reset restores."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from typing import Any
 

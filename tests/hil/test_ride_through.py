@@ -1,8 +1,5 @@
 """With an inner stage a converter rides through what trips it without one."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,7 +41,7 @@ def on_its_feet(found: Run) -> None:
 
 
 @pytest.mark.parametrize("inner", ["none", *LIMITED])
-def test_it_starts_at_rest(inner: str) -> None:
+def test_it_starts_at_rest(inner):
     """The operating point is that of plant, law and stage together."""
     s = run({"type": "reference", "P_ref": 0.5}, 0.1, inner=inner).signals
     for name in ("true_p", "true_V", "true_i", "u_E_u", "u_omega_u"):
@@ -52,7 +49,7 @@ def test_it_starts_at_rest(inner: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["vsg-2", "droop-3"])
-def test_a_jump_of_25_degrees_stays_within_the_rating(law: str) -> None:
+def test_a_jump_of_25_degrees_stays_within_the_rating(law):
     found = run({"type": "grid-phase-jump", "degrees": -25.0}, 2.0, law)
     i = np.asarray(found.signals["true_i"][:])
     assert cycle_mean(i).max() <= 1.22 and i.max() <= 1.35
@@ -61,7 +58,7 @@ def test_a_jump_of_25_degrees_stays_within_the_rating(law: str) -> None:
     assert cycle_mean(np.asarray(free.signals["true_i"][:])).max() > 1.6
 
 
-def test_the_grid_gone_for_150_ms() -> None:
+def test_the_grid_gone_for_150_ms():
     found = run({"type": "grid-voltage", "V_g": 0.0, "duration": 0.15}, 2.0)
     s = found.signals
     assert np.asarray(s["true_i"][:]).max() <= 2.0
@@ -71,7 +68,7 @@ def test_the_grid_gone_for_150_ms() -> None:
 
 
 @pytest.mark.parametrize("inner", LIMITED)
-def test_a_bolted_fault_at_the_terminal_with_a_peak_limit(inner: str) -> None:
+def test_a_bolted_fault_at_the_terminal_with_a_peak_limit(inner):
     bolted = {"type": "fault", "position": 0.0, "R": 0.001, "duration": 0.15}
     found = run(bolted, 2.0, inner=inner, plant={"i_peak": 2.5})
     assert np.asarray(found.signals["true_i"][:]).max() <= 2.55
@@ -79,7 +76,7 @@ def test_a_bolted_fault_at_the_terminal_with_a_peak_limit(inner: str) -> None:
     assert run(bolted, 0.1, inner=inner).summary["status"] == "tripped"
 
 
-def test_a_grid_at_49_hz_is_left_at_the_power_limit() -> None:
+def test_a_grid_at_49_hz_is_left_at_the_power_limit():
     """A droop of 1 % asks for 2.5 p.u. there; without the power limiter VSG-2 slips."""
     fall = {"type": "grid-frequency", "f_hz": 49.0, "rate": 4.0}
     s = run(fall, 3.0).signals
@@ -87,7 +84,7 @@ def test_a_grid_at_49_hz_is_left_at_the_power_limit() -> None:
     assert np.asarray(s["true_i"][:]).max() <= 1.2
 
 
-def test_the_stage_must_carry_the_operating_point() -> None:
+def test_the_stage_must_carry_the_operating_point():
     with pytest.raises(UserError, match=r"inner.I_max: 1.2 p.u.: this operating point needs 1\.4"):
         run({"type": "reference", "P_ref": 0.5}, 0.1, references={"P_ref": 1.4})
 
@@ -106,9 +103,7 @@ FAULTS = [(V_g, duration) for V_g in (0.0, 0.25, 0.5) for duration in (0.15, 0.2
 @pytest.mark.full
 @pytest.mark.parametrize("limiter", LIMITERS)
 @pytest.mark.parametrize(("V_g", "duration"), FAULTS)
-def test_mimo_gfm_practical_holds_synchronism(
-    limiter: str, V_g: float, duration: float, tmp_path: Path
-) -> None:
+def test_mimo_gfm_practical_holds_synchronism(limiter, V_g, duration, tmp_path):
     """mimo-gfm-deployable slips in most of them: its phi_15 fills the DC link in a fault."""
     stage = tmp_path / "stage.toml"
     stage.write_text(LIMITERS[limiter])
@@ -118,7 +113,7 @@ def test_mimo_gfm_practical_holds_synchronism(
     assert np.ptp(found.signals["true_v_dc"][:]) < 0.2
 
 
-def test_the_gain_that_lets_mimo_gfm_deployable_slip() -> None:
+def test_the_gain_that_lets_mimo_gfm_deployable_slip():
     fault = {"type": "grid-voltage", "V_g": 0.0, "duration": 0.15}
     slips = run(fault, 1.0, "mimo-gfm-deployable")
     assert np.max(slips.signals["true_v_dc"][:]) > 1.2
@@ -128,7 +123,7 @@ def test_the_gain_that_lets_mimo_gfm_deployable_slip() -> None:
     assert np.abs(held.signals["true_delta"][:]).max() < 1.0
 
 
-def test_a_law_of_its_own_stage_changes_to_one_without() -> None:
+def test_a_law_of_its_own_stage_changes_to_one_without():
     """The bridge's voltage goes on; what the stage stood for decays in 0.2 s."""
     found = run({"type": "law", "law": "droop-5"}, 2.0, inner=None, law="vsg-2")
     assert "u_E_q" not in found.signals

@@ -1,7 +1,5 @@
 """A run that lasted but still oscillates at its end is no success, wherever it is judged."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scenario files: shipped ones load, written ones are read back, a mistake gives one line."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib
@@ -297,7 +295,7 @@ def test_any_scenario_survives_being_written_and_read(content):
     assert again.digest() == scenario.digest()
 
 
-def test_lockstep_waits_longer_than_real_time_unless_the_scenario_says(make) -> None:
+def test_lockstep_waits_longer_than_real_time_unless_the_scenario_says(make):
     """Where no time passes, a busy machine has seconds; what the scenario says holds in both."""
     waits = {}
     for mode in ("lockstep", "realtime"):
@@ -327,7 +325,7 @@ def test_the_digest_is_of_contents_not_of_places(make, tmp_path):
     assert make(title="other").digest() == make().digest()
 
 
-def test_a_step_of_the_short_circuit_ratio_gives_the_line_of_that_ratio() -> None:
+def test_a_step_of_the_short_circuit_ratio_gives_the_line_of_that_ratio():
     from gfm_hil.scenario.events.grid_impedance import GridImpedance
     from gfm_plant import Plant, make_plant
 
@@ -342,7 +340,7 @@ def test_a_step_of_the_short_circuit_ratio_gives_the_line_of_that_ratio() -> Non
 
 
 @pytest.mark.parametrize("line", [{}, {"L_g": 2.0}, {"scr": 3.0}, {"L_g": 2.0, "x_over_r": 3.0}])
-def test_a_line_is_given_by_its_elements_or_by_its_ratio(line: dict[str, float]) -> None:
+def test_a_line_is_given_by_its_elements_or_by_its_ratio(line):
     content = {"title": "line", "duration": 1.0, **event(type="grid-impedance", **line)}
     with pytest.raises(UserError, match="give L_g and R_g, or scr and x_over_r"):
         check_scenario(content, "test")

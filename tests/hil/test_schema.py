@@ -1,7 +1,5 @@
 """JSON schemas: what ships is valid by them, what is misspelt is not, every key is described."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The scope in Chromium: a run is shown, commanded, trips, and is reset."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -61,7 +59,7 @@ def moves(page: Browser) -> None:
     wait_for(lambda: page.picture("power") != before and page.text("#time") != time)
 
 
-def test_drive(page: Browser) -> None:
+def test_drive(page):
     assert page.text("#title") == "A rig that is told what to do"
     assert "token" not in page.driver.current_url
     moves(page)
@@ -90,7 +88,7 @@ def test_drive(page: Browser) -> None:
     moves(page)
 
 
-def test_a_refused_command_says_why(page: Browser) -> None:
+def test_a_refused_command_says_why(page):
     page.write("#set-P_ref", "9")
     page.click("#apply")
     why = "P_ref = 9.0: must lie in [-2, 2] p.u."
@@ -99,7 +97,7 @@ def test_a_refused_command_says_why(page: Browser) -> None:
     assert page.text("#now-P_ref") == "0.500"
 
 
-def test_grid(page: Browser) -> None:
+def test_grid(page):
     page.write("#set-f_hz", "50.02")
     page.write("#set-rate", "0.5")
     page.click("#set-frequency")
@@ -113,7 +111,7 @@ def test_grid(page: Browser) -> None:
     wait_for(lambda: page.text("#now-f_g") == "50.000")
 
 
-def test_without_the_token_one_may_look_not_touch(going: Rig, page: Browser) -> None:
+def test_without_the_token_one_may_look_not_touch(going, page):
     with Browser() as other:
         other.driver.get(going.look)
         wait_for(lambda: other.text("#state") == page.text("#state"))
@@ -136,7 +134,7 @@ def test_without_the_token_one_may_look_not_touch(going: Rig, page: Browser) -> 
     assert page.text("#now-P_ref") == "0.500"
 
 
-def test_a_wrong_token_is_none(going: Rig) -> None:
+def test_a_wrong_token_is_none(going):
     with connect(going.look.replace("http", "ws") + "socket") as socket:
         socket.send(json.dumps({"kind": "hello", "token": going.token[::-1]}))
         socket.send(json.dumps({"kind": "command", "id": 5, "event": {"type": "reset"}}))
@@ -145,7 +143,7 @@ def test_a_wrong_token_is_none(going: Rig) -> None:
     assert [m["ok"] for m in heard if m["kind"] == "answer"] == [False]
 
 
-def test_pause_zoom_cursors(page: Browser) -> None:
+def test_pause_zoom_cursors(page):
     page.click("#run")
     wait_for(lambda: page.text("#run") == "Run")
     before = page.picture("power")
@@ -173,7 +171,7 @@ def test_pause_zoom_cursors(page: Browser) -> None:
     moves(page)
 
 
-def test_trigger(page: Browser) -> None:
+def test_trigger(page):
     page.choose("#trigger-mode", "single")
     page.choose("#trigger-channel", "p")
     page.write("#trigger-level", "0.6")
@@ -190,7 +188,7 @@ def test_trigger(page: Browser) -> None:
     wait_for(lambda: page.text("#now-P_ref") == "0.500")
 
 
-def test_signals_can_be_chosen(page: Browser) -> None:
+def test_signals_can_be_chosen(page):
     count = "return document.querySelectorAll('.strip').length"
     assert page.js(count) == 6
     page.click("#signals summary")
@@ -213,7 +211,7 @@ def test_signals_can_be_chosen(page: Browser) -> None:
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (1024, 700), (390, 844)])
-def test_it_fits(going: Rig, width: int, height: int, dark: bool) -> None:
+def test_it_fits(going, width, height, dark):
     with Browser(width, height, dark=dark, phone=width < 500) as page:
         page.driver.get(going.control)
         wait_for(lambda: page.text("#state") == "RUNNING")

@@ -1,7 +1,5 @@
 """The scope among many pages, some silent and some malicious: none of them harms another."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging
@@ -67,7 +65,7 @@ def gone(peer: ClientConnection) -> bool:
     [{"id": 10**400}, {"id": 2**60}, {"channels": ["p" * 5000]}],
     ids=["400 digits", "61 bits", "long name"],
 )
-def test_numbers_without_bounds_are_refused(port, more, attack_now) -> None:
+def test_numbers_without_bounds_are_refused(port, more, attack_now):
     with connect(address(port)) as page, connect(address(port)) as other:
         say(page, **{**LOOK, **more})
         assert next(iter(more)) in words(page, "error")["text"]
@@ -81,7 +79,7 @@ def test_numbers_without_bounds_are_refused(port, more, attack_now) -> None:
 @pytest.mark.attack(
     "3.2", "a page whose picture raises an exception", "the scope ends for every page"
 )
-def test_an_exception_ends_its_own_page_alone(port, monkeypatch, caplog, attack_now) -> None:
+def test_an_exception_ends_its_own_page_alone(port, monkeypatch, caplog, attack_now):
     frame = ScopePicture.frame
 
     def fails(self: ScopePicture, head: int) -> bytes | None:
@@ -104,7 +102,7 @@ def test_an_exception_ends_its_own_page_alone(port, monkeypatch, caplog, attack_
 @pytest.mark.attack(
     "3.3", "one exception in the scope's follower of the log", "no page hears of an event again"
 )
-def test_a_follower_that_ends_begins_again(port, scope, monkeypatch, caplog, attack_now) -> None:
+def test_a_follower_that_ends_begins_again(port, scope, monkeypatch, caplog, attack_now):
     lines = [{"t": 0.0, "tick": 0, "event": "reset", "label": "late news"}]
     failures = iter([OSError(24, "Too many open files"), ValueError("not a log")])
 
@@ -122,7 +120,7 @@ def test_a_follower_that_ends_begins_again(port, scope, monkeypatch, caplog, att
 
 
 @pytest.mark.attack("4.1", "one page that never reads", "no other page hears of any event again")
-def test_a_page_that_never_reads_is_dropped(port, scope, monkeypatch, caplog, attack_now) -> None:
+def test_a_page_that_never_reads_is_dropped(port, scope, monkeypatch, caplog, attack_now):
     big = {"t": 0.0, "tick": 0, "event": "reset", "label": "x" * 6_000_000}
     with mute(port), connect(address(port), max_size=None) as other:
         wait_for(lambda: len(scope._sessions) == 2)
@@ -139,7 +137,7 @@ def test_a_page_that_never_reads_is_dropped(port, scope, monkeypatch, caplog, at
 @pytest.mark.attack(
     "4.2", "16 pages that look, then the operator with the token", "503, locked out for good"
 )
-def test_the_token_s_holder_gets_in_among_pages_that_look(port, scope, attack_now) -> None:
+def test_the_token_s_holder_gets_in_among_pages_that_look(port, scope, attack_now):
     with contextlib.ExitStack() as stack:
         for _ in range(16):
             stack.enter_context(connect(address(port)))
@@ -161,7 +159,7 @@ def test_the_token_s_holder_gets_in_among_pages_that_look(port, scope, attack_no
     "23.5", "16 pages that never read, then a page that looks", "503 until their pings time out"
 )
 @pytest.mark.parametrize("query", ["", "?control"])
-def test_pages_that_never_read_make_room_for_a_newcomer(query, port, scope, attack_now) -> None:
+def test_pages_that_never_read_make_room_for_a_newcomer(query, port, scope, attack_now):
     with contextlib.ExitStack() as stack:
         reader = stack.enter_context(connect(address(port)))
         for _ in range(15):
@@ -179,7 +177,7 @@ def test_pages_that_never_read_make_room_for_a_newcomer(query, port, scope, atta
 @pytest.mark.attack(
     "4.3", "300 connections that send nothing", "each holds a descriptor of the scope"
 )
-def test_half_open_connections_make_room(port, scope, attack_now) -> None:
+def test_half_open_connections_make_room(port, scope, attack_now):
     with contextlib.ExitStack() as stack:
         page = stack.enter_context(connect(address(port)))
         words(page, "events")
@@ -199,7 +197,7 @@ def test_half_open_connections_make_room(port, scope, attack_now) -> None:
     attack_now(f"{ended} of 300 ended, the oldest first; the pages go on")
 
 
-def test_half_open_connections_end_by_themselves(scope, monkeypatch) -> None:
+def test_half_open_connections_end_by_themselves(scope, monkeypatch):
     monkeypatch.setattr(server, "HALF_OPEN_S", 0.3)
     with serving(scope) as port, connect(address(port)) as page:
         with socket.create_connection(("127.0.0.1", port)) as peer:
@@ -247,7 +245,7 @@ def told(lab: Rig) -> list[dict[str, Any]]:
     ],
     ids=["list", "object", "400 digits", "400 digits of a gain", "huge", "nothing"],
 )
-def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now) -> None:
+def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now):
     with operator(lab) as page:
         say(page, kind="command", id=1, event=event)
         answer = words(page, "answer")
@@ -258,7 +256,7 @@ def test_whatever_an_event_is_it_is_answered(lab, event, text, attack_now) -> No
 
 
 @pytest.mark.attack("10.1", "who gave this command?", '`by`: "operator", with no name')
-def test_the_log_says_who_commanded(lab, attack_now) -> None:
+def test_the_log_says_who_commanded(lab, attack_now):
     with operator(lab) as page:
         host, port = page.local_address[:2]
         say(page, kind="command", id=1, event={"type": "reference", "P_ref": 0.41})
@@ -272,7 +270,7 @@ def test_the_log_says_who_commanded(lab, attack_now) -> None:
 @pytest.mark.attack(
     "10.2", "400 commands at once from one page", "400 carried out, 400 lines in events.jsonl"
 )
-def test_a_page_has_a_limit_of_commands(lab, attack_now) -> None:
+def test_a_page_has_a_limit_of_commands(lab, attack_now):
     with operator(lab) as page:
         for k in range(400):
             say(page, kind="command", id=k, event={"type": "reference", "Q_ref": 0.02})

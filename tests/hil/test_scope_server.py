@@ -1,7 +1,5 @@
 """The scope's server: its files, its access rules, and its answers to messages."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -51,7 +49,7 @@ def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, dict[str, st
         return problem.code, dict(problem.headers), problem.read()
 
 
-def test_page_with_its_policy(served) -> None:
+def test_page_with_its_policy(served):
     port, _, _ = served
     for path, (kind, content) in static_files().items():
         status, headers, body = fetch(port, path)
@@ -64,13 +62,13 @@ def test_page_with_its_policy(served) -> None:
         assert fetch(port, wrong)[0] == 404
 
 
-def test_page_and_server_mean_the_same_by_a_picture() -> None:
+def test_page_and_server_mean_the_same_by_a_picture():
     script = static_files()["/frame.js"][1].decode()
     listed = script.partition("const HEAD = [")[2].partition("]")[0]
     assert [name.strip().strip('"') for name in listed.split(",")] == list(HEAD)
 
 
-def test_nothing_is_fetched_from_elsewhere() -> None:
+def test_nothing_is_fetched_from_elsewhere():
     for path, (_, content) in static_files().items():
         if not path.startswith("/vendor/"):
             assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
@@ -88,14 +86,14 @@ def test_nothing_is_fetched_from_elsewhere() -> None:
         {"Origin": "null"},
     ],
 )
-def test_others_pages_are_refused(served, headers) -> None:
+def test_others_pages_are_refused(served, headers):
     port, _, _ = served
     status, _, body = fetch(port, "/", **headers)
     assert status == 403
     assert b"not" in body
 
 
-def test_sockets_of_others_pages_are_refused(served) -> None:
+def test_sockets_of_others_pages_are_refused(served):
     port, _, _ = served
     address = f"ws://127.0.0.1:{port}/socket"
     origin = "http://127.0.0.1:1"
@@ -106,7 +104,7 @@ def test_sockets_of_others_pages_are_refused(served) -> None:
         assert words(socket, "about")["title"] == "test"
 
 
-def test_it_says_what_there_is_and_shows_it(served) -> None:
+def test_it_says_what_there_is_and_shows_it(served):
     port, _, done = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         about = words(socket, "about")
@@ -127,7 +125,7 @@ def test_it_says_what_there_is_and_shows_it(served) -> None:
         assert values[2, 0] == pytest.approx(50 * done.signals["y_omega_u"][:16].min())
 
 
-def test_a_run_that_is_over_can_be_played(served) -> None:
+def test_a_run_that_is_over_can_be_played(served):
     port, _, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         socket.send(json.dumps({"kind": "play", "start": 0.02, "speed": 0.1}))
@@ -156,7 +154,7 @@ def test_a_run_that_is_over_can_be_played(served) -> None:
         ('{"kind": "look", "span": NaN}', "span"),
     ],
 )
-def test_bad_messages_are_answered_and_change_nothing(served, message, words_of_it) -> None:
+def test_bad_messages_are_answered_and_change_nothing(served, message, words_of_it):
     port, _, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         socket.send(message)
@@ -165,7 +163,7 @@ def test_bad_messages_are_answered_and_change_nothing(served, message, words_of_
         assert isinstance(socket.recv(10), bytes)
 
 
-def test_oversized_messages_end_the_connection(served) -> None:
+def test_oversized_messages_end_the_connection(served):
     port, _, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         socket.send("x" * 100_000)
@@ -174,7 +172,7 @@ def test_oversized_messages_end_the_connection(served) -> None:
                 socket.recv(10)
 
 
-def test_control_needs_the_token(served) -> None:
+def test_control_needs_the_token(served):
     port, access, _ = served
     with connect(f"ws://127.0.0.1:{port}/socket") as socket:
         tell = json.dumps({"kind": "command", "id": 1, "event": {"type": "reset"}})
@@ -191,7 +189,7 @@ def test_control_needs_the_token(served) -> None:
         }  # fmt: skip
 
 
-def test_pages_beyond_the_limit_are_put_off(served) -> None:
+def test_pages_beyond_the_limit_are_put_off(served):
     port, _, _ = served
     address = f"ws://127.0.0.1:{port}/socket"
     with contextlib.ExitStack() as stack:
@@ -211,7 +209,7 @@ def test_pages_beyond_the_limit_are_put_off(served) -> None:
         (["{run}", "--host", "203.0.113.1", "--plain"], "--host 203.0.113.1"),
     ],
 )
-def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options, message) -> None:
+def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options, message):
     monkeypatch.setattr(os, "nice", lambda by: by)  # it would last for all of pytest
     monkeypatch.chdir(tmp_path)
     folder = str(run(duration=0.01).folder) if "{run}" in options else ""
@@ -222,14 +220,14 @@ def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options,
     assert not said.out
 
 
-def test_a_folder_of_something_else(tmp_path, capsys) -> None:
+def test_a_folder_of_something_else(tmp_path, capsys):
     (tmp_path / "scenario.toml").write_text("= 1")
     assert main(["scope", str(tmp_path)]) == 2
     assert "not a run folder: scenario.toml" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")
-def test_encrypted(run, start, tmp_path) -> None:
+def test_encrypted(run, start, tmp_path):
     folder = run(duration=0.01).folder
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
@@ -247,7 +245,7 @@ def test_encrypted(run, start, tmp_path) -> None:
         assert words(socket, "about")["kind"] == "about"
 
 
-def test_scope_waits_for_a_run_that_is_to_come(start, tmp_path) -> None:
+def test_scope_waits_for_a_run_that_is_to_come(start, tmp_path):
     scope = start("scope", "run", "--wait", "--port", "0")
     assert main(["run", "pref_step", "--link", "inproc", "--duration", "1.5", "--quiet",
                  "--no-figures", "--out", str(tmp_path / "run")]) == 0  # fmt: skip
@@ -256,6 +254,6 @@ def test_scope_waits_for_a_run_that_is_to_come(start, tmp_path) -> None:
         assert words(socket, "about")["capacity"] == 15_000
 
 
-def test_static_files_lie_in_the_package() -> None:
+def test_static_files_lie_in_the_package():
     licence = Path(static_files.__code__.co_filename).parent / "static/vendor/uPlot.LICENSE"
     assert "MIT" in licence.read_text("utf-8")

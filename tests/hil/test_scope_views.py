@@ -1,7 +1,5 @@
 """A scope's view of a recording: no window loses a peak; the trigger's edge."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -45,7 +43,7 @@ def noise(n: int, seed: int = 0) -> np.ndarray:
     st.integers(2, TICKS),
     st.integers(16, 900),
 )
-def test_bins_hold_the_extremes_of_their_ticks(chunks, first, span, wanted) -> None:
+def test_bins_hold_the_extremes_of_their_ticks(chunks, first, span, wanted):
     p = noise(min(TICKS, sum(chunks)))
     record, done = Growing(p), 0
     pyramid = pyramid_of(record)
@@ -63,7 +61,7 @@ def test_bins_hold_the_extremes_of_their_ticks(chunks, first, span, wanted) -> N
         assert (low[k - a], high[k - a]) == (rows.min(), rows.max())
 
 
-def test_missing_values_hide_no_others() -> None:
+def test_missing_values_hide_no_others():
     p = np.full(TICKS, np.nan)
     p[777] = 3.0
     pyramid = pyramid_of(Growing(p))
@@ -73,7 +71,7 @@ def test_missing_values_hide_no_others() -> None:
     assert high[777 // 64] == 3.0
 
 
-def test_a_long_recording_is_taken_in_by_and_by() -> None:
+def test_a_long_recording_is_taken_in_by_and_by():
     record = Growing(noise(100_000))
     record.capacity = 100_000
     pyramid = pyramid_of(record)
@@ -83,7 +81,7 @@ def test_a_long_recording_is_taken_in_by_and_by() -> None:
     assert pyramid.done == 100_000
 
 
-def test_frequencies_are_in_hertz_and_misses_are_counted() -> None:
+def test_frequencies_are_in_hertz_and_misses_are_counted():
     scheduled = np.arange(1000) * 100_000
     received = scheduled + 20_000
     received[[5, 500, 501]] = -1
@@ -102,7 +100,7 @@ def test_frequencies_are_in_hertz_and_misses_are_counted() -> None:
     assert [pyramid.misses(k) for k in (5, 6, 501, 1000)] == [0, 1, 2, 3]
 
 
-def test_loop_figures_of_a_run_without_deadlines_are_left_out() -> None:
+def test_loop_figures_of_a_run_without_deadlines_are_left_out():
     never = np.full(64, -1)
     record = Growing(np.zeros(64), plant_scheduled=never, plant_received=never, plant_sent=never)
     pyramid = pyramid_of(record)
@@ -110,7 +108,7 @@ def test_loop_figures_of_a_run_without_deadlines_are_left_out() -> None:
         assert np.isnan(pyramid.values(name, 0, 64)).all()
 
 
-def test_edges() -> None:
+def test_edges():
     values = np.array([0, 1, 1, 0, np.nan, 1, 0, 1], np.float32)
     rising = Trigger(channel="p", level=0.5)
     assert edges(values, rising).tolist() == [1, 7]
@@ -130,7 +128,7 @@ def acquisition(mode: str, p: np.ndarray, span: int = 100) -> tuple[Acquisition,
     return Acquisition(pyramid, trigger, span, 0), pyramid
 
 
-def test_single_holds_the_first_edge_for_good() -> None:
+def test_single_holds_the_first_edge_for_good():
     one, _ = acquisition("single", square(20_000, 4000))
     assert one.window(1000) == (900, 1000)
     assert one.doing == ARMED
@@ -141,7 +139,7 @@ def test_single_holds_the_first_edge_for_good() -> None:
         assert one.doing == HELD
 
 
-def test_normal_goes_from_edge_to_edge_and_waits_between_them() -> None:
+def test_normal_goes_from_edge_to_edge_and_waits_between_them():
     normal, _ = acquisition("normal", square(20_000, 4000))
     shown = []
     for head in range(0, 20_000, 50):
@@ -150,7 +148,7 @@ def test_normal_goes_from_edge_to_edge_and_waits_between_them() -> None:
     assert sorted(set(shown)) == [-1, 2000, 6000, 10_000, 14_000, 18_000]
 
 
-def test_auto_rolls_when_nothing_comes() -> None:
+def test_auto_rolls_when_nothing_comes():
     auto, _ = acquisition("auto", np.zeros(20_000))
     assert auto.window(4000) == (3900, 4000)
     assert auto.doing == ARMED
@@ -171,7 +169,7 @@ def taken_apart(frame: bytes, channels: int = 1, watched: int = 0):
     return head, rest[: 2 * n * channels].reshape(2 * channels, n), rest[2 * n * channels :]
 
 
-def test_frames_roll_along_and_say_what_is_the_case() -> None:
+def test_frames_roll_along_and_say_what_is_the_case():
     p = noise(TICKS)
     state = np.full(TICKS, 2.0)
     state[12_000:] = 3.0
@@ -190,7 +188,7 @@ def test_frames_roll_along_and_say_what_is_the_case() -> None:
     assert head["state"] == 3
 
 
-def test_a_held_window_is_sent_once_and_then_only_what_else_is_new() -> None:
+def test_a_held_window_is_sent_once_and_then_only_what_else_is_new():
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     view = ScopePicture(pyramid, look(mode="held", start=0.1, span=0.2), 0)
@@ -201,7 +199,7 @@ def test_a_held_window_is_sent_once_and_then_only_what_else_is_new() -> None:
     assert (head["same"], head["head"], values.size) == (1, 11_000, 0)
 
 
-def test_a_window_beyond_what_is_recorded_is_empty() -> None:
+def test_a_window_beyond_what_is_recorded_is_empty():
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     for start in (-5.0, 5.0):
@@ -211,7 +209,7 @@ def test_a_window_beyond_what_is_recorded_is_empty() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"channels": ["x"]}, {"watched": ["x"]}, {"mode": "trigger"}])
-def test_a_look_that_cannot_be_is_refused(wrong) -> None:
+def test_a_look_that_cannot_be_is_refused(wrong):
     pyramid = pyramid_of(Growing(noise(TICKS)))
     with pytest.raises(ValueError, match=r"channel = .*: unknown|trigger: missing"):
         ScopePicture(pyramid, look(**wrong), 0)
@@ -224,7 +222,7 @@ def test_a_look_that_cannot_be_is_refused(wrong) -> None:
     st.sampled_from(["roll", "held", "trigger"]),
     st.lists(st.integers(0, TICKS), min_size=1, max_size=4).map(sorted),
 )
-def test_no_look_is_too_odd(start, span, bins, mode, heads) -> None:
+def test_no_look_is_too_odd(start, span, bins, mode, heads):
     pyramid = pyramid_of(Growing(noise(TICKS)))
     pyramid.update()
     trigger = Trigger(channel="p", level=0.0)

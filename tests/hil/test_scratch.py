@@ -1,7 +1,5 @@
 """Folders that exist as long as their processes, and recordings in memory that outlive theirs."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Callable
 from pathlib import Path

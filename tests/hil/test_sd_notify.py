@@ -1,7 +1,5 @@
 """A side's messages to systemd, received on a real datagram socket in systemd's place."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import signal

@@ -1,11 +1,8 @@
 """The serial link over pseudo terminals: framing, damage on the line, whole runs."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,11 +44,11 @@ KNOWN = {
 
 
 @pytest.mark.parametrize("plain", KNOWN)
-def test_stuffing_is_that_of_the_literature(plain: str) -> None:
+def test_stuffing_is_that_of_the_literature(plain):
     assert stuffed(bytes.fromhex(plain)) == bytes.fromhex(KNOWN[plain]) + b"\0"
 
 
-def test_a_run_of_254_bytes_needs_one_more_byte() -> None:
+def test_a_run_of_254_bytes_needs_one_more_byte():
     run = bytes(range(1, 255))
     assert stuffed(b"\0" + run)[:2] == b"\x01\xff"
     assert stuffed(run + b"\xff") == b"\xff" + run + b"\x02\xff\0"
@@ -59,7 +56,7 @@ def test_a_run_of_254_bytes_needs_one_more_byte() -> None:
 
 
 @given(st.binary(min_size=1, max_size=LONGEST))
-def test_every_message_comes_back(message: bytes) -> None:
+def test_every_message_comes_back(message):
     line = stuffed(message)
     assert line.count(0) == 1 and line[-1] == 0
     assert len(line) <= len(message) + 4 + 4
@@ -74,9 +71,7 @@ def test_every_message_comes_back(message: bytes) -> None:
     ),
     st.lists(st.integers(1, 90), min_size=1, max_size=5),
 )
-def test_damage_costs_the_damaged_messages_alone(
-    faults: list[tuple[str | None, int, int]], cuts: list[int]
-) -> None:
+def test_damage_costs_the_damaged_messages_alone(faults, cuts):
     """Every other frame arrives, in order; what comes of a damaged one, the reader refuses."""
     writer, line, good, traces = FrameWriter("y"), b"", [], 0
     for tick, (kind, at, value) in enumerate(faults):
@@ -103,7 +98,7 @@ def test_damage_costs_the_damaged_messages_alone(
     assert refused + into.damaged == 0 or traces > 0
 
 
-def test_a_lost_end_costs_two_messages_and_a_long_silence_of_zeros_none() -> None:
+def test_a_lost_end_costs_two_messages_and_a_long_silence_of_zeros_none():
     into, words = Unstuffer(), [b"first", b"second", b"third", b"fourth"]
     line = stuffed(words[0]) + stuffed(words[1])[:-1] + stuffed(words[2]) + stuffed(words[3])
     into.feed(b"\x07ends somewhere\0" + line)
@@ -118,7 +113,7 @@ def test_a_lost_end_costs_two_messages_and_a_long_silence_of_zeros_none() -> Non
     assert (into.next(), into.damaged) == (b"again", 2)
 
 
-def test_a_damaged_greeting_is_left_out() -> None:
+def test_a_damaged_greeting_is_left_out():
     """A frame has a CRC of its own; a digit of a greeting would change what it says."""
     hello = b'GFMHIL {"kind": "hello", "T_s": 0.0001}'
     into = Unstuffer()
@@ -132,9 +127,7 @@ def endpoint(tmp_path: Path) -> str:
 
 
 @pytest.mark.full
-def test_a_run_with_an_inner_stage_has_the_bits_of_the_run_in_process(
-    make: Any, run: Any, tmp_path: Path
-) -> None:
+def test_a_run_with_an_inner_stage_has_the_bits_of_the_run_in_process(make, run, tmp_path):
     content = {"duration": 0.02, "link": PATIENT, "law": "vsg-2", "inner": "virtual-stator"}
     pair = run_pair(make(**content), tmp_path, "serial")
     assert_same(pair.signals, run(**content).signals)
@@ -143,9 +136,7 @@ def test_a_run_with_an_inner_stage_has_the_bits_of_the_run_in_process(
     assert not (tmp_path / "line").is_symlink()
 
 
-def test_damage_on_the_line_changes_no_bit(
-    make: Any, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damage_on_the_line_changes_no_bit(make, run, tmp_path, monkeypatch):
     """Bytes that are lost, doubled, wrong or foreign: the plant asks again, and all is counted."""
     draw, hits = random.Random(1), dict.fromkeys(KINDS, 0)
 
@@ -171,9 +162,7 @@ def test_damage_on_the_line_changes_no_bit(
     assert not any(end[name] for end in ends for name in ("tick", "state", "source", "dropped"))
 
 
-def test_a_line_is_of_one_side_and_of_one_user(
-    endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_is_of_one_side_and_of_one_user(endpoint, tmp_path, monkeypatch):
     controller = open_link("serial", "controller", endpoint)
     plant = open_link("serial", "plant", endpoint)
     try:
@@ -194,7 +183,7 @@ def test_a_line_is_of_one_side_and_of_one_user(
         open_link("serial", "plant", endpoint, {"baud": 10})
 
 
-def test_the_sender_drops_what_the_line_cannot_take(endpoint: str) -> None:
+def test_the_sender_drops_what_the_line_cannot_take(endpoint):
     """The plant may ask again faster than the line is; then its queue must not grow."""
     controller = open_link("serial", "controller", endpoint)
     plant = open_link("serial", "plant", endpoint)
@@ -214,7 +203,7 @@ def test_the_sender_drops_what_the_line_cannot_take(endpoint: str) -> None:
         controller.close()
 
 
-def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint: str) -> None:
+def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint):
     """Whatever call of the system finds out: at the end of a run PeerLost alone is expected."""
     controller = open_link("serial", "controller", endpoint)
     plant = open_link("serial", "plant", endpoint)

@@ -1,7 +1,5 @@
 """The shared-memory link in this process: the same runs, its ring, refused peers."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

@@ -1,7 +1,5 @@
 """The shared-memory link between processes: no torn message, and the rests of killed processes."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Callable
 from pathlib import Path

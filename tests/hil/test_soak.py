@@ -4,8 +4,6 @@
 With GFMHIL_SOAK_CSV=FOLDER the test of each link writes its samples there as ``soak_LINK.csv``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

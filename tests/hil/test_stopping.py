@@ -1,7 +1,5 @@
 """Signals set a flag during a run, and the handlers are restored after it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Six laws in one run, switched during a change of power: no bump, no trip."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

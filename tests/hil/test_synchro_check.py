@@ -1,8 +1,5 @@
 """Events with a synchro-check: the grid's breaker of one converter, and the black start."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,7 +34,7 @@ def island(closes_at: float, **check: Any) -> Run:
     return gfmhil.run(content(closes_at, **check))
 
 
-def test_the_grids_breaker_closes_when_the_angles_meet() -> None:
+def test_the_grids_breaker_closes_when_the_angles_meet():
     """Without the check it closes at whatever angle there is; half a turn later that ends a run."""
     checked = island(1.0, **CHECK)
     *_, waits, closed = checked.summary["events"]
@@ -53,7 +50,7 @@ def test_the_grids_breaker_closes_when_the_angles_meet() -> None:
 
 @pytest.mark.processes
 @pytest.mark.timeout(400)  # compiles
-def test_over_a_link_it_closes_in_the_same_tick(tmp_path: Path) -> None:
+def test_over_a_link_it_closes_in_the_same_tick(tmp_path):
     given = content(0.4, **CHECK | {"degrees": 60.0, "within_s": 0.2})
     given |= {"duration": 1.0, "link": {"type": "shm", "peer_timeout_s": 30.0}}
     given["events"].append({**given["events"][-1], "t": 0.7, "check": {**CHECK, "within_s": 0.03}})
@@ -67,7 +64,7 @@ def test_over_a_link_it_closes_in_the_same_tick(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_black_start_ends_on_the_grid(tmp_path: Path) -> None:
+def test_a_black_start_ends_on_the_grid(tmp_path):
     """The angle of the bus, from what A records at rest, is the one that the log names."""
     scenario = load_scenario("black_start")
     run = run_network(scenario, tmp_path / "run")
@@ -100,7 +97,7 @@ def test_a_black_start_ends_on_the_grid(tmp_path: Path) -> None:
         ({"closed": True, "check": {"angle": 5.0}}, "angle"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_one_line_that_names_it(event: dict[str, Any], message: str) -> None:
+def test_what_is_wrong_is_one_line_that_names_it(event, message):
     content = {
         "title": "island", "duration": 1.0, "link": {"type": "inproc"},
         "plant": {"grid": {"load_R": 45.0, "load_L": 0.02}},
@@ -111,6 +108,6 @@ def test_what_is_wrong_is_one_line_that_names_it(event: dict[str, Any], message:
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_black_start_cannot_begin_without_any_voltage() -> None:
+def test_a_black_start_cannot_begin_without_any_voltage():
     with pytest.raises(UserError, match=r"network: V = 0.0.*must be > 0 p.u."):
         gfmhil.run_network("black_start", references__V_ref=0.0)

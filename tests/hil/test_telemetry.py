@@ -1,7 +1,5 @@
 """A run's streams, to a subscriber of PlotJuggler's documented format and to ours."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Metrics of a run, scraped as by Prometheus."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

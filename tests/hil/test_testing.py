@@ -1,7 +1,5 @@
 """The pytest plugin: a user's project, made in a folder and run by pytest itself."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -39,7 +37,7 @@ def lab(tmp_path: Path) -> Lab:
     return make
 
 
-def test_steps_happen_at_their_ticks(lab: Lab) -> None:
+def test_steps_happen_at_their_ticks(lab):
     bench = lab()
     bench.run(0.02)
     bench.set(p_ref=0.6)
@@ -53,7 +51,7 @@ def test_steps_happen_at_their_ticks(lab: Lab) -> None:
     assert s["f_hz"] == pytest.approx(s["omega_u"] * 50)
 
 
-def test_going_on_after_a_look_is_the_same_run(lab: Lab) -> None:
+def test_going_on_after_a_look_is_the_same_run(lab):
     bench = lab()
     bench.run(0.02)
     first = bench.signals["p"]
@@ -64,7 +62,7 @@ def test_going_on_after_a_look_is_the_same_run(lab: Lab) -> None:
     np.testing.assert_array_equal(both[: len(first)], first)
 
 
-def test_failing_test_says_why_and_leaves_a_figure(pytester: pytest.Pytester) -> None:
+def test_failing_test_says_why_and_leaves_a_figure(pytester):
     pytester.makepyfile(
         """
         def test_too_fast(bench):
@@ -89,7 +87,7 @@ def test_failing_test_says_why_and_leaves_a_figure(pytester: pytest.Pytester) ->
     assert figure.read_bytes().startswith(b"\x89PNG")
 
 
-def test_passing_test_passes_and_is_marked_by_its_link(pytester: pytest.Pytester) -> None:
+def test_passing_test_passes_and_is_marked_by_its_link(pytester):
     pytester.makepyfile(
         """
         import pytest
@@ -108,7 +106,7 @@ def test_passing_test_passes_and_is_marked_by_its_link(pytester: pytest.Pytester
     )
 
 
-def test_a_file_that_cannot_be_imported_is_told_by_pytest_alone(pytester: pytest.Pytester) -> None:
+def test_a_file_that_cannot_be_imported_is_told_by_pytest_alone(pytester):
     pytester.makepyfile("import nowhere_to_be_found")
     result = pytester.runpytest()
     result.assert_outcomes(errors=1)
@@ -116,7 +114,7 @@ def test_a_file_that_cannot_be_imported_is_told_by_pytest_alone(pytester: pytest
     assert result.ret == pytest.ExitCode.INTERRUPTED
 
 
-def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) -> None:
+def test_what_is_not_looked_at_is_run_all_the_same(pytester):
     pytester.makepyfile(
         """
         import pytest
@@ -151,7 +149,7 @@ def test_what_is_not_looked_at_is_run_all_the_same(pytester: pytest.Pytester) ->
         ("bench.grid()", "f_hz = None, V_g = None"),
     ],
 )
-def test_wrong_use_is_told_in_one_line(lab: Lab, steps: str, says: str) -> None:
+def test_wrong_use_is_told_in_one_line(lab, steps, says):
     bench = lab()
     with pytest.raises(UserError) as told:
         exec(steps, {"bench": bench})
@@ -159,7 +157,7 @@ def test_wrong_use_is_told_in_one_line(lab: Lab, steps: str, says: str) -> None:
     assert "\n" not in str(told.value)
 
 
-def test_unused_plugin_imports_nothing_heavy() -> None:
+def test_unused_plugin_imports_nothing_heavy():
     code = "import gfm_pytest.plugin, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy = {"numpy", "numba", "gfm_hil", "pydantic", "zmq", "matplotlib"}
@@ -174,13 +172,13 @@ def project(name: str, tmp_path: Path, *options: str) -> subprocess.CompletedPro
     return subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
 
 
-def test_example_law_passes_its_tests(tmp_path: Path) -> None:
+def test_example_law_passes_its_tests(tmp_path):
     done = project("own_law", tmp_path)
     assert done.returncode == 0, done.stdout
     assert "9 passed" in done.stdout
 
 
-def test_wrong_law_fails_with_the_reason_and_figures(tmp_path: Path) -> None:
+def test_wrong_law_fails_with_the_reason_and_figures(tmp_path):
     done = project("own_law", tmp_path, "--law=too-stiff", "--gfmhil-out=figures", "-k", "not do")
     assert done.returncode == 1
     assert "5 failed, 2 passed" in done.stdout
@@ -196,7 +194,7 @@ def test_wrong_law_fails_with_the_reason_and_figures(tmp_path: Path) -> None:
     assert all(Path(name).is_file() for name in named)
 
 
-def test_example_controller_passes_its_tests(tmp_path: Path) -> None:
+def test_example_controller_passes_its_tests(tmp_path):
     done = project("own_controller", tmp_path)
     assert done.returncode == 0, done.stdout
     assert "3 passed" in done.stdout
@@ -204,13 +202,13 @@ def test_example_controller_passes_its_tests(tmp_path: Path) -> None:
 
 @pytest.mark.apt  # make, a C compiler, libzmq3-dev
 @pytest.mark.timeout(600)
-def test_example_controller_in_c_passes_its_tests(tmp_path: Path) -> None:
+def test_example_controller_in_c_passes_its_tests(tmp_path):
     done = project("own_controller_c", tmp_path)
     assert done.returncode == 0, done.stdout
     assert "4 passed" in done.stdout
 
 
-def test_example_controller_is_droop_5_but_for_its_integrator(lab: Lab, tmp_path: Path) -> None:
+def test_example_controller_is_droop_5_but_for_its_integrator(lab, tmp_path):
     """Euler there, Tustin here: the responses of the same law agree within 1 %."""
     source = (EXAMPLES / "own_law" / "laws" / "my-droop.toml").read_text(encoding="utf-8")
     (tmp_path / "law.toml").write_text(source, encoding="utf-8")
@@ -239,7 +237,7 @@ def window(x: np.ndarray, before: float = 0.0) -> Window:
     return Window("p", 0.5 + T, x, before, 0.5)
 
 
-def test_settles_counts_from_the_last_time_outside() -> None:
+def test_settles_counts_from_the_last_time_outside():
     w = window(np.where((T > 0.3) & (T < 0.6), 1.5, 1.0))
     assert settles(w, to=1.0, within=0.61, tolerance=0.02) is None
     found = settles(w, to=1.0, within=0.2, tolerance=0.02)
@@ -251,7 +249,7 @@ def test_settles_counts_from_the_last_time_outside() -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_overshoot_is_a_part_of_the_step(sign: int) -> None:
+def test_overshoot_is_a_part_of_the_step(sign):
     w = window(2 + sign * np.where(T < 0.1, 1.25, 1.0), before=2.0)
     assert overshoot(w, percent=25.1, to=None) is None
     found = overshoot(w, percent=24.9, to=None)
@@ -261,7 +259,7 @@ def test_overshoot_is_a_part_of_the_step(sign: int) -> None:
         overshoot(w, percent=1.0, to=2.0)
 
 
-def test_envelope_of_a_file_ends_with_its_lines(tmp_path: Path) -> None:
+def test_envelope_of_a_file_ends_with_its_lines(tmp_path):
     file = tmp_path / "limits.csv"
     file.write_text("t,low,high\n0.2,0,1\n0.4,,2\n")
     low, high = read_envelope(file, T)
@@ -285,7 +283,7 @@ def test_envelope_of_a_file_ends_with_its_lines(tmp_path: Path) -> None:
             read_envelope(file, T)
 
 
-def test_damped_reads_the_ratio() -> None:
+def test_damped_reads_the_ratio():
     x = 1 + np.exp(-0.2 * 20 * T) * np.cos(20 * np.sqrt(1 - 0.2**2) * T)
     assert damped(window(x), 0.19, 1e-3, 50.0) is None
     found = damped(window(x), 0.21, 1e-3, 50.0)
@@ -299,7 +297,7 @@ def test_damped_reads_the_ratio() -> None:
     assert found is not None and "at 50 Hz" in found.text and found.text.endswith("it grows.")
 
 
-def test_a_run_that_still_oscillates_fails_unless_that_is_expected(lab: Lab) -> None:
+def test_a_run_that_still_oscillates_fails_unless_that_is_expected(lab):
     """Droop-5 on the rig, whose D/A keeps an oscillation going (docs/experiments.md)."""
     bench = lab("rig_pref_step", law="droop-5")
     bench.run()
@@ -311,7 +309,7 @@ def test_a_run_that_still_oscillates_fails_unless_that_is_expected(lab: Lab) -> 
     bench.assert_no_trip()
 
 
-def test_change_of_law_and_its_bump(lab: Lab) -> None:
+def test_change_of_law_and_its_bump(lab):
     bench = lab(plant__dc_source={"mode": "regulated"})
     bench.run(0.01)
     bench.switch("vsg-2")
@@ -321,7 +319,7 @@ def test_change_of_law_and_its_bump(lab: Lab) -> None:
         bench.assert_bump_below(-1.0)
 
 
-def test_other_gains_and_a_way_back_from_a_trip(lab: Lab) -> None:
+def test_other_gains_and_a_way_back_from_a_trip(lab):
     bench = lab(law="droop-1", after_trip="wait")
     bench.run(0.1)
     bench.gains(D_p=0.002)
@@ -337,7 +335,7 @@ def test_other_gains_and_a_way_back_from_a_trip(lab: Lab) -> None:
     assert bench.signals["trip"][[2010, -1]].tolist() == [1.0, 0.0]
 
 
-def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab: Lab) -> None:
+def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab):
     p = []
     for link in ("inproc", "can"):
         bench = lab(link=link)
@@ -350,7 +348,7 @@ def test_results_over_can_are_those_in_process_but_for_its_sixteen_bits(lab: Lab
     np.testing.assert_allclose(p[1], p[0], atol=2e-3)
 
 
-def test_real_time_is_run_once_and_counts_its_misses(lab: Lab) -> None:
+def test_real_time_is_run_once_and_counts_its_misses(lab):
     patient = {"late_policy__hold": 10**6, "link__peer_timeout_s": 10.0}  # for a busy machine
     bench = lab("rig_pref_step", events=[], link="shm", mode="realtime", **patient)
     bench.run(0.05)
@@ -368,7 +366,7 @@ def test_real_time_is_run_once_and_counts_its_misses(lab: Lab) -> None:
         _ = bench.summary
 
 
-def test_link_of_the_command_line_replaces_or_skips(pytester: pytest.Pytester) -> None:
+def test_link_of_the_command_line_replaces_or_skips(pytester):
     pytester.makepyfile(
         """
         import pytest
@@ -400,9 +398,7 @@ def test_link_of_the_command_line_replaces_or_skips(pytester: pytest.Pytester) -
         ([sys.executable, "-c", "raise SystemExit(3)"], AssertionError, "the controller failed"),
     ],
 )
-def test_controller_that_does_not_run_is_told(
-    lab: Lab, command: list[str], error: type[Exception], says: str
-) -> None:
+def test_controller_that_does_not_run_is_told(lab, command, error, says):
     bench = lab(controller_command=command)
     bench.run(0.01)
     with pytest.raises(error, match=says):

@@ -1,13 +1,9 @@
 """The three phases of recorded runs, against phasors, single-phase circuits and the recording."""
 
-from __future__ import annotations
-
 import cmath
 import csv
 import math
-from collections.abc import Callable
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,7 +79,7 @@ class Still:
         return {name: x[:] for name, x in three_phase(columns, Bases()).items()}
 
 
-def test_a_balanced_steady_state_is_three_sines(run: Callable[..., Run]) -> None:
+def test_a_balanced_steady_state_is_three_sines(run):
     one = run(duration=0.1, plant={"grid": WEAK})
     waves, V = one.three_phase(), one.signals["V"][0]
     start = math.atan2(one.signals["v_im"][0], one.signals["v_re"][0])
@@ -97,7 +93,7 @@ def test_a_balanced_steady_state_is_three_sines(run: Callable[..., Run]) -> None
     assert v - Z_g * i == pytest.approx(1.0, abs=1e-7)  # the grid's phase a
 
 
-def test_power_is_that_of_the_three_phases_in_watts(run: Callable[..., Run]) -> None:
+def test_power_is_that_of_the_three_phases_in_watts(run):
     one = run(events=[{"t": 0.02, "type": "reference", "P_ref": 0.9}])
     for si, scale in ((False, 2 / 3), (True, 1 / Bases().S_n)):
         waves = one.three_phase(si=si)
@@ -107,9 +103,7 @@ def test_power_is_that_of_the_three_phases_in_watts(run: Callable[..., Run]) -> 
     assert np.ptp(one.signals["p"]) > 0.05
 
 
-def test_the_capacitor_takes_what_the_bridge_gives_and_the_line_does_not(
-    run: Callable[..., Run],
-) -> None:
+def test_the_capacitor_takes_what_the_bridge_gives_and_the_line_does_not(run):
     """In F, V and A: the line's current follows from p and q, the charge from v alone."""
     one = run(law="vsg-2", plant={"grid": WEAK}, events=[{**SAG, "t": 0.02}])
     waves = one.three_phase(si=True)
@@ -120,7 +114,7 @@ def test_the_capacitor_takes_what_the_bridge_gives_and_the_line_does_not(
         assert np.abs(v[1:] - v[0] - charge / 20e-6).max() < 0.01 * np.abs(v).max()
 
 
-def test_each_phase_is_a_circuit_of_its_own() -> None:
+def test_each_phase_is_a_circuit_of_its_own():
     """Two phases sag while the grid's angle jumps: R, L and C of each phase by SciPy, in volts that
     nothing turns; phase voltages of the grid without their zero sequence, as three wires have."""
     plant = Still(grid=WEAK)
@@ -163,7 +157,7 @@ def test_each_phase_is_a_circuit_of_its_own() -> None:
             w = solution.sol(end)
 
 
-def test_the_negative_sequence_is_that_of_the_network() -> None:
+def test_the_negative_sequence_is_that_of_the_network():
     """In the steady state of an unbalanced grid, by the phasors of each sequence's circuit."""
     plant = Still(grid=WEAK)
     grid_unbalance(plant.plant, (1.0, 0.5, 0.5))
@@ -186,7 +180,7 @@ def test_the_negative_sequence_is_that_of_the_network() -> None:
     assert behind == pytest.approx(1 / 6, abs=1e-6)
 
 
-def test_a_bolted_fault_leaves_no_voltage_and_the_lines_current(run: Callable[..., Run]) -> None:
+def test_a_bolted_fault_leaves_no_voltage_and_the_lines_current(run):
     """v is 0.001 p.u. times what flows into the fault; the line alone feeds it from the grid."""
     bolted = {"t": 0.02, "type": "fault", "position": 0.0, "R": 0.001}
     plant = {"grid": WEAK, "protection": OFF, "i_peak": 1.5}
@@ -199,7 +193,7 @@ def test_a_bolted_fault_leaves_no_voltage_and_the_lines_current(run: Callable[..
         assert np.abs(late[f"v_{k}"]).max() < 0.01
 
 
-def test_a_blocked_bridge_carries_no_current(run: Callable[..., Run]) -> None:
+def test_a_blocked_bridge_carries_no_current(run):
     one = run(
         plant={"protection": {"over_current": {"threshold": 0.7}}},
         after_trip="wait",
@@ -213,7 +207,7 @@ def test_a_blocked_bridge_carries_no_current(run: Callable[..., Run]) -> None:
 
 
 @pytest.mark.full
-def test_converters_of_a_network_see_one_node(tmp_path: Path) -> None:
+def test_converters_of_a_network_see_one_node(tmp_path):
     """Of different ratings, in volts and amperes: behind their lines is the same voltage, and the
     load takes what both bring."""
     big = tmp_path / "big.toml"
@@ -238,14 +232,14 @@ def test_converters_of_a_network_see_one_node(tmp_path: Path) -> None:
     assert power.imag / power.real == pytest.approx(0.2 / 0.8, rel=0.01)
 
 
-def test_a_recording_without_them_says_so(run: Callable[..., Run]) -> None:
+def test_a_recording_without_them_says_so(run):
     one = run(duration=0.01)
     columns = {name: x for name, x in one.columns.items() if name != "true_v_re"}
     with pytest.raises(UserError, match="the three phases need true_v_re, which the recording"):
         three_phase(columns, Bases())
 
 
-def test_the_names_are_described() -> None:
+def test_the_names_are_described():
     named = three_phase(dict.fromkeys(["t", *(f"true_{n}" for n in TRUTH)], np.zeros(1)), Bases())
     volts = three_phase(
         dict.fromkeys(["t", *(f"true_{n}" for n in TRUTH)], np.zeros(1)), Bases(), si=True
@@ -255,7 +249,7 @@ def test_the_names_are_described() -> None:
     assert describe("i_a", []).comment.startswith("current of L_f, phase a")
 
 
-def test_exports_have_them_on_request(run: Callable[..., Run], tmp_path: Path) -> None:
+def test_exports_have_them_on_request(run, tmp_path):
     one = run(duration=0.02)
     volts, pu = one.three_phase(si=True), one.three_phase()
     export_run(one.folder, "parquet", tmp_path / "run.parquet", "si")
@@ -276,9 +270,7 @@ def test_exports_have_them_on_request(run: Callable[..., Run], tmp_path: Path) -
     assert "v_a" not in (tmp_path / "run.csv").read_text(encoding="utf-8").partition("\n")[0]
 
 
-def test_the_scope_draws_them_and_its_trigger_finds_a_zero_crossing(
-    run: Callable[..., Run],
-) -> None:
+def test_the_scope_draws_them_and_its_trigger_finds_a_zero_crossing(run):
     one = run(plant={"grid": WEAK}, events=[{**SAG, "t": 0.02}])
     channels = {c.name: c for c in make_channels(T_S, 50.0) if c.group == "wave"}
     waves = one.three_phase(0.03, 0.05)
@@ -290,7 +282,7 @@ def test_the_scope_draws_them_and_its_trigger_finds_a_zero_crossing(
     assert len(up) == 5 and np.abs(np.diff(up) - 200).max() < 15  # 50 Hz, an angle that swings
 
 
-def test_the_figure_shows_the_cycles_around_the_first_event(run: Callable[..., Run]) -> None:
+def test_the_figure_shows_the_cycles_around_the_first_event(run):
     one = run(duration=0.4, law="vsg-2", plant={"grid": WEAK}, events=[SAG])
     axes = draw_waveforms(Figure(), one.scenario, one.columns, one.summary)
     assert axes[0].get_xlim() == pytest.approx((0.04, 0.24))
@@ -305,9 +297,7 @@ def test_the_figure_shows_the_cycles_around_the_first_event(run: Callable[..., R
     assert draw_waveforms(Figure(), one.scenario, one.columns, one.summary, (0.5, 0.6)) == []
 
 
-def test_the_window_of_the_report_is_that_of_the_scenario(
-    make: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_the_window_of_the_report_is_that_of_the_scenario(make, tmp_path):
     file = tmp_path / "scenario.toml"
     file.write_text('title = "t"\nduration = 0.05\nlink.type = "inproc"\n', encoding="utf-8")
     folder = tmp_path / "run"
@@ -324,7 +314,7 @@ def test_the_window_of_the_report_is_that_of_the_scenario(
 
 
 @pytest.mark.parametrize("text", ["0.1", "0.1:0.2:0.3", "a:b"])
-def test_a_window_that_is_none(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_window_that_is_none(text, capsys):
     with pytest.raises(SystemExit):
         main(["run", "pref_step", "--waveforms", text])
     assert f"{text!r}: must be FROM:TO, two numbers in s" in capsys.readouterr().err

@@ -1,14 +1,12 @@
 """The XCP slave: packets by the tables of ASAM MCD-1 XCP, and pyxcp as the master of a run."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +76,7 @@ def line(run: MadeUpRun) -> Line:
     return made
 
 
-def test_the_answers_of_a_session_are_those_of_the_tables(run: MadeUpRun) -> None:
+def test_the_answers_of_a_session_are_those_of_the_tables(run):
     line = Line(run)
     assert line(b"\xfd") == b""  # not connected: only CONNECT is answered
     # RESOURCE = CAL, COMM_MODE_BASIC = Intel, bytes, optional; MAX_CTO, MAX_DTO, versions
@@ -100,9 +98,7 @@ def test_the_answers_of_a_session_are_those_of_the_tables(run: MadeUpRun) -> Non
     "23.5", "a datagram of 1.5 kB from a forged address that connects and uploads",
     "16.5 kB to that address",
 )  # fmt: skip
-def test_a_datagram_that_connects_brings_no_more_than_its_answer(
-    run: MadeUpRun, attack_now: Callable[[str], None]
-) -> None:
+def test_a_datagram_that_connects_brings_no_more_than_its_answer(run, attack_now):
     made = slave(run)
     file, piece = datagram(b"\xfa\x04"), datagram(b"\xf5\xf0")
     asked = datagram(CONNECT) + file + 240 * piece
@@ -116,7 +112,7 @@ def test_a_datagram_that_connects_brings_no_more_than_its_answer(
 
 
 @pytest.mark.attack("23.5", "a master that asks for what there is not, for ever", "a line for each")
-def test_the_log_of_refusals_is_bounded(run: MadeUpRun, attack_now: Callable[[str], None]) -> None:
+def test_the_log_of_refusals_is_bounded(run, attack_now):
     told: list[str] = []
     line = Line(run, notice=told.append)
     line(CONNECT)
@@ -127,7 +123,7 @@ def test_the_log_of_refusals_is_bounded(run: MadeUpRun, attack_now: Callable[[st
     attack_now(f"{len(told)} lines, the last of which says so")
 
 
-def test_the_file_is_uploaded_in_pieces_and_a_parser_reads_it(line: Line, tmp_path: Path) -> None:
+def test_the_file_is_uploaded_in_pieces_and_a_parser_reads_it(line, tmp_path):
     answer = line(b"\xfa\x04")
     assert answer[:4] == bytes.fromhex("ff 00 0000")
     size, text = struct.unpack("<I", answer[4:])[0], b""
@@ -144,7 +140,7 @@ def test_the_file_is_uploaded_in_pieces_and_a_parser_reads_it(line: Line, tmp_pa
             assert int(where[f"{law.replace('-', '_')}.{name}"], 16) == GAINS + EACH * k + 8 * j
 
 
-def test_measurements_are_read_from_one_tick(line: Line, run: MadeUpRun) -> None:
+def test_measurements_are_read_from_one_tick(line, run):
     plant = [name for name in run.now if name in TABLE and name.startswith(("y_", "u_", "true_"))]
     assert line.numbers(0x1000, 4) == (7.0, *(run.now[name] for name in plant[:3]))
     whole = line(short_upload(0x1000, 32))
@@ -164,7 +160,7 @@ def test_measurements_are_read_from_one_tick(line: Line, run: MadeUpRun) -> None
     assert line(short_upload(0x1000, 8)) == b"\xfe\x33"  # the run has not begun
 
 
-def test_a_write_is_one_command_with_all_its_values(line: Line, run: MadeUpRun) -> None:
+def test_a_write_is_one_command_with_all_its_values(line, run):
     assert line(short_download(REFERENCES + 8, 0.8)) == b"\xff"
     line(set_mta(REFERENCES))
     assert line(download(1.0, 0.7, 1.0, 0.1, 1.0)) == b"\xff"
@@ -185,7 +181,7 @@ def test_a_write_is_one_command_with_all_its_values(line: Line, run: MadeUpRun) 
     assert line(short_download(D_P, 0.02)) == b"\xfe\x24"  # not the law in force
 
 
-def test_what_is_wrong_is_refused_and_changes_nothing(run: MadeUpRun) -> None:
+def test_what_is_wrong_is_refused_and_changes_nothing(run):
     said: list[str] = []
     line = Line(run, notice=said.append)
     line(CONNECT)
@@ -213,7 +209,7 @@ def test_what_is_wrong_is_refused_and_changes_nothing(run: MadeUpRun) -> None:
     assert not run.told
 
 
-def test_one_master_at_a_time_until_it_is_silent(run: MadeUpRun) -> None:
+def test_one_master_at_a_time_until_it_is_silent(run):
     now, other = [0.0], ("127.0.0.1", 40001)
     line = Line(run, clock=lambda: now[0])
     line(CONNECT)
@@ -226,7 +222,7 @@ def test_one_master_at_a_time_until_it_is_silent(run: MadeUpRun) -> None:
     assert line(CONNECT, other)[:1] == b"\xff" and line(b"\xfd") == b""
 
 
-def test_several_packets_of_a_datagram_and_what_is_no_packet(run: MadeUpRun) -> None:
+def test_several_packets_of_a_datagram_and_what_is_no_packet(run):
     one = slave(run)
     answer = one.take(datagram(CONNECT, b"\xfc", b"\xfd"), MASTER)
     assert answer == datagram(bytes.fromhex("ff0180ffff000101"), b"\xfe\0", b"\xff" + bytes(5))
@@ -235,7 +231,7 @@ def test_several_packets_of_a_datagram_and_what_is_no_packet(run: MadeUpRun) -> 
     assert one.take(b"\x01\0\0", MASTER) == b""
 
 
-def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> None:
+def test_on_a_can_bus_a_frame_is_a_packet(run, tmp_path):
     line = CanFd("virtual", "xcp", [0x123, 0x124])
     one = slave(run, most=line.most)
     with can.Bus(interface="virtual", channel="xcp", fd=True) as bus, line:
@@ -279,17 +275,13 @@ def test_on_a_can_bus_a_frame_is_a_packet(run: MadeUpRun, tmp_path: Path) -> Non
         ("a,b", "--ids a,b: must be two numbers"),
     ],
 )
-def test_identifiers_that_cannot_be(
-    ids: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_identifiers_that_cannot_be(ids, why, tmp_path, capsys):
     assert main(["xcp", str(tmp_path), "--can", "can0", "--ids", ids]) == 2
     error = capsys.readouterr().err
     assert why in error and error.count("\n") == 1
 
 
-def test_beyond_this_machine_only_if_that_is_meant(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_beyond_this_machine_only_if_that_is_meant(tmp_path, capsys):
     for more, why in (
         (["--host", "0.0.0.0"], "--plain if it shall"),
         (["--port", "70000"], "--port 70000: must be 0 (any) to 65535"),
@@ -331,9 +323,7 @@ def mastered(folder: Path, *options: str) -> Iterator[Any]:
             served.terminate()
 
 
-def test_it_waits_for_the_command_server_not_for_the_recording_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_waits_for_the_command_server_not_for_the_recording_alone(tmp_path, monkeypatch):
     (tmp_path / "parts").mkdir()
     for file in ("scenario.toml", "parts/controller_progress.npy"):
         (tmp_path / file).touch()
@@ -346,7 +336,7 @@ def test_it_waits_for_the_command_server_not_for_the_recording_alone(
 
 
 @pytest.mark.processes
-def test_pyxcp_measures_and_calibrates_a_run(tmp_path: Path) -> None:
+def test_pyxcp_measures_and_calibrates_a_run(tmp_path):
     folder = tmp_path / "run"
     with running(folder, SCENARIO) as process:
         with mastered(folder, "--write") as master:

@@ -1,7 +1,5 @@
 """ZeroMQ beyond one machine: encrypted, with the one known plant, or refused."""
 
-from __future__ import annotations
-
 import socket
 import stat
 import threading

@@ -1,7 +1,5 @@
 """ZeroMQ called from compiled code: the same messages as with pyzmq, byte by byte."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A plant in equilibrium, the start of most tests of the plant."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

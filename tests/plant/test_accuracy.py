@@ -1,7 +1,6 @@
 """The exact solution against SciPy's DOP853 on the same equations; what of it is not exact, and
 how fast that converges."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -52,7 +51,7 @@ def assert_exact(x: NDArray[np.float64], truth: NDArray[np.float64]) -> None:
     assert error[V_DC] < 1e-8
 
 
-def test_one_second_open_loop(rest: Callable[..., Any]) -> None:
+def test_one_second_open_loop(rest):
     """The paper's DC source while it charges: v_dc is then stable without control."""
     plant = rest(P=-0.5)
     segments = [(10_000, plant.near(E_u=1e-3))]
@@ -61,7 +60,7 @@ def test_one_second_open_loop(rest: Callable[..., Any]) -> None:
     assert_exact(x, reference(plant, segments))
 
 
-def test_one_second_with_the_regulated_source(rest: Callable[..., Any]) -> None:
+def test_one_second_with_the_regulated_source(rest):
     """The angle moves for 50 ms at +0.001 p.u., which is 0.45 p.u. of power; then it is held."""
     plant = rest(dc_source={"mode": "regulated"})
     segments = [(500, plant.near(omega_u=1e-3)), (9500, plant.u)]
@@ -70,7 +69,7 @@ def test_one_second_with_the_regulated_source(rest: Callable[..., Any]) -> None:
     assert_exact(x, reference(plant, segments))
 
 
-def test_fourth_order_of_the_dc_link(rest: Callable[..., Any]) -> None:
+def test_fourth_order_of_the_dc_link(rest):
     """A step makes the filter ring; half the period gives a sixteenth of the error of v_dc."""
     errors = []
     for n in (1, 2, 4):
@@ -84,9 +83,7 @@ def test_fourth_order_of_the_dc_link(rest: Callable[..., Any]) -> None:
 
 
 @pytest.mark.parametrize("omega_u", [0.0, 1e-9, 1e-6, 1e-3])
-def test_a_circuit_without_losses_driven_near_its_own_frequency(
-    rest: Callable[..., Any], omega_u: float
-) -> None:
+def test_a_circuit_without_losses_driven_near_its_own_frequency(rest, omega_u):
     """Without resistance the currents' mean is a mode at 0 Hz, which the bridge then drives."""
     off = {"over_current": {"enabled": False}, "under_frequency": {"enabled": False}}
     plant = rest(factors={"R_f": 0.0, "R_g": 0.0}, protection=off, dc_source={"mode": "regulated"})
@@ -96,7 +93,7 @@ def test_a_circuit_without_losses_driven_near_its_own_frequency(
     assert np.abs(np.delete(x - truth, V_DC, axis=1)).max() < 1e-9
 
 
-def test_power_balance_of_a_run(rest: Callable[..., Any]) -> None:
+def test_power_balance_of_a_run(rest):
     """Energy from C_dc and the DC source is lost, stored or delivered, by Simpson's rule."""
     plant = rest(T_s=1e-5)
     u = plant.near(i_u=0.2, omega_u=5e-4, E_u=2e-3)

@@ -25,18 +25,18 @@ from gfm_plant import Bases
         ("f", 49.9, 0.998),
     ],
 )
-def test_values_worked_by_hand(quantity: str, si: float, pu: float) -> None:
+def test_values_worked_by_hand(quantity, si, pu):
     bases = Bases()
     assert bases.to_pu(si, quantity) == pytest.approx(pu, rel=1e-6)
     assert bases.to_si(pu, quantity) == pytest.approx(si, rel=1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, -380.0, math.nan, math.inf])
-def test_a_base_must_be_positive(value: float) -> None:
+def test_a_base_must_be_positive(value):
     with pytest.raises(ValueError, match=r"V_n = .*must be finite and > 0"):
         Bases(V_n=value)
 
 
-def test_unknown_quantity_lists_the_known() -> None:
+def test_unknown_quantity_lists_the_known():
     with pytest.raises(ValueError, match=r"quantity = 'G': must be one of P, Q, V, .*, f"):
         Bases().to_pu(1.0, "G")

@@ -1,7 +1,5 @@
 """The modes of a circuit: its motion is that of its differential equations, however it is drawn."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -33,7 +31,7 @@ def converter(k: int, node: str, L: float = 0.1) -> tuple[list[Branch], Capacito
     )
 
 
-def test_lc_filter_against_the_matrix_exponential() -> None:
+def test_lc_filter_against_the_matrix_exponential():
     branches, capacitor, bridge = converter(1, "g")
     order = ["i_f1", "i_o1", "v1"]
     m = find_modes(branches, [capacitor], [bridge, GRID], OMEGA_B, order)
@@ -48,7 +46,7 @@ def test_lc_filter_against_the_matrix_exponential() -> None:
     np.testing.assert_allclose(moved(m, w, s, t), exact, atol=1e-12)
 
 
-def test_a_line_in_two_pieces_is_the_same_line() -> None:
+def test_a_line_in_two_pieces_is_the_same_line():
     branches, capacitor, bridge = converter(1, "g", L=0.1)
     whole = find_modes(branches, [capacitor], [bridge, GRID], OMEGA_B, ["i_f1", "i_o1", "v1"])
     pieces = [
@@ -65,7 +63,7 @@ def test_a_line_in_two_pieces_is_the_same_line() -> None:
 
 
 @pytest.mark.parametrize("n", [2, 5, 10])
-def test_identical_converters_in_parallel(n: int) -> None:
+def test_identical_converters_in_parallel(n):
     """Their eigenvalues repeat; each then moves as one converter on a line that n share."""
     branches, capacitors, sources, order = [], [], [], []
     for k in range(n):
@@ -88,7 +86,7 @@ def test_identical_converters_in_parallel(n: int) -> None:
     assert b[-1] == pytest.approx(n * a[3], abs=1e-10)
 
 
-def test_switching_keeps_the_flux_of_a_loop() -> None:
+def test_switching_keeps_the_flux_of_a_loop():
     """Two inductors that an opened breaker puts in series share (L1 i1 + L2 i2) / (L1 + L2)."""
     m = find_modes(
         [Branch("a", "e", "n", 0.3, 0.1), Branch("b", "n", GROUND, 0.2, 0.5)], [],
@@ -111,8 +109,6 @@ A, B = Branch("a", "e", "n", 0.1, 0.0), Branch("b", "n", "g", 0.1, 0.0)
         ([A, B], [Capacitor("c", "g", 1.0)], [E, GRID], "node g: a source and a"),
     ],
 )
-def test_circuits_that_cannot_be(
-    branches: Any, capacitors: Any, sources: Any, message: str
-) -> None:
+def test_circuits_that_cannot_be(branches, capacitors, sources, message):
     with pytest.raises(ValueError, match=message):
         find_modes(branches, capacitors, sources, OMEGA_B, ["a", "b", "c"])

@@ -1,6 +1,5 @@
 """The path of a command to the bridge and the DC source: D/A, delay, limits, regulation."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ def commands(n: int, u0: Any) -> Any:
 
 
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
-def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) -> None:
+def test_whole_delay_is_a_shifted_input(rest, samples):
     late, prompt = rest(delay={"samples": samples}), rest()
     u = commands(50, late.u)
     shifted = np.concatenate([np.tile(late.u, (samples, 1)), u])
@@ -30,9 +29,7 @@ def test_whole_delay_is_a_shifted_input(rest: Callable[..., Any], samples: int) 
 
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
 @pytest.mark.parametrize("fraction", [0.02, 0.3, 0.5, 0.99])
-def test_fraction_splits_the_period_exactly(
-    rest: Callable[..., Any], samples: int, fraction: float
-) -> None:
+def test_fraction_splits_the_period_exactly(rest, samples, fraction):
     """Reference: a plant with a hundredth of the period; its command changes at the right tick."""
     late = rest(delay={"samples": samples, "fraction": fraction})
     fine = rest(T_s=1e-6)
@@ -47,20 +44,20 @@ def test_fraction_splits_the_period_exactly(
         assert late.truth()["delta"] == pytest.approx(fine.truth()["delta"], abs=1e-13)
 
 
-def test_dac_rounds_and_clamps(rest: Callable[..., Any]) -> None:
+def test_dac_rounds_and_clamps(rest):
     plant = rest(dac={"bits": 8, "range": {"E_u": [0.0, 2.0], "i_u": [-1.0, 1.0]}})
     plant.advance(u=np.array([5.0, 1.00123, 1.001]))
     assert list(plant.st["u_now"][0]) == [1.0 - 2 / 256, 1.00123, 1.0, 0.0]
 
 
-def test_rig_boards_by_name(rest: Callable[..., Any]) -> None:
+def test_rig_boards_by_name(rest):
     plant = rest(adc="DS2004", dac="DS2101")
     plant.advance(100)
     assert plant.sample()[1] == pytest.approx(plant.truth()["p"], abs=2 / 2**16)
     assert plant.st["u_now"][0, 2] == pytest.approx(plant.u[2], abs=1 / 2**12)
 
 
-def test_limited_source(rest: Callable[..., Any]) -> None:
+def test_limited_source(rest):
     limited, other = rest(dc_source={"i_max": 0.7}), rest()
     limited.advance(10, limited.near(i_u=5.0))
     other.advance(10, np.array([0.7, *other.u[1:]]))
@@ -68,7 +65,7 @@ def test_limited_source(rest: Callable[..., Any]) -> None:
     assert limited.truth()["i_dc"] == other.truth()["i_dc"] == 0.7
 
 
-def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -> None:
+def test_regulated_source_ignores_i_u_and_holds_v_dc(rest):
     plant = rest(dc_source={"mode": "regulated"})
     plant.advance(50, plant.near(i_u=9.0, omega_u=5e-3))
     assert plant.truth()["p"] > 0.57
@@ -78,7 +75,7 @@ def test_regulated_source_ignores_i_u_and_holds_v_dc(rest: Callable[..., Any]) -
     assert plant.truth()["i_dc"] * plant.truth()["v_dc"] == pytest.approx(drawn, abs=1e-4)
 
 
-def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
+def test_regulated_source_does_not_wind_up(rest):
     """At the current limit the integral is frozen, so that v_dc does not overshoot afterwards."""
     plant = rest(P=0.3, dc_source={"mode": "regulated", "i_max": 0.5})
     plant.advance(50, plant.near(omega_u=0.01))  # the power rises beyond 0.5 p.u.
@@ -95,7 +92,7 @@ def test_regulated_source_does_not_wind_up(rest: Callable[..., Any]) -> None:
     assert peak < 1.01
 
 
-def test_no_allocation_in_a_tick(rest: Callable[..., Any]) -> None:
+def test_no_allocation_in_a_tick(rest):
     @njit
     def run(plant: Any, u: Any, y: Any, out: Any, ticks: int) -> None:
         for _ in range(ticks):

@@ -1,7 +1,5 @@
 """Loads of constant power, against SciPy's DOP853 and against their own derivatives."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from typing import Any
@@ -85,7 +83,7 @@ def error(plant: Network, u: np.ndarray, seconds: float, T_s: float) -> float:
 
 
 @pytest.mark.parametrize("slip", [0.0, 2e-3])
-def test_a_rest_is_one(slip: float) -> None:
+def test_a_rest_is_one(slip):
     """At the start the load draws its power, at its own voltage and at any speed."""
     plant = make()
     u = start_at(plant, [1.02, 1.02], 1 + slip)
@@ -126,7 +124,7 @@ def start_at(plant: Network, E: Any, omega: float) -> np.ndarray:
     return u
 
 
-def test_a_step_against_an_adaptive_integrator_of_second_order() -> None:
+def test_a_step_against_an_adaptive_integrator_of_second_order():
     """Half a piece, which is a period here, a quarter of the error."""
     errors = []
     for T_s in (1e-4, 5e-5, 2.5e-5):
@@ -140,7 +138,7 @@ def test_a_step_against_an_adaptive_integrator_of_second_order() -> None:
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.05)
 
 
-def test_it_comes_on_and_goes_off() -> None:
+def test_it_comes_on_and_goes_off():
     plant = make(closed=False)
     u = start(plant, [1.02, 1.02], [0.0, 0.0])
     assert error(plant, u, 0.01, 1e-4) < 1e-8
@@ -152,7 +150,7 @@ def test_it_comes_on_and_goes_off() -> None:
     assert error(plant, u, 0.01, 1e-4) < 1e-8
 
 
-def test_below_its_least_voltage_it_is_an_impedance() -> None:
+def test_below_its_least_voltage_it_is_an_impedance():
     """Which draws P and Q at that voltage."""
     plant = make(V_least=2.0)
     u = start_at(plant, [1.02, 1.02], 1.0)
@@ -162,7 +160,7 @@ def test_below_its_least_voltage_it_is_an_impedance() -> None:
     assert i == pytest.approx(complex(0.5, -0.1) / 4)
 
 
-def test_six_of_a_sixth_are_one() -> None:
+def test_six_of_a_sixth_are_one():
     found = []
     for count in (1, 6):
         plant = make(count=count)
@@ -174,7 +172,7 @@ def test_six_of_a_sixth_are_one() -> None:
 
 
 @pytest.mark.parametrize("V", [1.03, 0.6])
-def test_the_admittance_is_the_derivative(V: float) -> None:
+def test_the_admittance_is_the_derivative(V):
     load = ConstantPowerLoad(node="n", P=0.5, Q=0.1)
     Y = load.admittance(V, 0.0)
     step = 1e-6
@@ -188,7 +186,7 @@ def test_the_admittance_is_the_derivative(V: float) -> None:
     assert fast[1] == pytest.approx(Y / (1 + 1j)) and np.abs(fast[2]).max() < 1e-3
 
 
-def test_its_slope_is_that_of_its_current() -> None:
+def test_its_slope_is_that_of_its_current():
     f, d, step = 0.9 + 0.2j, -3.0 + 5.0j, 1e-6
     _, slope = drawn(0.5 + 0.1j, 0.49, f, d)
     ends = [f + sign * step * d for sign in (1, -1)]
@@ -204,6 +202,6 @@ def test_its_slope_is_that_of_its_current() -> None:
         ({"tau_s": 1e-4}, "network.constant_power.p: tau_s = 0.0001: must be >= 0.0005 s"),
     ],
 )
-def test_impossible_loads(change: dict[str, Any], message: str) -> None:
+def test_impossible_loads(change, message):
     with pytest.raises(ValueError, match=message):
         make(**change)

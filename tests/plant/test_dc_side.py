@@ -1,7 +1,6 @@
 """The DC source's lag and the bridge's modulation limit."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ T_S = 1e-4
 
 
 @pytest.mark.parametrize("source", [{}, {"mode": "regulated"}])
-def test_source_with_a_lag(rest: Callable[..., Any], source: dict[str, Any]) -> None:
+def test_source_with_a_lag(rest, source):
     """Against SciPy: tau i' = what is asked for - i, and C_dc takes i."""
     plant = rest(P=-0.5, dc_source={**source, "tau_s": 0.02})
     r, u = plant.par[0], plant.near(i_u=0.1, E_u=1e-3)
@@ -35,7 +34,7 @@ def test_source_with_a_lag(rest: Callable[..., Any], source: dict[str, Any]) -> 
     assert plant.truth()["i_dc"] == pytest.approx(exact[9], abs=1e-7)
 
 
-def test_lag_comes_after_the_limit(rest: Callable[..., Any]) -> None:
+def test_lag_comes_after_the_limit(rest):
     plant = rest(P=-0.5, dc_source={"i_max": 0.6, "tau_s": 0.01})
     plant.advance(100, plant.near(i_u=-9.0))  # one time constant towards -0.6
     start = plant.u[0]
@@ -43,7 +42,7 @@ def test_lag_comes_after_the_limit(rest: Callable[..., Any]) -> None:
 
 
 @pytest.mark.parametrize("tau", [0.0, 1e-3])
-def test_a_source_that_reaches_its_limit(rest: Callable[..., Any], tau: float) -> None:
+def test_a_source_that_reaches_its_limit(rest, tau):
     """Between two ticks; against SciPy in steps of 2 us, which see when."""
     lag = {"tau_s": tau} if tau else {}
     plant = rest(dc_source={"mode": "regulated", "i_max": 0.55, **lag})
@@ -70,7 +69,7 @@ def test_a_source_that_reaches_its_limit(rest: Callable[..., Any], tau: float) -
 
 
 @pytest.mark.parametrize("empty", [False, True])
-def test_a_link_that_empties(rest: Callable[..., Any], empty: bool) -> None:
+def test_a_link_that_empties(rest, empty):
     """A load of constant power alone: C_dc / omega_b v v' = -p, so v^2 falls in a straight line."""
     plant = rest()
     r, s = plant.par[0], plant.st[0]
@@ -86,9 +85,7 @@ def test_a_link_that_empties(rest: Callable[..., Any], empty: bool) -> None:
 
 
 @pytest.mark.parametrize(("modulation", "most"), [("space-vector", 1.3026), ("sine", 1.1281)])
-def test_modulation_limits_the_bridge_by_v_dc(
-    rest: Callable[..., Any], modulation: str, most: float
-) -> None:
+def test_modulation_limits_the_bridge_by_v_dc(rest, modulation, most):
     """Line-to-line RMS of 700 V DC over 380 V, by hand: 1 / sqrt(2), and sqrt(3 / 8)."""
     off = {name: {"enabled": False} for name in ("over_current", "over_voltage")}
     plant = rest(modulation=modulation, protection=off)
@@ -100,12 +97,12 @@ def test_modulation_limits_the_bridge_by_v_dc(
     assert limits[-1] < 0.98 * limits[0]  # v_dc has sagged, and the limit with it
 
 
-def test_no_rest_beyond_the_modulation(rest: Callable[..., Any]) -> None:
+def test_no_rest_beyond_the_modulation(rest):
     with pytest.raises(NoEquilibrium, match=r"need E_u = 1.195 p.u.* gives 1.128 p.u."):
         rest(V=1.2, modulation="sine", grid={"V_g": 1.2})
 
 
-def test_a_stage_and_the_bridge_have_the_same_limit_of_space_vector_modulation() -> None:
+def test_a_stage_and_the_bridge_have_the_same_limit_of_space_vector_modulation():
     """They differed in the fifth digit, 1.30255 and 1.30257, in the stage
     and the bridge; the circle in the hexagon has sqrt(3/2) / sqrt(3) of v_dc line to line."""
     plant = make_plant(Plant.model_validate({"modulation": "space-vector"}), 1e-4)

@@ -1,8 +1,5 @@
 """Three-phase faults on the line and at the filter capacitor, and their clearing."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,9 +40,7 @@ def moved(plant: Any, w: Any, t: float, at: float, R: float | None) -> Any:
 
 
 @pytest.mark.parametrize(("at", "R"), [(0.0, 0.5), (0.0, 0.3), (0.4, 0.0), (0.7, 0.1)])
-def test_fault_and_clearing_against_the_equations(
-    rest: Callable[..., Any], at: float, R: float
-) -> None:
+def test_fault_and_clearing_against_the_equations(rest, at, R):
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source={"mode": "regulated"})
     x = plant.x[:6]
     w = np.array([complex(*x[:2]), complex(*x[2:4]), complex(*x[4:]), complex(*x[4:])])
@@ -64,7 +59,7 @@ def test_fault_and_clearing_against_the_equations(
     assert [complex(*now[k : k + 2]) for k in (0, 2, 4)] == pytest.approx(w[:3], abs=1e-9)
 
 
-def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
+def test_bolted_fault_in_the_steady_state(rest):
     """The bridge feeds its filter and 0.3 of the line: phasors at nominal frequency, by hand."""
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source={"mode": "regulated", "k_p": 200.0})
     fault(plant.plant, 0.3, 0.0)
@@ -80,7 +75,7 @@ def test_bolted_fault_in_the_steady_state(rest: Callable[..., Any]) -> None:
     assert plant.st["x"][0, :7] == pytest.approx(plant.x[:7], abs=1e-6)
 
 
-def test_fault_on_a_tripped_plant_and_a_new_line(rest: Callable[..., Any]) -> None:
+def test_fault_on_a_tripped_plant_and_a_new_line(rest):
     """A bolted fault trips by current; the grid then feeds it alone through 0.8 of the line."""
     plant = rest(grid=WEAK)
     fault(plant.plant, 0.2, 0.0)
@@ -105,9 +100,7 @@ def test_fault_on_a_tripped_plant_and_a_new_line(rest: Callable[..., Any]) -> No
         (0.5, 0.1, 0.0, "duration = 0.0: must be > 0 s"),
     ],
 )
-def test_impossible_faults_change_nothing(
-    rest: Callable[..., Any], at: float, R: float, duration: float | None, message: str
-) -> None:
+def test_impossible_faults_change_nothing(rest, at, R, duration, message):
     plant = rest()
     before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):

@@ -1,6 +1,5 @@
 """A grid whose frequency follows its balance of power."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,14 @@ from gfm_plant.model import DELTA, f
 GRID = {"S": 2.0, "H": 3.0, "D": 1.0, "droop": 0.05, "T_gov": 0.4}
 
 
-def test_rests_where_it_starts(rest: Callable[..., Any]) -> None:
+def test_rests_where_it_starts(rest):
     plant = rest(grid={"finite": GRID, "omega_g": 0.998})
     plant.advance(5000)
     assert plant.truth()["omega_g"] == pytest.approx(0.998, abs=1e-12)
     assert plant.st["x"][0] == pytest.approx(plant.x, abs=1e-9)
 
 
-def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
+def test_load_step_against_the_swing_equation(rest):
     """The converter's u is held, so its angle runs away from the grid's: both interact."""
     plant = rest(grid={"finite": GRID}, dc_source={"mode": "regulated"})
     s, c = plant.plant.of(FiniteGrid)[0], GRID
@@ -54,7 +53,7 @@ def test_load_step_against_the_swing_equation(rest: Callable[..., Any]) -> None:
     np.testing.assert_allclose(found[:, 1], p, atol=1e-5)
 
 
-def test_alone_it_settles_by_its_droop(rest: Callable[..., Any]) -> None:
+def test_alone_it_settles_by_its_droop(rest):
     """Without the converter: -change / (1 / droop + D), by hand; the nadir lies lower."""
     local = {"load_R": 72.2, "load_L": 0.05}
     plant = rest(grid={"finite": GRID, **local}, dc_source={"mode": "regulated"})
@@ -69,7 +68,7 @@ def test_alone_it_settles_by_its_droop(rest: Callable[..., Any]) -> None:
     assert min(w) < 1.2 * w[-1]
 
 
-def test_wrong_grids(rest: Callable[..., Any]) -> None:
+def test_wrong_grids(rest):
     own = rest(grid={"finite": GRID})
     with pytest.raises(ValueError, match=r"plant.grid.finite: such a grid sets its own frequency"):
         grid_frequency(own.plant, 0.99)

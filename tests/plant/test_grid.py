@@ -1,7 +1,6 @@
 """Every action of the grid simulator has its effect."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,14 @@ def load_current(plant: Any) -> complex:
     return plant.phasor("load")
 
 
-def test_start_values(rest: Callable[..., Any]) -> None:
+def test_start_values(rest):
     truth = rest(grid={"omega_g": 0.99, "V_g": 0.9}, V=0.9).truth()
     assert (truth["omega_g"], truth["V_g"]) == (0.99, 0.9)
     assert truth["p"] == pytest.approx(0.5)
     assert truth["omega_u"] == 0.99
 
 
-def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
+def test_frequency_step_turns_the_angle(rest):
     plant = rest()
     grid_frequency(plant.plant, 0.999)
     before = plant.truth()["delta"]
@@ -36,7 +35,7 @@ def test_frequency_step_turns_the_angle(rest: Callable[..., Any]) -> None:
 
 
 @pytest.mark.parametrize(("goal", "sign"), [(0.998, -1), (1.002, 1)])
-def test_frequency_ramp(rest: Callable[..., Any], goal: float, sign: int) -> None:
+def test_frequency_ramp(rest, goal, sign):
     plant = rest()
     grid_frequency(plant.plant, goal, rate=0.1)
     values = []
@@ -48,7 +47,7 @@ def test_frequency_ramp(rest: Callable[..., Any], goal: float, sign: int) -> Non
     assert values[201:] == [goal] * 99
 
 
-def test_voltage_step_ramp_and_sag(rest: Callable[..., Any]) -> None:
+def test_voltage_step_ramp_and_sag(rest):
     plant = rest()
     grid_voltage(plant.plant, 0.9)
     assert plant.truth()["V_g"] == 0.9
@@ -64,7 +63,7 @@ def test_voltage_step_ramp_and_sag(rest: Callable[..., Any]) -> None:
     assert plant.truth()["V_g"] == 1.0
 
 
-def test_sag_within_a_sag_recovers_to_before_both(rest: Callable[..., Any]) -> None:
+def test_sag_within_a_sag_recovers_to_before_both(rest):
     plant = rest()
     grid_voltage(plant.plant, 0.8, duration=0.01)
     plant.advance(5)
@@ -73,7 +72,7 @@ def test_sag_within_a_sag_recovers_to_before_both(rest: Callable[..., Any]) -> N
     assert plant.truth()["V_g"] == 1.0
 
 
-def test_step_within_a_sag_cancels_the_recovery(rest: Callable[..., Any]) -> None:
+def test_step_within_a_sag_cancels_the_recovery(rest):
     plant = rest()
     grid_voltage(plant.plant, 0.8, duration=0.001)
     grid_voltage(plant.plant, 0.95)
@@ -81,7 +80,7 @@ def test_step_within_a_sag_cancels_the_recovery(rest: Callable[..., Any]) -> Non
     assert plant.truth()["V_g"] == 0.95
 
 
-def test_phase_jump_of_the_grid(rest: Callable[..., Any]) -> None:
+def test_phase_jump_of_the_grid(rest):
     plant = rest()
     phase_jump(plant.plant, 10.0)
     assert plant.truth()["delta"] == pytest.approx(plant.x[DELTA] - math.radians(10))
@@ -89,14 +88,14 @@ def test_phase_jump_of_the_grid(rest: Callable[..., Any]) -> None:
     assert plant.truth()["p"] < 0.5  # a leading grid takes less power
 
 
-def test_a_full_turn_changes_nothing(rest: Callable[..., Any]) -> None:
+def test_a_full_turn_changes_nothing(rest):
     plant = rest()
     phase_jump(plant.plant, 360.0)
     plant.advance(100)
     assert plant.truth()["p"] == pytest.approx(0.5, abs=1e-9)
 
 
-def test_impedance_change_is_a_factor_on_the_nominal_line(rest: Callable[..., Any]) -> None:
+def test_impedance_change_is_a_factor_on_the_nominal_line(rest):
     plant = rest(factors={"L_g": 2.0})
     current = plant.st["x"][0, 4:6].copy()
     grid_impedance(plant.plant, 5.0, 3.0)
@@ -107,7 +106,7 @@ def test_impedance_change_is_a_factor_on_the_nominal_line(rest: Callable[..., An
     assert strong.par[0]["L_g"] == plant.par[0]["L_g"]
 
 
-def test_breaker_conserves_flux(rest: Callable[..., Any]) -> None:
+def test_breaker_conserves_flux(rest):
     plant = rest(grid=LOAD)
     L_g, L_load = plant.par[0]["L_g"], plant.plant.wiring.branches[0].L
     assert L_load == pytest.approx(0.4351236)
@@ -122,7 +121,7 @@ def test_breaker_conserves_flux(rest: Callable[..., Any]) -> None:
     assert plant.par[0]["L_g"] == L_g
 
 
-def test_local_load_rests_while_the_breaker_is_closed(rest: Callable[..., Any]) -> None:
+def test_local_load_rests_while_the_breaker_is_closed(rest):
     plant = rest(grid=LOAD)
     before = load_current(plant)
     plant.advance(1000)
@@ -130,7 +129,7 @@ def test_local_load_rests_while_the_breaker_is_closed(rest: Callable[..., Any]) 
     assert plant.truth()["p"] == pytest.approx(0.5, abs=1e-9)
 
 
-def test_local_load_follows_the_grid(rest: Callable[..., Any]) -> None:
+def test_local_load_follows_the_grid(rest):
     """Against SciPy: L_load di/dt = omega_b (v_g - R_load i) - j omega_b omega_u L_load i."""
     plant = rest(grid=LOAD)
     (load,) = plant.plant.wiring.branches
@@ -146,7 +145,7 @@ def test_local_load_follows_the_grid(rest: Callable[..., Any]) -> None:
     assert load_current(plant) == pytest.approx(exact, abs=1e-10)
 
 
-def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> None:
+def test_island_runs_at_the_converters_frequency(rest):
     """Its waveform in a fixed frame rotates at omega_u, independent of the disconnected grid."""
     plant = rest(dc_source={"mode": "regulated"}, grid=LOAD)
     breaker(plant.plant, closed=False)
@@ -165,7 +164,7 @@ def test_island_runs_at_the_converters_frequency(rest: Callable[..., Any]) -> No
     assert plant.truth()["trip"] == 0
 
 
-def test_impedance_change_of_an_island(rest: Callable[..., Any]) -> None:
+def test_impedance_change_of_an_island(rest):
     plant = rest(grid=LOAD)
     breaker(plant.plant, closed=False)
     grid_impedance(plant.plant, 2.0, 1.0)
@@ -189,9 +188,7 @@ def test_impedance_change_of_an_island(rest: Callable[..., Any]) -> None:
         (lambda p: breaker(p.plant, closed=False), "load_R, plant.grid.load_L: not set"),
     ],
 )
-def test_impossible_actions_change_nothing(
-    rest: Callable[..., Any], action: Callable[[Any], None], message: str
-) -> None:
+def test_impossible_actions_change_nothing(rest, action, message):
     plant = rest()
     before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):

@@ -1,7 +1,5 @@
 """The second inductor of a filter: between its capacitor and the point of connection."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +22,7 @@ def two(rest: Callable[..., Any], **grid: Any) -> tuple[Any, Any]:
     return with_lcl, rest(factors=factors, grid=grid, protection=OFF, dc_source=STIFF)
 
 
-def test_it_adds_to_the_line(rest: Callable[..., Any]) -> None:
+def test_it_adds_to_the_line(rest):
     lcl, line = two(rest, **LOAD)
     r = lcl.par[0]
     nominal = rest().par[0]
@@ -42,7 +40,7 @@ def test_it_adds_to_the_line(rest: Callable[..., Any]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["3ph", "LG"])
-def test_a_fault_at_the_point_of_connection(rest: Callable[..., Any], kind: str) -> None:
+def test_a_fault_at_the_point_of_connection(rest, kind):
     """With R over L the same in both parts, the place on a line as long as both is known."""
     r = rest().par[0]
     ratio = 3.0
@@ -58,7 +56,7 @@ def test_a_fault_at_the_point_of_connection(rest: Callable[..., Any], kind: str)
     assert lcl.st["x"][0] == pytest.approx(line.st["x"][0], abs=1e-10)
 
 
-def test_another_line_leaves_it_as_it_is(rest: Callable[..., Any]) -> None:
+def test_another_line_leaves_it_as_it_is(rest):
     changed, made = two(rest)
     grid_impedance(changed.plant, 5.0, 4.0)
     r, nominal = changed.par[0], rest().par[0]
@@ -69,7 +67,7 @@ def test_another_line_leaves_it_as_it_is(rest: Callable[..., Any]) -> None:
     assert changed.st["x"][0] == pytest.approx(made.st["x"][0], abs=1e-10)
 
 
-def test_a_scr_is_that_at_the_point_of_connection(rest: Callable[..., Any]) -> None:
+def test_a_scr_is_that_at_the_point_of_connection(rest):
     plant = rest(lcl=SECOND, grid={"scr": 3.0, "x_over_r": 6.0})
     line = plant.plant.wiring.branches[0]
     assert abs(complex(line.R, line.L)) == pytest.approx(1 / 3)

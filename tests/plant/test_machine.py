@@ -1,7 +1,5 @@
 """Synchronous machines: the classical model, against SciPy."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -47,7 +45,7 @@ def rest(plant: Network, angles: list[float]) -> np.ndarray:
     return u
 
 
-def test_a_step_against_an_adaptive_integrator() -> None:
+def test_a_step_against_an_adaptive_integrator():
     plant = make(g=MACHINE)
     u = rest(plant, [0.05])
     wiring, n, now = plant.wiring, plant.net[0], plant.now[0]
@@ -93,7 +91,7 @@ def test_a_step_against_an_adaptive_integrator() -> None:
     assert np.abs(now["w"][:6] - exact[:6]).max() < 1e-6
 
 
-def test_a_machine_that_is_lost_runs_up_by_itself() -> None:
+def test_a_machine_that_is_lost_runs_up_by_itself():
     """Without load: 2 H d(omega)/dt = P_turbine - D (omega - 1), the current is zero at once."""
     plant = make(g=MACHINE, h={**MACHINE, "S": 1.0})
     u = rest(plant, [0.05, 0.03])
@@ -114,7 +112,7 @@ def test_a_machine_that_is_lost_runs_up_by_itself() -> None:
     assert now["omega_g"] == last and g["omega"] > last  # the last machine is gone
 
 
-def test_five_of_a_fifth_are_one() -> None:
+def test_five_of_a_fifth_are_one():
     found = []
     for count in (1, 5):
         plant = make(**{f"g{k}": {**MACHINE, "S": 2.0 / count} for k in range(count)})
@@ -127,6 +125,6 @@ def test_five_of_a_fifth_are_one() -> None:
     assert found[0] == pytest.approx(found[1], abs=1e-11)
 
 
-def test_a_machine_that_swings_too_fast() -> None:
+def test_a_machine_that_swings_too_fast():
     with pytest.raises(ValueError, match=r"network.machines.g: it swings at .* rad/s; allowed are"):
         make(g={**MACHINE, "H": 1e-4})

@@ -19,7 +19,7 @@ def par() -> NDArray[np.void]:
     return make_plant(Plant(), 1e-4).par
 
 
-def test_as_printed_in_the_paper(par: NDArray[np.void]) -> None:
+def test_as_printed_in_the_paper(par):
     r = par[0]
     i_d, i_q, v_d, v_q, i_od, i_oq, delta, v_dc = X
     i_u, omega_u, E_u = U
@@ -49,7 +49,7 @@ def test_as_printed_in_the_paper(par: NDArray[np.void]) -> None:
     assert g(X, U) == pytest.approx(outputs, rel=1e-15)
 
 
-def test_complex_step_agrees_with_central_differences(par: NDArray[np.void]) -> None:
+def test_complex_step_agrees_with_central_differences(par):
     z = np.concatenate([X, U, D])
 
     def value(z: NDArray[np.complex128]) -> NDArray[np.complex128]:
@@ -64,7 +64,7 @@ def test_complex_step_agrees_with_central_differences(par: NDArray[np.void]) -> 
         np.testing.assert_allclose(exact, central.real, rtol=1e-7, atol=1e-5)
 
 
-def test_power_balance_closes(par: NDArray[np.void]) -> None:
+def test_power_balance_closes(par):
     """Change of stored energy = DC power in - losses in R_f, R_g - power into the grid."""
     r = par[0]
     rng = np.random.default_rng(1)

@@ -1,11 +1,7 @@
 """Several converters in one network, against SciPy and against networks that are the same."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,7 +73,7 @@ def go(plant: Network, u: np.ndarray, ticks: int) -> None:
 @pytest.mark.parametrize(
     ("factor", "kind"), [(1.0, "none"), (1.3, "none"), (1.3, "LL"), (1.0, "LG")]
 )
-def test_against_an_adaptive_integrator(factor: float, kind: str) -> None:
+def test_against_an_adaptive_integrator(factor, kind):
     """Two converters, the second with other elements, at two nodes with a capacitor bank each; a
     fault connects phases c and a at the second node, or phase b and ground."""
     plant = make(
@@ -138,7 +134,7 @@ def test_against_an_adaptive_integrator(factor: float, kind: str) -> None:
 
 
 @pytest.mark.parametrize("n", [3, 14])
-def test_identical_converters_at_one_bus_are_one_with_a_longer_line(n: int) -> None:
+def test_identical_converters_at_one_bus_are_one_with_a_longer_line(n):
     """Each of n equal converters sees a shared line n times as long."""
     L, R = 0.1, 0.02
     many = make(
@@ -159,7 +155,7 @@ def test_identical_converters_at_one_bus_are_one_with_a_longer_line(n: int) -> N
     assert np.abs(found[0] - found[1][0]).max() < 1e-10
 
 
-def test_a_rating_is_as_many_converters_of_the_first_one(tmp_path: Path) -> None:
+def test_a_rating_is_as_many_converters_of_the_first_one(tmp_path):
     """A converter of twice the rating, the same in its own p.u., is two of the small one."""
     paper = load_converter("paper").model_dump()
     paper["S_n"] *= 2
@@ -193,7 +189,7 @@ def tripping(**limits: float) -> Network:
     )
 
 
-def test_one_trips_and_the_other_goes_on() -> None:
+def test_one_trips_and_the_other_goes_on():
     plant = tripping(a=0.01)
     u = start(plant, 1.0, 0.2)
     alone = make(
@@ -217,7 +213,7 @@ def test_one_trips_and_the_other_goes_on() -> None:
     assert abs(plant.st["x"][1, 4]) > 0.3
 
 
-def test_two_that_trip_at_once_trip_one_tick_apart() -> None:
+def test_two_that_trip_at_once_trip_one_tick_apart():
     plant = tripping(a=0.01, b=0.01)
     u = start(plant, 1.0, 0.2)
     trips = []
@@ -231,7 +227,7 @@ def test_two_that_trip_at_once_trip_one_tick_apart() -> None:
     assert np.abs(plant.st["x"][:, :2]).max() == 0.0
 
 
-def test_a_load_that_is_off_draws_nothing_and_a_line_that_opens_no_current() -> None:
+def test_a_load_that_is_off_draws_nothing_and_a_line_that_opens_no_current():
     def at(closed: bool) -> Network:
         plant = make(
             {"a": ({}, "bus")}, grid="far",
@@ -254,7 +250,7 @@ def test_a_load_that_is_off_draws_nothing_and_a_line_that_opens_no_current() -> 
     assert plant.now["w"][0, k] == 0.0
 
 
-def test_delays_of_different_length_cut_the_period() -> None:
+def test_delays_of_different_length_cut_the_period():
     delays = {"a": {"samples": 1, "fraction": 0.25}, "b": {"samples": 1, "fraction": 0.75}}
     plant = make({name: ({"delay": d}, "bus") for name, d in delays.items()}, grid="bus")
     assert plant.net[0]["n_parts"] == 3
@@ -270,7 +266,7 @@ def test_delays_of_different_length_cut_the_period() -> None:
     assert i_a > 0.0 and math.isfinite(i_b)
 
 
-def test_a_fault_at_a_node_is_that_at_the_end_of_every_line_to_it() -> None:
+def test_a_fault_at_a_node_is_that_at_the_end_of_every_line_to_it():
     def ready() -> Network:
         return make(
             {"a": ({}, "bus"), "b": ({}, "bus")}, grid="far",
@@ -287,7 +283,7 @@ def test_a_fault_at_a_node_is_that_at_the_end_of_every_line_to_it() -> None:
     assert at_node.st["x"] == pytest.approx(on_line.st["x"], abs=1e-12)
 
 
-def test_a_fault_in_two_axes_is_one_in_three_phases() -> None:
+def test_a_fault_in_two_axes_is_one_in_three_phases():
     """Two phases bolted to an ideal ground hold the third one there too: with machine, load of
     constant power, delays and a trip, the circuits of two axes are as the balanced ones."""
     found = []
@@ -319,7 +315,7 @@ def test_a_fault_in_two_axes_is_one_in_three_phases() -> None:
         assert one == pytest.approx(other, abs=1e-9)
 
 
-def test_a_transformer_is_its_leakage_and_its_magnetising_inductance() -> None:
+def test_a_transformer_is_its_leakage_and_its_magnetising_inductance():
     """In p.u. of its own rating: as a line and a load of reactive power alone."""
     converters = {"a": ({}, "m"), "b": ({"lcl": {"L": 0.1, "R": 0.02}}, "m")}
     transformer = {"start": "m", "end": "far", "S": 2.0, "X": 0.2, "R": 0.02, "X_m": 10.0}
@@ -354,7 +350,7 @@ def test_a_transformer_is_its_leakage_and_its_magnetising_inductance() -> None:
         ("none", "m", None),
     ],
 )
-def test_the_path_of_a_zero_sequence(earthed: str, node: str, Z_0: complex | None) -> None:
+def test_the_path_of_a_zero_sequence(earthed, node, Z_0):
     """Leakage and line, in series or in parallel, by hand."""
     plant = make(
         {"a": ({}, "m")}, grid="far",
@@ -386,7 +382,7 @@ BUS = {"a": ({}, "bus")}
 
 
 @pytest.mark.parametrize("bank", [{}, {"c": {"node": "bus", "Q": 0.05}}])
-def test_a_resistor_is_switched_on_beside_another_as_one_of_both_sizes(bank: Any) -> None:
+def test_a_resistor_is_switched_on_beside_another_as_one_of_both_sizes(bank):
     y, z = {"node": "bus", "P": 0.4}, {"node": "bus", "P": 0.2, "closed": False}
     two = make(BUS, loads={"y": y, "z": z}, capacitors=bank)
     one = make(BUS, loads={"y": y}, capacitors=bank)
@@ -399,7 +395,7 @@ def test_a_resistor_is_switched_on_beside_another_as_one_of_both_sizes(bank: Any
         assert two.st["x"] == pytest.approx(one.st["x"], abs=1e-12)
 
 
-def test_a_converter_alone_on_an_open_bus_feeds_its_capacitor() -> None:
+def test_a_converter_alone_on_an_open_bus_feeds_its_capacitor():
     """v = E / (1 - w^2 L C + j w R C), and no current in the line."""
     plant = make(BUS)
     u = start(plant, 1.0, 0.2, 1.01)
@@ -427,7 +423,7 @@ def test_a_converter_alone_on_an_open_bus_feeds_its_capacitor() -> None:
          "t is at node 'y', which has no path"),
     ],
 )  # fmt: skip
-def test_impossible_networks(parts: dict[str, Any], message: str) -> None:
+def test_impossible_networks(parts, message):
     with pytest.raises(ValueError, match=message):
         make(BUS, **parts)
 
@@ -442,7 +438,7 @@ def test_impossible_networks(parts: dict[str, Any], message: str) -> None:
         (lambda p: line_breaker(p, "x", closed=False), r"name = 'x': must be one of \['a', 'l'\]"),
     ],
 )
-def test_impossible_events(event: Callable[[Network], None], message: str) -> None:
+def test_impossible_events(event, message):
     plant = make(BUS, grid="far", lines={"l": {"start": "bus", "end": "far", "L": 0.1}})
     before = plant.copy()
     with pytest.raises(ValueError, match=message):

@@ -1,7 +1,6 @@
 """Options: defaults are ideal; an error names the option, its value and what is allowed."""
 
 import tomllib
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -10,7 +9,7 @@ from gfm_plant import Plant, make_plant
 from gfm_plant.options import DS2004, DS2101, MEASURED
 
 
-def test_a_scenario_table() -> None:
+def test_a_scenario_table():
     options = Plant.model_validate(
         tomllib.loads(
             """
@@ -54,7 +53,7 @@ def test_a_scenario_table() -> None:
         ({"protection": {"over_current": {"threshold": 0.0}}}, "threshold", "greater than 0"),
     ],
 )
-def test_wrong_options(options: dict[str, Any], where: str, message: str) -> None:
+def test_wrong_options(options, where, message):
     with pytest.raises(ValidationError, match=message) as caught:
         Plant.model_validate(options)
     assert where in ".".join(str(part) for part in caught.value.errors()[0]["loc"])
@@ -70,24 +69,24 @@ def test_wrong_options(options: dict[str, Any], where: str, message: str) -> Non
         ({"dc_source": {"mode": "regulated", "k_p": 1e6}}, r"dc_source.k_p.*1.63.*e\+07 rad/s"),
     ],
 )
-def test_what_the_dc_link_cannot_follow(options: dict[str, Any], message: str) -> None:
+def test_what_the_dc_link_cannot_follow(options, message):
     with pytest.raises(ValueError, match=message):
         make_plant(Plant.model_validate(options), 1e-4)
 
 
 @pytest.mark.parametrize("T_s", [0.0, -1e-4, float("nan")])
-def test_sampling_period(T_s: float) -> None:
+def test_sampling_period(T_s):
     with pytest.raises(ValueError, match="T_s = "):
         make_plant(Plant(), T_s)
 
 
-def test_boards_of_the_rig() -> None:
+def test_boards_of_the_rig():
     assert (DS2004.bits, DS2101.bits) == (16, 12)
     assert set(DS2004.range) == set(MEASURED)
     assert "omega_u" not in DS2101.range
 
 
-def test_the_line_by_its_short_circuit_ratio() -> None:
+def test_the_line_by_its_short_circuit_ratio():
     """SCR = 2 and X/R = 10, by hand: 1/2 p.u. = sqrt(R^2 + X^2) with X = 10 R."""
     par = make_plant(Plant.model_validate({"grid": {"scr": 2.0, "x_over_r": 10.0}}), 1e-4).par
     assert par["R_g"][0] == pytest.approx(0.0497518595, rel=1e-9)
@@ -105,6 +104,6 @@ def test_the_line_by_its_short_circuit_ratio() -> None:
         ),
     ],
 )
-def test_a_line_is_given_once_and_whole(options: dict[str, Any], message: str) -> None:
+def test_a_line_is_given_once_and_whole(options, message):
     with pytest.raises(ValidationError, match=message):
         Plant.model_validate(options)

@@ -1,14 +1,12 @@
 """Converter files and factors."""
 
-from pathlib import Path
-
 import pytest
 from pydantic import ValidationError
 
 from gfm_plant import load_converter
 
 
-def test_the_papers_converter() -> None:
+def test_the_papers_converter():
     paper = load_converter("paper")
     assert (paper.L_f, paper.R_f, paper.C_f, paper.C_dc) == (2e-3, 0.06, 20e-6, 500e-6)
     assert paper.bases.base_of("R") == pytest.approx(36.1)
@@ -25,7 +23,7 @@ def test_the_papers_converter() -> None:
     )
 
 
-def test_factors_scale_the_element_and_leave_the_bases() -> None:
+def test_factors_scale_the_element_and_leave_the_bases():
     paper = load_converter("paper")
     assert paper.pu({"L_g": 3.0})["L_g"] == pytest.approx(3 * paper.pu()["L_g"])
     assert paper.pu({"L_g": 3.0})["L_f"] == paper.pu()["L_f"]
@@ -40,17 +38,17 @@ def test_factors_scale_the_element_and_leave_the_bases() -> None:
         ({"L_x": 1.0}, r"factors.L_x: must be one of L_f, R_f"),
     ],
 )
-def test_wrong_factors(factors: dict[str, float], message: str) -> None:
+def test_wrong_factors(factors, message):
     with pytest.raises(ValueError, match=message):
         load_converter("paper").pu(factors)  # type: ignore[arg-type]
 
 
-def test_unknown_name_lists_what_is_shipped() -> None:
+def test_unknown_name_lists_what_is_shipped():
     with pytest.raises(ValueError, match=r"converter = 'papre': must be one of .*paper.*\.toml"):
         load_converter("papre")
 
 
-def test_a_file_reports_every_mistake_at_once(tmp_path: Path) -> None:
+def test_a_file_reports_every_mistake_at_once(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(
         'source = "x"\nS_n = 4e3\nV_n = 380.0\nomega_n = 314.0\nV_dcref = 700.0\n'

@@ -1,9 +1,5 @@
 """The bridge's peak-current limit: within the limit while the DC voltage can hold it there."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -31,7 +27,7 @@ def current(i_peak: float | None, R: float, modulation: str = "space-vector") ->
 
 
 @pytest.mark.parametrize("R", [0.01, 0.1, 0.5])
-def test_the_current_stays_within_the_limit_in_a_fault(R: float) -> None:
+def test_the_current_stays_within_the_limit_in_a_fault(R):
     limited, free = current(LIMIT, R), current(None, R)
     within = slice(20, 120)  # while the fault lasts, v is far below what the bridge can give
     assert free[within].max() > 1.5 * LIMIT
@@ -39,7 +35,7 @@ def test_the_current_stays_within_the_limit_in_a_fault(R: float) -> None:
     assert limited[within].max() >= 0.99 * LIMIT
 
 
-def test_a_limit_that_is_not_reached_changes_nothing() -> None:
+def test_a_limit_that_is_not_reached_changes_nothing():
     """Near its limit the same circuit is solved in shorter pieces: E does not depend on v_dc
     here."""
     once = current(None, 0.5, "unlimited")
@@ -58,7 +54,7 @@ def test_a_limit_that_is_not_reached_changes_nothing() -> None:
     ],
     ids=["+60", "-60", "dip", "unbalance"],
 )
-def test_no_jump_of_the_grid_leads_beyond_the_limit(scr: float, event: dict[str, Any]) -> None:
+def test_no_jump_of_the_grid_leads_beyond_the_limit(scr, event):
     """From far below it the limit looks in time; the bridge gives whatever voltage that takes."""
     plant = {"i_peak": LIMIT, "modulation": "unlimited", "delay": {"fraction": 0.3},
              "grid": {"scr": scr, "x_over_r": 6.0}}  # fmt: skip

@@ -1,8 +1,6 @@
 """Every protection trips in time, latches, blocks the bridge and says why."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,9 +25,7 @@ def code_of(reason: str) -> int:
         ("under_frequency", 1.1, "under-frequency: omega_u = 1 p.u. < 1.1"),
     ],
 )
-def test_trip_after_its_time(
-    rest: Callable[..., Any], name: str, threshold: float, text: str
-) -> None:
+def test_trip_after_its_time(rest, name, threshold, text):
     plant = rest(protection={name: {"threshold": threshold, "delay_s": 0.002}})
     plant.advance(20)  # first seen at tick 1, so 1.9 ms have passed
     assert plant.truth()["trip"] == 0
@@ -42,13 +38,13 @@ def test_trip_after_its_time(
     assert plant.truth()["i"] == 0.0
 
 
-def test_disabled_never_trips(rest: Callable[..., Any]) -> None:
+def test_disabled_never_trips(rest):
     plant = rest(protection={"over_voltage": {"threshold": 0.9, "enabled": False}})
     plant.advance(1000)
     assert plant.truth()["trip"] == 0
 
 
-def test_shorter_than_its_time_does_not_trip(rest: Callable[..., Any]) -> None:
+def test_shorter_than_its_time_does_not_trip(rest):
     plant = rest(protection={"over_frequency": {"threshold": 1.01, "delay_s": 0.002}})
     for _ in range(2):  # twice 1.5 ms
         plant.advance(15, plant.near(omega_u=0.02))
@@ -58,7 +54,7 @@ def test_shorter_than_its_time_does_not_trip(rest: Callable[..., Any]) -> None:
     assert plant.truth()["trip"] == code_of("over-frequency")
 
 
-def test_trip_latches_blocks_and_the_network_goes_on(rest: Callable[..., Any]) -> None:
+def test_trip_latches_blocks_and_the_network_goes_on(rest):
     plant = rest(protection={"over_current": {"threshold": 0.5, "delay_s": 0.0}})
     plant.advance(1)
     v_dc, tick = plant.truth()["v_dc"], int(plant.st[0]["trip_tick"])
@@ -75,7 +71,7 @@ def test_trip_latches_blocks_and_the_network_goes_on(rest: Callable[..., Any]) -
     assert truth["q"] == pytest.approx(abs(v) ** 2 * r["C_f"], abs=1e-6)
 
 
-def test_first_trip_is_kept(rest: Callable[..., Any]) -> None:
+def test_first_trip_is_kept(rest):
     plant = rest(protection={"over_current": {"threshold": 0.5, "delay_s": 0.0}})
     plant.advance(1)
     plant.advance(1, np.array([math.nan, 1.0, 1.0]))
@@ -83,7 +79,7 @@ def test_first_trip_is_kept(rest: Callable[..., Any]) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_command_that_is_no_number(rest: Callable[..., Any], bad: float) -> None:
+def test_command_that_is_no_number(rest, bad):
     plant = rest()
     plant.advance(3)
     plant.advance(1, np.array([0.5, 1.0, bad]))
@@ -111,7 +107,7 @@ OFF = {
 @pytest.mark.parametrize(
     "u", [[0.5, 1.0, 1e12], [0.5, 1e300, 1.0], [-1e9, 1.0, 1.0], [0.5, 1.0, 1e308], [-2, 1, 1]]
 )
-def test_divergence_leaves_finite_values(rest: Callable[..., Any], u: list[float]) -> None:
+def test_divergence_leaves_finite_values(rest, u):
     plant = rest(protection=OFF, sensors={"bandwidth_hz": 1000.0})
     plant.advance(2000, np.array(u))
     assert plant.truth()["trip"] == code_of("diverged")
@@ -120,7 +116,7 @@ def test_divergence_leaves_finite_values(rest: Callable[..., Any], u: list[float
     assert np.isfinite(list(plant.truth().values())).all()
 
 
-def test_a_blocked_plant_outlives_a_grid_beyond_the_model(rest: Callable[..., Any]) -> None:
+def test_a_blocked_plant_outlives_a_grid_beyond_the_model(rest):
     """It keeps its last good state meanwhile; then it settles as one that saw none of it."""
     plant, other = rest(), rest()
     for one in (plant, other):

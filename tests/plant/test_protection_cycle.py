@@ -1,9 +1,6 @@
 """Protection by quantities over one cycle: overload profile and measured frequency."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,7 +42,7 @@ def shown(i: Any, angle: Any = 0.0, size: Any = 1.0, T_s: float = 1e-4, **protec
 
 
 @pytest.mark.parametrize("T_s", [1e-4, 2.5e-5, 1e-3])
-def test_rms_over_a_cycle_of_a_sine_and_a_mean(T_s: float) -> None:
+def test_rms_over_a_cycle_of_a_sine_and_a_mean(T_s):
     t = np.arange(1, round(0.06 / T_s) + 1) * T_s
     i = 0.7 + 0.4 * np.sin(2 * np.pi * 50 * t + 0.5) + 0.2 * np.cos(2 * np.pi * 150 * t)
     rms, *_ = shown(i, T_s=T_s, overload=PROFILE)
@@ -53,7 +50,7 @@ def test_rms_over_a_cycle_of_a_sine_and_a_mean(T_s: float) -> None:
     assert rms[t > 0.0201] == pytest.approx(wanted, abs=1e-9 if T_s >= 1e-4 else 1e-3)
 
 
-def test_the_sums_do_not_drift() -> None:
+def test_the_sums_do_not_drift():
     i = np.full(1_000_000, 3.0)
     i[-CYCLE:] = 0.5
     rms, *_ = shown(i, overload=[{"threshold": 50.0, "delay_s": 0.0}])
@@ -65,9 +62,7 @@ def test_the_sums_do_not_drift() -> None:
     ("step", "factor", "trips"),
     [(0, 1.01, True), (0, 0.99, False), (1, 1.01, True), (1, 0.99, False)],
 )
-def test_the_overload_profile_one_percent_above_and_below(
-    step: int, factor: float, trips: bool
-) -> None:
+def test_the_overload_profile_one_percent_above_and_below(step, factor, trips):
     """From 1 p.u. to i the squared RMS rises in a line: it crosses the threshold after
     (th^2 - 1) / (i^2 - 1) of a cycle."""
     threshold, delay = PROFILE[step]["threshold"], PROFILE[step]["delay_s"]
@@ -86,7 +81,7 @@ def test_the_overload_profile_one_percent_above_and_below(
     assert f"> {threshold:g} p.u. for {delay:g} s at tick" in trip_reason(plant)
 
 
-def test_each_step_of_the_profile_has_its_own_time() -> None:
+def test_each_step_of_the_profile_has_its_own_time():
     short = np.concatenate([np.full(1000, 1.0), np.full(350, 2.5), np.full(8000, 1.5)])
     *_, trip, _ = shown(short, overload=PROFILE)  # 35 ms of 2.5 p.u.
     assert not trip.any()
@@ -96,7 +91,7 @@ def test_each_step_of_the_profile_has_its_own_time() -> None:
 
 
 @pytest.mark.parametrize("omega", [0.94, 1.0, 1.06])
-def test_the_frequency_of_the_voltage(omega: float) -> None:
+def test_the_frequency_of_the_voltage(omega):
     turn = 100 * np.pi * (omega - 1.0) * np.arange(3000) * 1e-4  # in a frame of 50 Hz
     _, found, trip, plant = shown(1.0, turn, frequency="voltage", over_frequency={
         "threshold": 1.05, "delay_s": 0.05}, under_frequency={"threshold": 0.95, "delay_s": 0.05},
@@ -112,7 +107,7 @@ def test_the_frequency_of_the_voltage(omega: float) -> None:
         assert int(plant.st[0]["trip_tick"]) == pytest.approx(502, abs=1)
 
 
-def test_an_offset_of_the_line_and_a_voltage_that_is_gone_are_no_frequency() -> None:
+def test_an_offset_of_the_line_and_a_voltage_that_is_gone_are_no_frequency():
     t = np.arange(3000) * 1e-4
     v = 1.0 + 0.1 * np.exp(-100j * np.pi * t)  # DC in the phases: backwards at 50 Hz
     _, found, *_ = shown(1.0, np.angle(v), np.abs(v), frequency="voltage")
@@ -123,9 +118,7 @@ def test_an_offset_of_the_line_and_a_voltage_that_is_gone_are_no_frequency() -> 
     assert not trip.any()
 
 
-def test_a_command_that_jitters_trips_by_command_and_not_by_voltage(
-    rest: Callable[..., Any],
-) -> None:
+def test_a_command_that_jitters_trips_by_command_and_not_by_voltage(rest):
     tight = {"over_frequency": {"threshold": 1.03, "delay_s": 0.0}}
     for frequency, code in (("command", "over-frequency"), ("voltage", "none")):
         plant = rest(protection={**tight, "frequency": frequency})
@@ -134,7 +127,7 @@ def test_a_command_that_jitters_trips_by_command_and_not_by_voltage(
         assert TRIP_REASONS[int(plant.truth()["trip"])] == code
 
 
-def test_a_sag_through_which_the_profile_lets_the_plant_ride(rest: Callable[..., Any]) -> None:
+def test_a_sag_through_which_the_profile_lets_the_plant_ride(rest):
     """A blip of 3 ms above 2 p.u., which an instantaneous protection does not forgive."""
     at_once = {"over_current": {"threshold": 1.2, "delay_s": 0.0}}
     for protection, code in ((at_once, "over-current"), ({"overload": PROFILE}, "none")):
@@ -145,7 +138,7 @@ def test_a_sag_through_which_the_profile_lets_the_plant_ride(rest: Callable[...,
         assert TRIP_REASONS[int(plant.truth()["trip"])] == code
 
 
-def test_wrong_profiles_are_refused() -> None:
+def test_wrong_profiles_are_refused():
     for overload in ([{"threshold": 0.0, "delay_s": 1.0}], [{"threshold": 2.0}], PROFILE * 3):
         with pytest.raises(ValidationError, match="overload"):
             Plant.model_validate({"protection": {"overload": overload}})

@@ -1,8 +1,6 @@
 """Sensors, noise and A/D."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +10,14 @@ from gfm_plant.noise import gaussians
 from gfm_plant.quantise import quantise
 
 
-def test_ideal_sensors_see_the_truth(rest: Callable[..., Any]) -> None:
+def test_ideal_sensors_see_the_truth(rest):
     plant = rest()
     plant.advance(50, plant.near(omega_u=1e-3, E_u=1e-3))
     y, truth = plant.sample(), plant.truth()
     assert list(y) == [truth[name] for name in ("v_dc", "p", "omega_u", "q", "V")]
 
 
-def test_low_pass_against_the_exact_first_order(rest: Callable[..., Any]) -> None:
+def test_low_pass_against_the_exact_first_order(rest):
     """A step of the DC current makes v_dc a known ramp; the filter lags it exponentially."""
     plant = rest(P=0.0, V=1.0, sensors={"bandwidth_hz": 200.0})
     # A DC current of 0.1 p.u. and no power: v_dc = 1 + a t, apart from the loss in R_f.
@@ -34,7 +32,7 @@ def test_low_pass_against_the_exact_first_order(rest: Callable[..., Any]) -> Non
         assert plant.sample()[0] == pytest.approx(exact, abs=1e-6)
 
 
-def test_low_pass_of_a_step(rest: Callable[..., Any]) -> None:
+def test_low_pass_of_a_step(rest):
     """A constant true value after a jump of the filter's state: a pure exponential."""
     plant = rest(sensors={"bandwidth_hz": 1000.0})
     plant.st["sensed"][0, :] += [0.1, 0.2, -0.3, 0.4]
@@ -45,7 +43,7 @@ def test_low_pass_of_a_step(rest: Callable[..., Any]) -> None:
     assert plant.sample() == pytest.approx(expected, abs=5e-8)
 
 
-def test_gain_and_offset(rest: Callable[..., Any]) -> None:
+def test_gain_and_offset(rest):
     plant = rest(sensors={"gain": {"p": 1.02, "v_dc": 0.99}, "offset": {"p": 0.01, "q": -0.02}})
     truth = plant.truth()
     assert plant.sample() == pytest.approx(
@@ -59,7 +57,7 @@ def test_gain_and_offset(rest: Callable[..., Any]) -> None:
     )
 
 
-def test_quantisation(rest: Callable[..., Any]) -> None:
+def test_quantisation(rest):
     plant = rest(adc={"bits": 8, "range": {"p": [-0.75, 0.75]}})
     ideal = rest()
     lsb = 1.5 / 256
@@ -80,11 +78,11 @@ def test_quantisation(rest: Callable[..., Any]) -> None:
     ("value", "expected"),
     [(-2.0, -1.0), (2.0, 0.75), (0.1, 0.0), (0.13, 0.25), (-0.9, -1.0), (0.99, 0.75)],
 )
-def test_codes(value: float, expected: float) -> None:
+def test_codes(value, expected):
     assert quantise(value, -1.0, 0.75, 0.25) == expected  # 3 bit over [-1, 1]
 
 
-def test_noise_depends_on_seed_tick_and_channel_alone() -> None:
+def test_noise_depends_on_seed_tick_and_channel_alone():
     options = {"noise_std": {"p": 0.01, "q": 0.01}, "seed": 7}
     samples = []
     for ticks in (5, 1000, 5):
@@ -101,7 +99,7 @@ def test_noise_depends_on_seed_tick_and_channel_alone() -> None:
     assert gaussians(8, 5, 0) != gaussians(7, 5, 0)
 
 
-def test_noise_is_white_and_normal() -> None:
+def test_noise_is_white_and_normal():
     n = 20_000
     z = np.array([gaussians(3, tick, 0) for tick in range(n)]).T
     assert z.mean(axis=1) == pytest.approx([0.0, 0.0], abs=4 / math.sqrt(n))

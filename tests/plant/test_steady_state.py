@@ -17,7 +17,7 @@ from gfm_plant.model import f, g
 
 @pytest.mark.parametrize("P", [-1.0, 0.0, 0.5, 1.0])
 @pytest.mark.parametrize(("V", "V_g", "omega_g"), [(1.0, 1.0, 1.0), (1.05, 0.95, 0.98)])
-def test_it_rests(P: float, V: float, V_g: float, omega_g: float) -> None:
+def test_it_rests(P, V, V_g, omega_g):
     par = make_plant(Plant(), 1e-4).par
     x, u = plant_equilibrium(par, P, V, V_g, omega_g)
     assert np.abs(f(x, u, np.array([omega_g, V_g]), par)).max() < 1e-8
@@ -25,7 +25,7 @@ def test_it_rests(P: float, V: float, V_g: float, omega_g: float) -> None:
     assert y[[0, 1, 2, 4]] == pytest.approx([1.0, P, omega_g, V], abs=1e-12)
 
 
-def test_emulator_stays_there() -> None:
+def test_emulator_stays_there():
     plant = make_plant(Plant(), 1e-4)
     x, u = plant_equilibrium(plant.par, 0.5, 1.0)
     plant.start(x, u)
@@ -34,7 +34,7 @@ def test_emulator_stays_there() -> None:
     assert plant.st["x"][0] == pytest.approx(x, abs=1e-12)
 
 
-def test_against_phasors() -> None:
+def test_against_phasors():
     """The bridge voltage behind the filter, by circuit theory."""
     par = make_plant(Plant(), 1e-4).par
     r = par[0]
@@ -47,7 +47,7 @@ def test_against_phasors() -> None:
 
 
 @pytest.mark.parametrize("factor", [1.0, 10.0, 50.0])
-def test_up_to_the_limit_of_the_line(factor: float) -> None:
+def test_up_to_the_limit_of_the_line(factor):
     par = make_plant(Plant(factors={"L_g": factor, "R_g": factor}), 1e-4).par
     R, X = par[0]["R_g"], par[0]["L_g"]
     Z = math.hypot(R, X)
@@ -59,7 +59,7 @@ def test_up_to_the_limit_of_the_line(factor: float) -> None:
         plant_equilibrium(par, 1.01 * most, 1.0)
 
 
-def test_no_voltage() -> None:
+def test_no_voltage():
     par = make_plant(Plant(), 1e-4).par
     with pytest.raises(NoEquilibrium, match="all must be > 0"):
         plant_equilibrium(par, 0.5, 1.0, V_g=0.0)

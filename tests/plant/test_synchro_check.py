@@ -1,7 +1,5 @@
 """The synchro-check of a breaker, against phasors solved by NumPy and the closed form of a slip."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -44,7 +42,7 @@ def bus(plant: Network) -> complex:
 
 
 @pytest.mark.parametrize("slip_hz", [0.5, -0.4])
-def test_it_closes_when_the_angle_has_been_within_for_long_enough(slip_hz: float) -> None:
+def test_it_closes_when_the_angle_has_been_within_for_long_enough(slip_hz):
     """The angle goes from -40 or 40 degrees evenly towards zero."""
     plant, u = island(slip_hz, angle=math.copysign(math.radians(40), -slip_hz))
     first = math.degrees(np.angle(bus(plant)))
@@ -70,9 +68,7 @@ def test_it_closes_when_the_angle_has_been_within_for_long_enough(slip_hz: float
         (0.5, 1.0, (0.1, 1.0 / 50, 5.0)),  # within 5 degrees for 56 ms at a time
     ],
 )
-def test_it_stays_open_when_its_time_is_over(
-    slip_hz: float, E: float, limits: tuple[float, float, float]
-) -> None:
+def test_it_stays_open_when_its_time_is_over(slip_hz, E, limits):
     plant, u = island(slip_hz, E)
     check_synchronism(plant, "tie", *limits, 0.06, 0.5)
     assert until(plant, u, 20000) == 5000
@@ -83,13 +79,13 @@ def test_it_stays_open_when_its_time_is_over(
     assert plant.wiring.check is None
 
 
-def test_it_does_not_close_onto_a_dead_side() -> None:
+def test_it_does_not_close_onto_a_dead_side():
     plant, u = island(0.0, E=0.1)
     check_synchronism(plant, "tie", 2.0, 1.0, 180.0, 0.01, 0.1)
     assert until(plant, u, 2000) == 1000 and plant.now[0]["check"] == TIME_OVER
 
 
-def test_a_breaker_that_is_switched_by_hand_ends_its_check() -> None:
+def test_a_breaker_that_is_switched_by_hand_ends_its_check():
     plant, _ = island(2.0)
     check_synchronism(plant, "tie", 0.1, 0.01, 10.0, 0.05, 5.0)
     line_breaker(plant, "tie", True)
@@ -112,7 +108,7 @@ def test_a_breaker_that_is_switched_by_hand_ends_its_check() -> None:
         ("", {}, "network.grid: not set"),
     ],
 )
-def test_impossible_checks(name: str, more: dict[str, Any], message: str) -> None:
+def test_impossible_checks(name, more, message):
     parts: dict[str, Any] = {"loads": {"r": {"node": "m", "P": 0.4}}, "lines": {"tie": TIE}}
     parts["lines"]["tie"] = {**TIE, "end": "n"}
     plant = make({"a": ({}, "m")}, **parts)
@@ -122,7 +118,7 @@ def test_impossible_checks(name: str, more: dict[str, Any], message: str) -> Non
     assert plant.wiring.check is None
 
 
-def test_the_voltage_of_every_kind_of_node_is_that_of_its_phasors() -> None:
+def test_the_voltage_of_every_kind_of_node_is_that_of_its_phasors():
     """Of nodes with a capacitor, a resistor, branches alone, one that hangs, a dead one."""
     plant = make(
         {"a": ({}, "m"), "b": ({}, "far")},
@@ -180,7 +176,7 @@ def test_the_voltage_of_every_kind_of_node_is_that_of_its_phasors() -> None:
         assert by_w @ w + by_s @ s == pytest.approx(there, abs=1e-9), node
 
 
-def test_the_watch_sees_what_the_rows_say() -> None:
+def test_the_watch_sees_what_the_rows_say():
     """Of a node where branches alone meet, at rest; the grid is at 1."""
     plant = make(
         {"a": ({}, "m"), "b": ({}, "m")},

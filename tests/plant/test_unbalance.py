@@ -1,10 +1,7 @@
 """Unbalanced voltages of the grid: their sequences, and what the network makes of them."""
 
-from __future__ import annotations
-
 import cmath
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,14 +31,14 @@ TURN = cmath.exp(1j * math.pi / 3)
         ((0.5, 0.5, 0.5), 0.5, 0.0),
     ],
 )
-def test_sequences(rest: Callable[..., Any], phases: Any, positive: float, negative: float) -> None:
+def test_sequences(rest, phases, positive, negative):
     plant = rest()
     grid_unbalance(plant.plant, phases)
     found = [abs(complex(v)) for v in plant.now["sequence"][0]]
     assert found == pytest.approx([positive, negative], abs=1e-12)
 
 
-def test_each_sequence_meets_its_own_impedances(rest: Callable[..., Any]) -> None:
+def test_each_sequence_meets_its_own_impedances(rest):
     """After the transients, by phasors: the bridge is a short circuit to the negative sequence."""
     plant = rest(grid=WEAK, protection=OFF, dc_source={"mode": "regulated"})
     plant.advance(7)
@@ -61,7 +58,7 @@ def test_each_sequence_meets_its_own_impedances(rest: Callable[..., Any]) -> Non
     assert np.mean(v) == pytest.approx((E / Z_f + 2 / 3 / Z_g) / Y, abs=1e-6)
 
 
-def test_transient_and_clearing_against_the_equations(rest: Callable[..., Any]) -> None:
+def test_transient_and_clearing_against_the_equations(rest):
     """One phase lost for 10 ms; the grid's angle jumps by 20 degrees meanwhile."""
     plant = rest(grid=WEAK, protection=OFF, dc_source={"mode": "regulated"})
     r, E, x = plant.par[0], plant.u[2], plant.x
@@ -94,7 +91,7 @@ def test_transient_and_clearing_against_the_equations(rest: Callable[..., Any]) 
     assert plant.now["unbalance_left"][0] == 0.0
 
 
-def test_the_dc_link_ripples_at_twice_the_frequency(rest: Callable[..., Any]) -> None:
+def test_the_dc_link_ripples_at_twice_the_frequency(rest):
     plant = rest(grid=WEAK, protection=OFF, dc_source={"mode": "regulated"})
     grid_unbalance(plant.plant, (1.0, 0.7, 1.0))
     plant.advance(20_000)
@@ -106,7 +103,7 @@ def test_the_dc_link_ripples_at_twice_the_frequency(rest: Callable[..., Any]) ->
     assert np.argmax(size) == 20  # 100 Hz in 0.2 s
 
 
-def test_impossible_factors_change_nothing(rest: Callable[..., Any]) -> None:
+def test_impossible_factors_change_nothing(rest):
     plant = rest()
     before = plant.plant.copy()
     with pytest.raises(ValueError, match=r"duration = 0.0: must be > 0"):

@@ -1,10 +1,7 @@
 """Faults of one and two phases, against the equations of three phases and sequence networks."""
 
-from __future__ import annotations
-
 import cmath
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -126,9 +123,7 @@ class AtCapacitor(Phases):
         (0.0, 0.3, "LG", "b"), (0.0, 0.4, "LL", "ab"), (0.0, 0.3, "LLG", "bc"),
     ],
 )  # fmt: skip
-def test_fault_and_clearing_against_three_phases(
-    rest: Callable[..., Any], at: float, R: float, kind: str, which: str
-) -> None:
+def test_fault_and_clearing_against_three_phases(rest, at, R, kind, which):
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
     plant.advance(37)
     t = 37 * 1e-4
@@ -156,9 +151,7 @@ def test_fault_and_clearing_against_three_phases(
     ("kind", "which", "Z_0"),
     [("LG", "a", None), ("LG", "c", 0.5 + 1.1j), ("LL", "bc", None), ("LLG", "ca", 0.02 + 0.3j)],
 )
-def test_steady_state_by_sequence_networks(
-    rest: Callable[..., Any], kind: str, which: str, Z_0: complex | None
-) -> None:
+def test_steady_state_by_sequence_networks(rest, kind, which, Z_0):
     """In series for one phase, in parallel for two: v and i_o by phasors at the place."""
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
     at, R, r = 0.4, 0.05, plant.par[0]
@@ -200,7 +193,7 @@ def test_steady_state_by_sequence_networks(
     assert backwards.conj() == pytest.approx([v_2, i_2], abs=1e-6)
 
 
-def test_the_sources_give_what_the_resistances_take(rest: Callable[..., Any]) -> None:
+def test_the_sources_give_what_the_resistances_take(rest):
     plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
     at, R, Z_0, r = 0.3, 0.04, 0.1 + 0.4j, plant.par[0]
     fault(plant.plant, at, R, kind="LLG", phases="ca", Z_0=Z_0)
@@ -223,7 +216,7 @@ def test_the_sources_give_what_the_resistances_take(rest: Callable[..., Any]) ->
     assert np.ptp(given) > 0.1
 
 
-def test_two_phases_to_an_ideal_ground_are_all_three(rest: Callable[..., Any]) -> None:
+def test_two_phases_to_an_ideal_ground_are_all_three(rest):
     """Bolted and with Z_0 = 0 the third phase is at ground potential too."""
     found = []
     for more in ({"kind": "LLG", "phases": "ab", "Z_0": 0j}, {}):
@@ -239,7 +232,7 @@ def test_two_phases_to_an_ideal_ground_are_all_three(rest: Callable[..., Any]) -
     assert found[0] == pytest.approx(found[1], abs=1e-11)
 
 
-def test_protection_sees_it_and_the_grid_goes_on_feeding_it(rest: Callable[..., Any]) -> None:
+def test_protection_sees_it_and_the_grid_goes_on_feeding_it(rest):
     """The bridge trips; line and filter then ring as the equations with no bridge do."""
     plant = rest(grid=WEAK)
     fault(plant.plant, 0.1, 0.0, kind="LL")
@@ -258,9 +251,7 @@ def test_protection_sees_it_and_the_grid_goes_on_feeding_it(rest: Callable[..., 
     assert np.mean(i_g) == pytest.approx((U - Z_1 * I_1 - 1) / Z_grid, abs=1e-6)
 
 
-def test_a_line_that_changes_takes_the_path_of_the_zero_sequence_with_it(
-    rest: Callable[..., Any],
-) -> None:
+def test_a_line_that_changes_takes_the_path_of_the_zero_sequence_with_it(rest):
     """During the fault, against a plant that had that line and fault at once."""
     plant, other = (rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF) for _ in range(2))
     L, R = (2 * plant.par[0][f"{x}_g"] / plant.par[0][f"{x}_line_n"] for x in "LR")
@@ -288,9 +279,7 @@ def test_a_line_that_changes_takes_the_path_of_the_zero_sequence_with_it(
         ({"kind": "LG", "R": -1.0}, "R = -1.0: must be >= 0 p.u. at position 0.5"),
     ],
 )
-def test_impossible_faults_change_nothing(
-    rest: Callable[..., Any], more: dict[str, Any], message: str
-) -> None:
+def test_impossible_faults_change_nothing(rest, more, message):
     plant = rest()
     before = plant.plant.copy()
     with pytest.raises(ValueError, match=message):
@@ -298,7 +287,7 @@ def test_impossible_faults_change_nothing(
     assert [r.tobytes() for r in plant.plant.memory] == [r.tobytes() for r in before.memory]
 
 
-def test_an_island_needs_a_path_to_ground(rest: Callable[..., Any]) -> None:
+def test_an_island_needs_a_path_to_ground(rest):
     plant = rest(grid={"load_R": 50.0, "load_L": 0.05})
     breaker(plant.plant, closed=False)
     with pytest.raises(ValueError, match="X_0: not set, and no closed line leads from position"):

@@ -1,7 +1,5 @@
 """A program behind a guard: how it ends, what it leaves, what it prints."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -50,12 +48,12 @@ def gone(numbers: list[int]) -> bool:
         (["/no/such"], 2, b"gfmhil: /no/such: cannot be started: No such file or directory\n"),
     ],
 )
-def test_a_guard_ends_as_its_program(command: list[str], code: int, said: bytes) -> None:
+def test_a_guard_ends_as_its_program(command, code, said):
     done = subprocess.run(guarded(command, bounded=True), stdout=subprocess.PIPE, check=False)
     assert (done.returncode, done.stdout) == (code, said)
 
 
-def test_of_much_it_keeps_the_beginning_and_the_end() -> None:
+def test_of_much_it_keeps_the_beginning_and_the_end():
     program = [sys.executable, "-c", "print('first' + 10**7 * '.' + 'last')"]
     said = subprocess.run(guarded(program, bounded=True), stdout=subprocess.PIPE, check=True).stdout
     assert said.startswith(b"first.") and said.endswith(b".last\n")
@@ -64,7 +62,7 @@ def test_of_much_it_keeps_the_beginning_and_the_end() -> None:
 
 
 @pytest.mark.parametrize("how", ["program ends", "parent is killed", "SIGTERM"])
-def test_nothing_is_left_of_a_stubborn_program(how: str) -> None:
+def test_nothing_is_left_of_a_stubborn_program(how):
     script = (
         "import os, subprocess, sys; from gfm_runtime.children import guarded\n"
         f"p = subprocess.Popen(guarded([sys.executable, '-c', {STUBBORN!r}]))\n"
@@ -80,7 +78,7 @@ def test_nothing_is_left_of_a_stubborn_program(how: str) -> None:
         assert gone([*number.values()])
 
 
-def test_a_guard_and_a_program_that_are_stopped_end_now() -> None:
+def test_a_guard_and_a_program_that_are_stopped_end_now():
     command = guarded([sys.executable, "-c", STUBBORN])
     with subprocess.Popen(command, stdout=subprocess.PIPE) as guard:
         assert guard.stdout is not None
@@ -92,7 +90,7 @@ def test_a_guard_and_a_program_that_are_stopped_end_now() -> None:
         assert gone(numbers[1:])
 
 
-def test_a_program_gets_the_signals_of_its_guard() -> None:
+def test_a_program_gets_the_signals_of_its_guard():
     script = (
         "import time\ntry:\n print(1, flush=True); time.sleep(1000)\n"
         "except KeyboardInterrupt:\n print(2)"

@@ -1,10 +1,7 @@
 """The functions of a tick are compiled without numba's runtime."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +33,7 @@ def test_arrays_come_in_and_views_of_them_are_had(decorator):
     assert tick(x) == 1 + 2 + 4 + 5
 
 
-def test_any_change_of_compiled_code_makes_numba_compile_again() -> None:
+def test_any_change_of_compiled_code_makes_numba_compile_again():
     """A compiled function contains its callees, so its cache is as old as the oldest of them."""
     from gfm_hil.engine.plant_ticks import plant_ticks
     from gfm_plant import plant_sample
@@ -63,13 +60,13 @@ assert type(numba.njit(cache=True)(lambda x: x)._cache) is caching.FunctionCache
 
 
 @pytest.mark.processes
-def test_a_program_that_imports_us_keeps_numba_as_it_is(tmp_path: Path) -> None:
+def test_a_program_that_imports_us_keeps_numba_as_it_is(tmp_path):
     (tmp_path / "theirs.py").write_text(_THEIRS)
     done = subprocess.run([sys.executable, "theirs.py"], cwd=tmp_path, capture_output=True)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_path: Path) -> None:
+def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_path):
     index = _Index(str(tmp_path), "tick", "stamp")
     kept = type("Gone", (), {"__module__": __name__})
     globals()["Gone"] = kept
@@ -103,9 +100,7 @@ for n in map(int, sys.argv[1:]):
 
 
 @pytest.mark.processes
-def test_what_two_processes_compiled_for_two_records_does_not_mix_in_a_third(
-    tmp_path: Path,
-) -> None:
+def test_what_two_processes_compiled_for_two_records_does_not_mix_in_a_third(tmp_path):
     (tmp_path / "theirs.py").write_text(_TWO_RECORDS)
     found = [
         subprocess.run(

@@ -1,7 +1,5 @@
 """The controller's tick: states, checks, set-points, changes of law, scheduling."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -45,14 +43,14 @@ def state(c: Controller) -> tuple[int, int, int]:
 # --- states ---
 
 
-def test_names_of_states_and_reasons() -> None:
+def test_names_of_states_and_reasons():
     assert [STATES[k] for k in (INIT, READY, RUNNING, SAFE, STOPPED)] == [
         "INIT", "READY", "RUNNING", "SAFE", "STOPPED",
     ]  # fmt: skip
     assert REASONS[OK] == "" and all(REASONS[1:]) and len(set(REASONS)) == len(REASONS)
 
 
-def test_a_fresh_record_is_init_with_the_tables_ranges() -> None:
+def test_a_fresh_record_is_init_with_the_tables_ranges():
     ctl = make_controller(hold=3)[0]
     assert (ctl["state"], ctl["reason"], ctl["request"], ctl["hold"]) == (INIT, OK, -1, 3)
     np.testing.assert_array_equal(ctl["ref"], [s.default for s in group("ref")])
@@ -61,7 +59,7 @@ def test_a_fresh_record_is_init_with_the_tables_ranges() -> None:
     np.testing.assert_array_equal(ctl["y_high"], [s.high for s in measured])
 
 
-def test_ready_does_nothing_until_started() -> None:
+def test_ready_does_nothing_until_started():
     c, u = ready(), np.array([7.0, 8.0, 9.0])
     assert state(c)[0] == READY
     c.step(REF, u)
@@ -73,14 +71,14 @@ def test_ready_does_nothing_until_started() -> None:
 
 
 @pytest.mark.parametrize("now", [INIT, RUNNING, SAFE, STOPPED])
-def test_only_ready_can_start(now: int) -> None:
+def test_only_ready_can_start(now):
     c = ready()
     c.ctl["state"] = now
     with pytest.raises(LawError, match=f"controller: is {STATES[now]}; only READY can start"):
         c.start(np.zeros(3), np.ones(3))
 
 
-def test_start_is_at_rest() -> None:
+def test_start_is_at_rest():
     c = ready("vsg-2")
     c.states["offset"], c.states["trend"] = 0.3, 0.2
     c.start(np.array([0.1, 0.0, 0.2]), np.array([0.1, 1.0, 1.2]))
@@ -95,7 +93,7 @@ def test_start_is_at_rest() -> None:
 
 @pytest.mark.parametrize("channel", range(NY), ids=Y_NAMES)
 @pytest.mark.parametrize("wrong", ["nan", "inf", "-inf", "above", "below"])
-def test_bad_measurement_leads_to_safe(channel: int, wrong: str) -> None:
+def test_bad_measurement_leads_to_safe(channel, wrong):
     c, u = started(), np.zeros(3)
     c.step(REF, u)
     held, x = u.copy(), c.states["x"].copy()
@@ -108,14 +106,14 @@ def test_bad_measurement_leads_to_safe(channel: int, wrong: str) -> None:
     np.testing.assert_array_equal(c.states["x"], x)
 
 
-def test_values_at_the_ends_of_the_range_are_good() -> None:
+def test_values_at_the_ends_of_the_range_are_good():
     c = started()
     for y in ([s.low for s in SIGNALS[:NY]], [s.high for s in SIGNALS[:NY]]):
         c.step(np.array(y), np.zeros(3))
     assert state(c)[0] == RUNNING
 
 
-def test_safe_is_latched_until_reset() -> None:
+def test_safe_is_latched_until_reset():
     c, u = started(), np.zeros(3)
     c.step(REF, u)
     held = u.copy()
@@ -134,7 +132,7 @@ def test_safe_is_latched_until_reset() -> None:
 
 
 @pytest.mark.parametrize(("row", "field"), [(0, "i_u"), (1, "omega_u"), (2, "E_u")])
-def test_bad_output_leads_to_safe(row: int, field: str) -> None:
+def test_bad_output_leads_to_safe(row, field):
     c, u = started("matching-2"), np.zeros(3)
     c.step(REF, u)
     held = u.copy()
@@ -148,7 +146,7 @@ def test_bad_output_leads_to_safe(row: int, field: str) -> None:
 
 
 @pytest.mark.parametrize("hold", [0, 1, 5])
-def test_so_many_misses_are_held(hold: int) -> None:
+def test_so_many_misses_are_held(hold):
     c = started(hold=hold)
     for k in range(hold):
         missed(c.ctl)
@@ -157,7 +155,7 @@ def test_so_many_misses_are_held(hold: int) -> None:
     assert state(c) == (SAFE, STALE, -1)
 
 
-def test_a_fresh_measurement_starts_the_count_again() -> None:
+def test_a_fresh_measurement_starts_the_count_again():
     c, u = started(hold=2), np.zeros(3)
     for _ in range(10):
         missed(c.ctl)
@@ -169,7 +167,7 @@ def test_a_fresh_measurement_starts_the_count_again() -> None:
 # --- set-points ---
 
 
-def test_set_point_step() -> None:
+def test_set_point_step():
     c = started("droop-1")
     c.set("P_ref", 0.8)
     u = np.zeros(3)
@@ -180,7 +178,7 @@ def test_set_point_step() -> None:
 
 @pytest.mark.parametrize("name", REF_NAMES)
 @pytest.mark.parametrize("away", [0.05, -0.05])
-def test_set_point_ramp(name: str, away: float) -> None:
+def test_set_point_ramp(name, away):
     """Equal steps; the ramp reaches the target exactly, without overshoot."""
     c, u, j = started(), np.zeros(3), REF_NAMES.index(name)
     c.set(name, REF[j] + away, ramp_s=10 * T_S)
@@ -192,7 +190,7 @@ def test_set_point_ramp(name: str, away: float) -> None:
     assert seen[10:] == [seen[10]] * 5 and c.ctl["ref"][0, j] == REF[j] + away
 
 
-def test_a_new_target_during_a_ramp() -> None:
+def test_a_new_target_during_a_ramp():
     c, u = started(), np.zeros(3)
     c.set("P_ref", 1.0, ramp_s=10 * T_S)
     for _ in range(4):
@@ -206,7 +204,7 @@ def test_a_new_target_during_a_ramp() -> None:
     assert c.ctl["ref"][0, 1] == 0.2
 
 
-def test_ramps_of_two_references_do_not_mix() -> None:
+def test_ramps_of_two_references_do_not_mix():
     ctl, c, u = make_controller(), started(), np.zeros(3)
     set_reference(ctl, 1, 0.6, -0.01)
     assert ctl["ref_rate"][0, 1] == 0.01, "a rate has no sign"
@@ -216,12 +214,12 @@ def test_ramps_of_two_references_do_not_mix() -> None:
     assert c.ctl["ref"][0] == pytest.approx([1.0, 0.51, 1.0, 0.0, 1.1])
 
 
-def test_unknown_reference() -> None:
+def test_unknown_reference():
     with pytest.raises(ValueError):
         ready().set("omega_x", 1.0)
 
 
-def test_references_do_not_move_unless_running() -> None:
+def test_references_do_not_move_unless_running():
     c, u = ready(), np.zeros(3)
     c.set("P_ref", 1.0)
     c.step(REF, u)
@@ -239,7 +237,7 @@ def run(c: Controller, ticks: int, u: Vector, y: Vector = REF) -> Vector:
     return out
 
 
-def test_change_of_law_at_the_next_tick() -> None:
+def test_change_of_law_at_the_next_tick():
     c, u = started("mimo-gfm", "vsg-2"), np.zeros(3)
     y = REF + np.array([0.001, 0.01, 0.0, 0.01, 0.001])
     run(c, 200, u, y)
@@ -253,7 +251,7 @@ def test_change_of_law_at_the_next_tick() -> None:
     assert np.abs(u - before).max() < 0.02, "no more than MIMO-GFM's own slope"
 
 
-def test_tour_of_all_laws() -> None:
+def test_tour_of_all_laws():
     """All laws in one run, each for 20 ms: no bump anywhere."""
     names = law_names()
     c, u = started(*names), np.zeros(3)
@@ -267,7 +265,7 @@ def test_tour_of_all_laws() -> None:
     assert state(c)[0] == RUNNING and c.ctl["changes"][0] == len(names)
 
 
-def test_asking_for_the_active_law_changes_nothing() -> None:
+def test_asking_for_the_active_law_changes_nothing():
     us = []
     for again in (True, False):
         c, u = started("vsg-12", "vsg-2"), np.zeros(3)
@@ -280,7 +278,7 @@ def test_asking_for_the_active_law_changes_nothing() -> None:
     np.testing.assert_array_equal(us[0], us[1])
 
 
-def test_a_law_left_and_taken_again_starts_afresh() -> None:
+def test_a_law_left_and_taken_again_starts_afresh():
     c, u = started("vsg-2", "droop-1"), np.zeros(3)
     run(c, 100, u, REF + 0.002)
     for name in ("droop-1", "vsg-2"):
@@ -290,18 +288,18 @@ def test_a_law_left_and_taken_again_starts_afresh() -> None:
     assert c.active == "vsg-2" and c.ctl["changes"][0] == 2
 
 
-def test_unknown_law() -> None:
+def test_unknown_law():
     with pytest.raises(LawError, match=r"law 'vsg-3': not ready; ready are \['vsg-2'\]"):
         ready().select("vsg-3")
 
 
-def test_a_law_that_does_not_discretise_is_refused_before_the_start() -> None:
+def test_a_law_that_does_not_discretise_is_refused_before_the_start():
     with pytest.raises(LawError, match="T_s"):
         Controller([load_law("vsg-2")], 0.0, list(REF))
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_tick_is_the_kernels_step(name: str) -> None:
+def test_a_tick_is_the_kernels_step(name):
     c = Controller([LawSet(name, (LAWS[name],))], T_S, list(REF))
     c.start(np.zeros(c.active_law.order), np.array([0.0, 1.0, 1.0]))
     bare, u = Running.of(discretise(LAWS[name], T_S)), np.zeros(3)
@@ -312,7 +310,7 @@ def test_a_tick_is_the_kernels_step(name: str) -> None:
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_warm_up_changes_nothing(real: type) -> None:
+def test_warm_up_changes_nothing(real):
     c = Controller([load_law("vsg-2"), load_law("dvoc")], T_S, list(REF), real=real)
     before = [a.tobytes() for a in (c.ctl, c.laws, c.states, c.est)]
     warm_up(c)

@@ -1,7 +1,5 @@
 """Tustin's discretisation and the kernel against SciPy, and the checks that reject a law."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -35,7 +33,7 @@ def scipy_bilinear(law: Law, refs: Vector, ys: Vector, T_s: float) -> Vector:
 
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("T_s", [T_S, 1e-3])
-def test_kernel_is_scipys_bilinear(name: str, T_s: float) -> None:
+def test_kernel_is_scipys_bilinear(name, T_s):
     law = LAWS[name]
     refs, ys = wander(400)
     ours = Running.of(discretise(law, T_s)).unlimited().run(refs, ys)
@@ -45,7 +43,7 @@ def test_kernel_is_scipys_bilinear(name: str, T_s: float) -> None:
 
 
 @pytest.mark.parametrize("phi_23", [P(0.7), P(-0.7), I(0.05), PI(0.3, 0.1), O(2.0, 0.01, 0.2)])
-def test_omega_u_loop_of_any_kind(phi_23: Element) -> None:
+def test_omega_u_loop_of_any_kind(phi_23):
     """Column 3 in all rows, with and without direct feed-through."""
     cells = {(0, 0): PI(9.0, 0.2), (0, 2): P(2.0), (1, 1): IF(0.01, 0.1), (1, 2): phi_23}
     law = Law("loop", "", "", {**cells, (2, 2): O(0.1, 0.02, 0.5), (2, 4): I(0.5)})
@@ -56,7 +54,7 @@ def test_omega_u_loop_of_any_kind(phi_23: Element) -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_closed_matrices_are_what_the_kernel_does(name: str) -> None:
+def test_closed_matrices_are_what_the_kernel_does(name):
     law = LAWS[name]
     discrete = discretise(law, T_S)
     A, B_r, B_y, C, D_r, D_y = discrete.closed()
@@ -112,7 +110,7 @@ def error_at(law: Law, T_s: float, t_end: float) -> Vector:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_error_falls_as_T_s_squared(name: str) -> None:
+def test_error_falls_as_T_s_squared(name):
     law = LAWS[name]
     errors = np.array([error_at(law, T_s, 0.08) for T_s in (8e-4, 4e-4, 2e-4)])
     rows = set(realise(law).rows)
@@ -126,7 +124,7 @@ def test_error_falls_as_T_s_squared(name: str) -> None:
 
 
 @pytest.mark.parametrize("T_s", [0.0, -1e-4, math.nan, math.inf])
-def test_sampling_time(T_s: float) -> None:
+def test_sampling_time(T_s):
     with pytest.raises(LawError, match=r"T_s: .* must be > 0"):
         discretise(get_law("vsg-2"), T_s)
 
@@ -153,27 +151,27 @@ def law_of(**cells: Element) -> Law:
         ({"psi_25": I(1.0), "psi_13": PI(1.0, 1.0)}, "psi_13: integrates omega_u"),
     ],
 )
-def test_loops_without_a_stable_solution(cells: dict[str, Element], says: str) -> None:
+def test_loops_without_a_stable_solution(cells, says):
     with pytest.raises(LawError) as caught:
         discretise(law_of(**cells), T_S)
     assert says in str(caught.value)
 
 
-def test_integrators_that_only_look_in_series() -> None:
+def test_integrators_that_only_look_in_series():
     """phi_23's integrator closes its own loop, so omega_u is not an integral."""
     discretise(law_of(phi_22=I(1.0), phi_23=I(1.0), phi_33=I(1.0)), T_S)
     discretise(law_of(phi_22=I(1.0), phi_34=I(1.0), phi_11=I(1.0)), T_S)
     discretise(law_of(phi_22=IF(1.0, 1.0), phi_33=I(1.0)), T_S)
 
 
-def test_slow_fast_and_repeated_poles_pass() -> None:
+def test_slow_fast_and_repeated_poles_pass():
     three = IF(1.0, 10.0) * IF(1.0, 10.0) * IF(1.0, 10.0)
     discretise(law_of(phi_22=three, phi_34=I(1.0) * three), T_S)
     discretise(law_of(phi_22=IF(1.0, 1e-9), phi_34=IF(1.0, 1e6), phi_11=I(1e6)), T_S)
     discretise(law_of(phi_22=I(1.0) * O(1.0, 0.03, 1.0), phi_11=O(1.0, 1.0, 0.001)), T_S)
 
 
-def test_coefficients_that_are_not_finite() -> None:
+def test_coefficients_that_are_not_finite():
     huge = Element((1e300,), ((1.0, 1e-9),))
     with pytest.raises(LawError, match=r"^phi_22: together they give .* not finite"):
         discretise(law_of(phi_22=huge), T_S)
@@ -181,7 +179,7 @@ def test_coefficients_that_are_not_finite() -> None:
         pack_law(discretise(law_of(phi_34=Element((1e45,), (INTEGRATOR,))), T_S), np.float32)
 
 
-def test_too_many_states_for_the_kernel() -> None:
+def test_too_many_states_for_the_kernel():
     cells = {(0, j): IF(1.0, 0.1 + j) * O(1.0, 0.2 + j, 0.5) for j in range(NY)}
     with pytest.raises(LawError, match=r"a: 15 states; the kernel holds 12"):
         pack_law(discretise(Law("a", "", "", cells), T_S))
@@ -201,9 +199,7 @@ where = st.tuples(st.integers(0, NU - 1), st.sampled_from([0, 1, 3, 4]))
 
 @repeatable
 @given(st.dictionaries(where, proper, max_size=4), st.dictionaries(where, proper, max_size=2))
-def test_any_stable_law_is_scipys_bilinear(
-    phi: dict[tuple[int, int], Element], psi: dict[tuple[int, int], Element]
-) -> None:
+def test_any_stable_law_is_scipys_bilinear(phi, psi):
     law = Law("any", "", "", phi, psi)
     refs, ys = wander(60, seed=5)
     discrete = discretise(law, 1e-3)
@@ -214,7 +210,7 @@ def test_any_stable_law_is_scipys_bilinear(
     assert np.max(np.abs(ours - theirs)) < 1e-10 * size
 
 
-def test_anti_windup_is_never_faster_than_a_tick() -> None:
+def test_anti_windup_is_never_faster_than_a_tick():
     """T_t below T_s: the state follows the limit at once, and does not overshoot."""
     law = Law("a", "", "", {(0, 0): PI(1.0, 1.0)}, limits=Limits(T_t=1e-6))
     discrete = discretise(law, T_S)

@@ -43,9 +43,7 @@ FORMULAE: list[tuple[Element, Callable[[complex], complex]]] = [
 
 @pytest.mark.parametrize(("element", "formula"), FORMULAE)
 @pytest.mark.parametrize("s", POINTS)
-def test_value_is_the_formula(
-    element: Element, formula: Callable[[complex], complex], s: complex
-) -> None:
+def test_value_is_the_formula(element, formula, s):
     assert element(s) == pytest.approx(formula(s), rel=1e-13)
 
 
@@ -65,7 +63,7 @@ def test_value_is_the_formula(
         (ZERO, 0, True),
     ],
 )
-def test_order_and_properness(element: Element, order: int, proper: bool) -> None:
+def test_order_and_properness(element, order, proper):
     assert (element.order, element.is_proper) == (order, proper)
 
 
@@ -83,18 +81,18 @@ def test_order_and_properness(element: Element, order: int, proper: bool) -> Non
         (P(0.0) * O(1.0, 1.0, 1.0), ZERO),
     ],
 )
-def test_what_cancels_has_no_states(product: Element, left: Element) -> None:
+def test_what_cancels_has_no_states(product, left):
     assert product.order == left.order == 0
     assert product.num == pytest.approx(left.num, rel=1e-9)
 
 
-def test_near_misses_do_not_cancel() -> None:
+def test_near_misses_do_not_cancel():
     assert (PD(1.0, 0.2) * IF(1.0, 0.2000001)).order == 1
     assert (PI(1e3, 1e3) * D(1.0)).order == 0
     assert PI(1e3, 1e6).order == 1, "a slow integrator is one"
 
 
-def test_factors_at_their_highest_multiplicity() -> None:
+def test_factors_at_their_highest_multiplicity():
     a, b = (1.0, 0.1), (1.0, 0.2)
     assert union([(a, a), (a, b), ()]) == (a, a, b)
     assert over(IF(2.0, 0.1), (a, b, INTEGRATOR)) == pytest.approx((0.0, 2.0, 0.4))
@@ -113,13 +111,13 @@ def test_factors_at_their_highest_multiplicity() -> None:
         (lambda: IF(-1e13, 1.0), "IF: k = -1e+13"),
     ],
 )
-def test_wrong_numbers_are_named(make: Callable[[], Element], named: str) -> None:
+def test_wrong_numbers_are_named(make, named):
     with pytest.raises(LawError) as caught:
         make()
     assert named in str(caught.value)
 
 
-def test_arrays_of_numbers_are_many_elements() -> None:
+def test_arrays_of_numbers_are_many_elements():
     """With the first element's cancellations."""
     k, T = np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, 0.3])
     many = PI(k, T) * PD(2.0, T) * IF(k, 2 * T) + I_gain(k) * P(-1.0)
@@ -146,7 +144,7 @@ any_element = st.one_of(
 
 @repeatable
 @given(any_element, any_element, any_element)
-def test_sums_and_products(a: Element, b: Element, c: Element) -> None:
+def test_sums_and_products(a, b, c):
     for s in (0.7 + 2j, 9j):
         assert (a * b)(s) == pytest.approx(a(s) * b(s), rel=1e-9)
         size = abs(a(s)) + abs(b(s)) + abs(c(s))
@@ -161,7 +159,7 @@ def test_sums_and_products(a: Element, b: Element, c: Element) -> None:
 
 @repeatable
 @given(any_element, any_element)
-def test_orders_never_exceed_their_parts(a: Element, b: Element) -> None:
+def test_orders_never_exceed_their_parts(a, b):
     for c in (a * b, a + b):
         assert c.order <= a.order + b.order
     assert (a * P(1.0)).den == (a + ZERO).den == a.den

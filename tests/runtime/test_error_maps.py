@@ -1,7 +1,5 @@
 """The error maps against closed forms in extended precision."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit
@@ -18,7 +16,7 @@ def sines(vectors, half, out):
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_the_half_angle_is_right_to_one_and_a_half_eps(real: type) -> None:
+def test_the_half_angle_is_right_to_one_and_a_half_eps(real):
     """10^6 pairs of any direction and size against sin and atan2 in extended precision."""
     rng = np.random.default_rng(3)
     angle, size = rng.uniform(-np.pi, np.pi, (2, 10**6)), 2.0 ** rng.uniform(-14, 14, (2, 10**6))
@@ -43,13 +41,13 @@ def test_the_half_angle_is_right_to_one_and_a_half_eps(real: type) -> None:
         (1e-9, 1e-9, 45),
     ],
 )
-def test_axes_and_the_vector_without_length(x: float, y: float, degrees: float) -> None:
+def test_axes_and_the_vector_without_length(x, y, degrees):
     out = np.empty(1)
     sines(np.array([[x, y, 1.0, 0.0]], float), 0.5, out)
     assert out[0] == pytest.approx(np.sin(np.radians(degrees) / 2), abs=1e-15)
 
 
-def test_hybrid_angle_is_the_angle_across_the_line() -> None:
+def test_hybrid_angle_is_the_angle_across_the_line():
     """A voltage V behind R + jX: the current conj((p + jq)/V) drops V to V_g e^(-j delta)."""
     R, X, V, V_ref = 0.05, 0.3, 1.05, 1.0
     r, y = np.array([1.0, 0.5, 1.0, 0.1, V_ref]), np.array([1.0, -0.7, 1.0, 0.4, V])

@@ -32,7 +32,7 @@ texts = st.recursive(
 
 @repeatable
 @given(texts)
-def test_as_python_does_it(text: str) -> None:
+def test_as_python_does_it(text):
     """As Python computes with floats: integers of a law file are floats too."""
     try:
         expected = eval(
@@ -61,7 +61,7 @@ def test_as_python_does_it(text: str) -> None:
         (0.25, 0.25),
     ],
 )
-def test_values(text: str | float, value: float) -> None:
+def test_values(text, value):
     assert evaluate("k", text, NUMBERS) == pytest.approx(value)
 
 
@@ -102,7 +102,7 @@ def test_values(text: str | float, value: float) -> None:
         (math.inf, "gives inf, not a finite number"),
     ],
 )
-def test_anything_else_is_refused(text: str | float, why: str) -> None:
+def test_anything_else_is_refused(text, why):
     with pytest.raises(LawError) as caught:
         evaluate("phi_22.k", text, NUMBERS)
     assert caught.value.where == "phi_22.k"
@@ -111,6 +111,6 @@ def test_anything_else_is_refused(text: str | float, why: str) -> None:
 
 @repeatable
 @given(st.text(max_size=20))
-def test_any_text_gives_a_number_or_a_law_error(text: str) -> None:
+def test_any_text_gives_a_number_or_a_law_error(text):
     with contextlib.suppress(LawError):
         assert math.isfinite(evaluate("k", text, NUMBERS))

@@ -1,12 +1,9 @@
 """Firmware without a compiler: the text, the golden rows, the report, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -61,7 +58,7 @@ def columns(rows: Any, real: str, *prefixes: str) -> list[Any]:
         if (name, real) != ("vsg-2", "float64")
     ],
 )
-def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
+def test_golden_rows_are_what_the_controller_does(name, real):
     """Rows against ``control``, the tick of the bench: u, states, refusals, changes."""
     law = (LAWS | STAGED)[name]
     modules = make_modules({name: law}, T_S, real)
@@ -111,7 +108,7 @@ def test_golden_rows_are_what_the_controller_does(name: str, real: str) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("real", REALS)
-def test_golden_rows_reach_all_paths(real: str) -> None:
+def test_golden_rows_reach_all_paths(real):
     modules = make_modules(of("mimo-gfm", "vsg-1"), T_S, real)
     rows = golden(modules, 10_080)
     refs, ys, us, offsets = columns(rows, real, "ref", "y", "u", "offset")
@@ -137,7 +134,7 @@ def test_golden_rows_reach_all_paths(real: str) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", [n for n in STAGED if n != "no stage"])
-def test_golden_rows_reach_all_paths_of_a_stage(name: str) -> None:
+def test_golden_rows_reach_all_paths_of_a_stage(name):
     real = "float32"
     module = make_modules(of(name), T_S, real)[0]
     stage = module.law.inner if module.law else None
@@ -176,7 +173,7 @@ def test_golden_rows_reach_all_paths_of_a_stage(name: str) -> None:
 
 
 @pytest.mark.full
-def test_golden_rows_of_a_law_do_not_depend_on_their_number() -> None:
+def test_golden_rows_of_a_law_do_not_depend_on_their_number():
     modules = make_modules(of("dvoc"), T_S, "float32")
     few, many = golden(modules, SHIPPED), golden(modules, 2 * SHIPPED)
     np.testing.assert_array_equal(few.words, many.words[:SHIPPED])
@@ -187,7 +184,7 @@ def test_golden_rows_of_a_law_do_not_depend_on_their_number() -> None:
 
 @repeatable
 @given(st.floats(allow_nan=False, allow_infinity=False))
-def test_a_literal_is_its_number_to_the_bit(value: float) -> None:
+def test_a_literal_is_its_number_to_the_bit(value):
     for real in (np.float64, np.float32):
         with np.errstate(over="ignore"):
             rounded = real(value)
@@ -201,7 +198,7 @@ def test_a_literal_is_its_number_to_the_bit(value: float) -> None:
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
-def test_the_code_calls_and_keeps_nothing_of_its_own(laws: Any, real: str, style: Any) -> None:
+def test_the_code_calls_and_keeps_nothing_of_its_own(laws, real, style):
     """No libm but sqrt and fabs, no malloc, no variable outside of a function."""
     files = export(of(*laws), T_S, real, style)
     end = "f" if real == "float32" else ""
@@ -220,7 +217,7 @@ def test_the_code_calls_and_keeps_nothing_of_its_own(laws: Any, real: str, style
         assert all(n.endswith("f") == (real == "float32") for n in numbers)
 
 
-def test_the_header_is_the_signal_table() -> None:
+def test_the_header_is_the_signal_table():
     text = export(of("vsg-1"), T_S, "float32", "unrolled")["gfm_vsg_1.h"]
     for letter, vector in (("REF", "ref"), ("Y", "y"), ("U", "u")):
         found = re.findall(rf"^    GFM_VSG_1_{letter}_(\w+),", text, re.MULTILINE)
@@ -231,11 +228,11 @@ def test_the_header_is_the_signal_table() -> None:
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_the_same_law_gives_the_same_bytes(style: Any) -> None:
+def test_the_same_law_gives_the_same_bytes(style):
     assert export(of(*SOME), T_S, "float32", style) == export(of(*SOME), T_S, "float32", style)
 
 
-def test_a_set_point_of_minus_zero_keeps_its_zeros() -> None:
+def test_a_set_point_of_minus_zero_keeps_its_zeros():
     """Then a row's sum may be -0, and a term of +0 would make it +0."""
     law = replace(LAWS["droop-1"], u_0=(-0.0, 1.0, 1.0))
     text = export({"x": law}, T_S, "float64", "unrolled")["gfm_x.c"]
@@ -243,7 +240,7 @@ def test_a_set_point_of_minus_zero_keeps_its_zeros() -> None:
     assert row is not None and row[1].count("->") == 1 + 1 + 2 * NY + NY
 
 
-def test_a_remark_cannot_end_its_comment() -> None:
+def test_a_remark_cannot_end_its_comment():
     assert plain("a */ b /* c\n d ??/ é\\") == "a * / b / * c d ? ?/ e"
     law = replace(LAWS["vsg-1"], title="*/ int x; /*", source="line\\\nline")
     text = export({"x": law}, T_S, "float32", "unrolled")["gfm_x.h"]
@@ -276,13 +273,13 @@ int g(void);
         (False, False, False, "d"),
     ],
 )  # fmt: skip
-def test_a_choice_is_made(one: bool, two: bool, three: bool, calls: str) -> None:
+def test_a_choice_is_made(one, two, three, calls):
     made = chosen(CHOICE, {"one": one, "two": two, "three": three})
     body = "".join(f"    {name}();\n" for name in calls)
     assert made == f"int f(void)\n{{\n{body}}}\n" + "int g(void);\n" * two
 
 
-def test_the_header_of_a_stage_is_the_signal_table() -> None:
+def test_the_header_of_a_stage_is_the_signal_table():
     text = export(of("vsg-2 cascaded", "no stage"), T_S, "float32", "unrolled")["gfm_no_stage.h"]
     for letter, rows in (("Y", carried_rows("y", True)), ("U", command_rows(True))):
         found = re.findall(rf"^    GFM_NO_STAGE_{letter}_(\w+),", text, re.MULTILINE)
@@ -293,7 +290,7 @@ def test_the_header_of_a_stage_is_the_signal_table() -> None:
     assert "k_v = 1.0" in text and "I_thr" not in text, "only what acts"
 
 
-def test_the_stage_is_that_of_the_converters_frequency() -> None:
+def test_the_stage_is_that_of_the_converters_frequency():
     at_50, at_60 = (
         make_modules(of("virtual-stator d"), T_S, "float64", 2 * math.pi * f)[0].record
         for f in (50.0, 60.0)
@@ -307,7 +304,7 @@ def test_the_stage_is_that_of_the_converters_frequency() -> None:
 
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
-def test_the_report_gives_the_records_back(laws: Any, real: str, tmp_path: Path) -> None:
+def test_the_report_gives_the_records_back(laws, real, tmp_path):
     files = export(of(*laws), T_S, real, "records")
     (tmp_path / "report.json").write_text(files["report.json"], encoding="utf-8")
     found = read_report(tmp_path)
@@ -319,7 +316,7 @@ def test_the_report_gives_the_records_back(laws: Any, real: str, tmp_path: Path)
             assert module.record[field].tobytes() == record[field].tobytes()
 
 
-def test_the_report_counts_the_operations_as_by_hand() -> None:
+def test_the_report_counts_the_operations_as_by_hand():
     """matching-2: i_u = P_ref, omega_u = 1 + m v, E_u = V_ref + k v with v = v_dc - V_dcref."""
     text = export(of("matching-2"), T_S, "float32", "unrolled")["report.json"]
     found = json.loads(text)["laws"][0]
@@ -333,7 +330,7 @@ def test_the_report_counts_the_operations_as_by_hand() -> None:
     assert found["bytes"]["state"] == 4 * (1 + 3 + 3 + 3)
 
 
-def test_the_report_counts_the_operations_of_a_stage_as_by_hand() -> None:
+def test_the_report_counts_the_operations_of_a_stage_as_by_hand():
     """What a virtual stator adds; in brackets its equations in ``gfm_runtime.inner``."""
     counts = []
     for stage in (None, VirtualStator()):
@@ -358,14 +355,14 @@ def test_the_report_counts_the_operations_of_a_stage_as_by_hand() -> None:
 # --- refusals ---
 
 
-def test_two_laws_with_one_name_in_c_are_refused() -> None:
+def test_two_laws_with_one_name_in_c_are_refused():
     with pytest.raises(LawError, match=r"'VSG 1'.*'vsg-1' has the same name in C"):
         make_modules({"vsg-1": LAWS["vsg-1"], "VSG 1": LAWS["vsg-1"]}, T_S, "float32")
     with pytest.raises(LawError, match="no letter or digit"):
         make_modules({"Φ": LAWS["vsg-1"]}, T_S, "float32")
 
 
-def test_limits_that_are_not_finite_are_refused() -> None:
+def test_limits_that_are_not_finite_are_refused():
     endless = LAWS["vsg-1"].limits.model_copy(update={"i_u": (-5.0, np.inf)})
     with pytest.raises(LawError, match=r"'x'.*high must be finite"):
         make_modules({"x": replace(LAWS["vsg-1"], limits=endless)}, T_S, "float32")
@@ -379,9 +376,7 @@ def test_limits_that_are_not_finite_are_refused() -> None:
      ("A", "nan", "record.A: must be 144 hexadecimal"), ("loop", "inf", "loop must be finite"),
      ("decay", "0x1p+9999", "decay: must be 1 hexadecimal number")],
 )  # fmt: skip
-def test_a_record_that_the_kernel_cannot_hold_is_refused(
-    key: str, value: Any, why: str, tmp_path: Path
-) -> None:
+def test_a_record_that_the_kernel_cannot_hold_is_refused(key, value, why, tmp_path):
     whole = json.loads(export(of("vsg-2 cascaded"), T_S, "float32", "unrolled")["report.json"])
     whole["laws"][0]["record"][key] = value
     (tmp_path / "report.json").write_text(json.dumps(whole), encoding="utf-8")
@@ -404,9 +399,7 @@ def test_a_record_that_the_kernel_cannot_hold_is_refused(
         ("[]", "is not as gfmhil firmware export writes it"),
     ],
 )
-def test_a_folder_that_is_none_is_refused(
-    text: str | None, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_is_none_is_refused(text, why, tmp_path, capsys):
     if text is not None:
         (tmp_path / "report.json").write_text(text, encoding="utf-8")
     assert main(["firmware", "check", str(tmp_path)]) == 2
@@ -420,13 +413,7 @@ def test_a_folder_that_is_none_is_refused(
         ("m7", "qemu-system-arm"), ("rv64", "qemu-system-misc"),
     ],
 )  # fmt: skip
-def test_a_missing_toolchain_is_named(
-    target: str,
-    package: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_missing_toolchain_is_named(target, package, tmp_path, monkeypatch, capsys):
     assert main(["firmware", "export", "droop-1", "-o", str(tmp_path)]) == 0
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "check", str(tmp_path), "--target", target]) == 2
@@ -434,18 +421,14 @@ def test_a_missing_toolchain_is_named(
     assert "apt-get install" in said and package in said and said.count("\n") == 1
 
 
-def test_what_an_earlier_export_left_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_an_earlier_export_left_is_said(tmp_path, capsys):
     for law, left in (("vsg-1", ""), ("droop-1", "gfm_vsg_1.c, gfm_vsg_1.h of an earlier export")):
         assert main(["firmware", "export", law, "-o", str(tmp_path)]) == 0
         said = capsys.readouterr().err
         assert left in said and bool(left) == bool(said)
 
 
-def test_the_command_writes_what_the_function_gives(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_what_the_function_gives(tmp_path, capsys):
     arguments = [
         "firmware",
         "export",
@@ -469,7 +452,7 @@ def test_the_command_writes_what_the_function_gives(
     assert [[int(w, 16) for w in line.split(",")] for line in lines[1:]] == rows.words.tolist()
 
 
-def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
+def test_the_command_exports_an_inner_stage(tmp_path):
     command = ["firmware", "export", "vsg-2", "droop-1", "--inner", "cascaded", "--f_n", "60"]
     assert main([*command, "-o", str(tmp_path)]) == 0
     laws = {name: load_law(name, "cascaded").laws[0] for name in ("vsg-2", "droop-1")}
@@ -477,9 +460,7 @@ def test_the_command_exports_an_inner_stage(tmp_path: Path) -> None:
         assert (tmp_path / name).read_text(encoding="utf-8") == text
 
 
-def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(tmp_path, capsys):
     assert main(["firmware", "export", "all", "--real", "fixed", "-o", str(tmp_path)]) == 0
     said = capsys.readouterr()
     assert said.err == (
@@ -490,7 +471,7 @@ def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])
-def test_the_third_output_of_a_stage_is_e_d(real: str) -> None:
+def test_the_third_output_of_a_stage_is_e_d(real):
     """It is a component, which can be negative."""
     made = make_modules({"x": load_law("vsg-2", "cascaded").laws[0]}, T_S, real)
     header = sources(made, T_S, "unrolled")["gfm_x.h"]
@@ -501,7 +482,7 @@ def test_the_third_output_of_a_stage_is_e_d(real: str) -> None:
     assert (of < 0).any()
 
 
-def test_what_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_command_refuses(tmp_path, capsys):
     for arguments, why in (
         (["export", "all", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
         (["golden", "vsg-1", "--ticks", "0"], "--ticks 0: must lie in [1, 1000000]"),

@@ -1,7 +1,5 @@
 """Calibration files of firmware: what nm, another reader of DWARF and an A2L parser say of them."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -93,9 +91,7 @@ def read_again(a2l: Path, elf: Path) -> str:
 
 @SETTINGS
 @pytest.mark.compilers
-def test_a_record_in_ram_is_calibrated_where_the_symbols_are(
-    tmp_path: Path, compiler: str, flags: tuple[str, ...]
-) -> None:
+def test_a_record_in_ram_is_calibrated_where_the_symbols_are(tmp_path, compiler, flags):
     elf = built(tmp_path, compiler, flags, RECORDS, "records")
     a2l = tmp_path / "program.a2l"
     assert main(["firmware", "a2l", str(elf), "-o", str(a2l)]) == 0
@@ -126,9 +122,7 @@ def test_a_record_in_ram_is_calibrated_where_the_symbols_are(
 
 @SETTINGS
 @pytest.mark.compilers
-def test_of_constants_in_the_code_only_variables_are_measured(
-    tmp_path: Path, compiler: str, flags: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_constants_in_the_code_only_variables_are_measured(tmp_path, compiler, flags, capsys):
     elf = built(tmp_path, compiler, flags, UNROLLED, "unrolled")
     a2l = tmp_path / "program.a2l"
     assert main(["firmware", "a2l", str(elf), "-o", str(a2l)]) == 0
@@ -141,7 +135,7 @@ def test_of_constants_in_the_code_only_variables_are_measured(
 
 
 @pytest.mark.compilers
-def test_what_has_no_addresses_or_no_law_is_refused(tmp_path: Path) -> None:
+def test_what_has_no_addresses_or_no_law_is_refused(tmp_path):
     (tmp_path / "main.c").write_text("static int n; int main(void) { return n; }")
     assert cc(tmp_path, "-g", "-c", "main.c").returncode == 0
     with pytest.raises(LawError, match=r"main\.o: is not linked"):
@@ -154,7 +148,7 @@ def test_what_has_no_addresses_or_no_law_is_refused(tmp_path: Path) -> None:
         elf_entries(tmp_path / "stripped")
 
 
-def test_what_is_no_elf_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_elf_file_is_refused(tmp_path, capsys):
     file = tmp_path / "law.elf"
     for content in (b"", b"not one", b"\x7fELF" + bytes(100)):
         file.write_bytes(content)
@@ -163,15 +157,13 @@ def test_what_is_no_elf_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["firmware", "a2l", str(tmp_path / "none"), "-o", "x.a2l"]) == 2
 
 
-def test_without_pyelftools_the_command_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_pyelftools_the_command_names_the_extra(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["firmware", "a2l", str(tmp_path / "x.elf"), "-o", str(tmp_path / "x.a2l")]) == 2
     assert "needs pyelftools: pip install 'gfmhil[calibration]'" in capsys.readouterr().err
 
 
-def test_text_of_any_entry_is_read_by_a_parser(tmp_path: Path) -> None:
+def test_text_of_any_entry_is_read_by_a_parser(tmp_path):
     entries = [
         Entry("a.b", 'has "quotes", a \\ and a ü', "FLOAT64_IEEE", 0x10, "p.u. (Z_b)", 0.0, 0.1),
         Entry("c[1]", "", "UBYTE", 0xFFFFFFFF, words=((0, ""), (3, "three"))),
@@ -187,7 +179,7 @@ def test_text_of_any_entry_is_read_by_a_parser(tmp_path: Path) -> None:
         a2l_text("x", "", [Entry("x", "", "UBYTE", 2**32)])
 
 
-def test_a_damaged_file_that_points_beyond_any_file_is_refused(tmp_path: Path) -> None:
+def test_a_damaged_file_that_points_beyond_any_file_is_refused(tmp_path):
     kind, where = b"\x7fELF\x02\x01\x01" + bytes(9), 64
     head = struct.pack("<HHIQQQIHHHHHH", 2, 62, 1, 0, 0, where, 0, 64, 0, 0, 64, 3, 2)
     sections = [(0, 0, 0, 0), (1, 1, 300, 9), (0, 3, 2**62, 20)]  # name, type, offset, size
@@ -199,7 +191,7 @@ def test_a_damaged_file_that_points_beyond_any_file_is_refused(tmp_path: Path) -
         elf_entries(file)
 
 
-def test_a_pipe_is_no_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pipe_is_no_program(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe")
     words = ["firmware", "a2l", str(tmp_path / "pipe"), "-o", str(tmp_path / "x.a2l")]
     assert main(words) == 2

@@ -1,7 +1,5 @@
 """Firmware compiled: every bit of every law on this machine and on processors in QEMU."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import subprocess
@@ -77,9 +75,7 @@ def differing(folder: Path, target: str, flags: str, of: Any = LAWS) -> int:
         ("clang", "unrolled", "-O2"),
     ],
 )
-def test_every_law_has_the_kernels_bits(
-    folders: Any, real: str, target: str, style: str, flags: str
-) -> None:
+def test_every_law_has_the_kernels_bits(folders, real, target, style, flags):
     assert differing(folders[real, style], target, flags) == 0
 
 
@@ -90,9 +86,7 @@ def test_every_law_has_the_kernels_bits(
         ("clang", "float64", "unrolled", "-O2"),
     ],
 )  # fmt: skip
-def test_every_stage_has_the_kernels_bits(
-    staged: Any, real: str, target: str, style: str, flags: str
-) -> None:
+def test_every_stage_has_the_kernels_bits(staged, real, target, style, flags):
     assert differing(staged[real, style], target, flags, STAGED) == 0
 
 
@@ -103,9 +97,7 @@ def test_every_stage_has_the_kernels_bits(
         pytest.param("host", "float64", "-O3 -march=haswell", marks=FUSES),
     ],
 )
-def test_fused_multiply_add_is_found(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], target: str, real: str, flags: str
-) -> None:
+def test_fused_multiply_add_is_found(tmp_path, capsys, target, real, flags):
     """The negative control: with it the bits differ, and the command says so by its exit code."""
     folder = str(exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle"))
     command = ["firmware", "check", folder, "--target", target]
@@ -114,7 +106,7 @@ def test_fused_multiply_add_is_found(
     assert "look for a fused multiply-add" in capsys.readouterr().err
 
 
-def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path):
     folder = exported(tmp_path, "float32", "unrolled", "vsg-1")
     source = folder / "gfm_vsg_1.c"
     text = source.read_text(encoding="utf-8")
@@ -127,7 +119,7 @@ def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_a_change_of_gains_has_the_kernels_bits(tmp_path: Path, style: Any) -> None:
+def test_a_change_of_gains_has_the_kernels_bits(tmp_path, style):
     laws = {"vsg-2": get_law("vsg-2"), "softer": get_law("vsg-2", D_p=0.02)}
     for name, text in export(laws, T_S, "float32", style).items():
         (tmp_path / name).write_text(text, encoding="utf-8")
@@ -137,16 +129,14 @@ def test_a_change_of_gains_has_the_kernels_bits(tmp_path: Path, style: Any) -> N
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("real", REALS)
-def test_the_code_compiles_without_a_warning(
-    folders: Any, staged: Any, real: str, style: str, compiler: str
-) -> None:
+def test_the_code_compiles_without_a_warning(folders, staged, real, style, compiler):
     for folder in (folders[real, style], staged[real, style]):
         sources = sorted(p.name for p in folder.glob("*.c"))
         done = cc(folder, *STRICT, "-fsyntax-only", *sources, compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path: Path) -> None:
+def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path):
     """By cppcheck's addon; and the page names no rule that is not broken."""
     page = (PAGES / "protection.md").read_text(encoding="utf-8")
     (macros,) = re.findall(r"-DFLT_.*?-D__GNUC__=12", page, re.DOTALL)
@@ -187,9 +177,7 @@ def test_no_rule_of_misra_is_broken_but_those_of_the_page(tmp_path: Path) -> Non
     [(style, laws) for style in STYLES for laws in (LAWS, STAGED)],
     ids=[f"{style}-{laws}" for style in STYLES for laws in ("plain", "staged")],
 )
-def test_sanitizers_find_nothing_and_the_self_test_passes(
-    folders: Any, staged: Any, style: str, laws: Any, tmp_path: Path
-) -> None:
+def test_sanitizers_find_nothing_and_the_self_test_passes(folders, staged, style, laws, tmp_path):
     folder = (folders if laws is LAWS else staged)["float32", style]
     program = str(tmp_path / "selftest")
     done = cc(
@@ -205,7 +193,7 @@ def test_sanitizers_find_nothing_and_the_self_test_passes(
 
 
 @pytest.mark.parametrize("real", REALS)
-def test_no_symbol_of_libm_but_sqrt(folders: Any, staged: Any, real: str, tmp_path: Path) -> None:
+def test_no_symbol_of_libm_but_sqrt(folders, staged, real, tmp_path):
     folder = folders[real, "unrolled"]
     sources = [str(folder / f"gfm_{law}.c") for law in ("vsg_1", "psc_dc", "dvoc", "hybrid_angle")]
     sources += [str(staged[real, "unrolled"] / "gfm_vsg_2_cascaded.c")]
@@ -227,12 +215,12 @@ def test_no_symbol_of_libm_but_sqrt(folders: Any, staged: Any, real: str, tmp_pa
     ("flag", "why"),
     [("-ffast-math", "-ffast-math changes"), ("-mfpmath=387", "rounded to their own type")],
 )
-def test_what_would_change_bits_does_not_compile(folders: Any, flag: str, why: str) -> None:
+def test_what_would_change_bits_does_not_compile(folders, flag, why):
     done = cc(folders["float32", "unrolled"], "-std=c99", flag, "-fsyntax-only", "gfm_vsg_1.c")
     assert done.returncode != 0 and why in done.stderr
 
 
-def test_the_pages_examples_compile(tmp_path: Path) -> None:
+def test_the_pages_examples_compile(tmp_path):
     page = (PAGES / "firmware.md").read_text(encoding="utf-8")
     plain, in_integers, with_stage = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     exported(tmp_path, FIXED, "unrolled", "vsg-1")
@@ -248,7 +236,7 @@ def test_the_pages_examples_compile(tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_cmake_builds_a_folder(folders: Any, tmp_path: Path) -> None:
+def test_cmake_builds_a_folder(folders, tmp_path):
     folder = folders["float64", "records"]
     for arguments in (["-S", str(folder), "-B", "build"], ["--build", "build"]):
         done = cc(tmp_path, *arguments, compiler="cmake")
@@ -293,7 +281,7 @@ def library(folders: Any, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CD
     return ctypes.CDLL(str(at))
 
 
-def test_two_instances_do_not_see_each_other(library: ctypes.CDLL) -> None:
+def test_two_instances_do_not_see_each_other(library):
     """Interleaved, each gives what the kernel gives alone."""
     record = make_modules({"vsg-1": LAWS["vsg-1"]}, T_S, "float64")[0].record
     states = np.zeros(2, state_dtype())
@@ -308,7 +296,7 @@ def test_two_instances_do_not_see_each_other(library: ctypes.CDLL) -> None:
             np.testing.assert_array_equal(u, expected)
 
 
-def test_the_safe_state_holds_until_a_reset(library: ctypes.CDLL) -> None:
+def test_the_safe_state_holds_until_a_reset(library):
     vsg, u, good = Instance(library), np.zeros(3), np.zeros(3)
     assert vsg.step(REF, REF, good) == OK
     u[:] = good
@@ -324,14 +312,14 @@ def test_the_safe_state_holds_until_a_reset(library: ctypes.CDLL) -> None:
     np.testing.assert_allclose(u, good, rtol=0, atol=1e-14)
 
 
-def test_a_state_that_is_not_finite_is_found(library: ctypes.CDLL) -> None:
+def test_a_state_that_is_not_finite_is_found(library):
     vsg, u = Instance(library), np.array([7.0, 8.0, 9.0])
     vsg.x[0] = np.nan
     assert vsg.step(REF, REF, u) == BAD_U
     assert u.tolist() == [7.0, 8.0, 9.0]
 
 
-def test_the_way_out_of_a_bad_u_leads_to_the_last_good_u(library: ctypes.CDLL) -> None:
+def test_the_way_out_of_a_bad_u_leads_to_the_last_good_u(library):
     """A NaN in the state is neither in u nor in the trend that the way out begins with."""
     vsg, u, zero = Instance(library), np.zeros(3), np.zeros(3)
     assert vsg.step(REF, REF, u) == OK
@@ -346,7 +334,7 @@ def test_the_way_out_of_a_bad_u_leads_to_the_last_good_u(library: ctypes.CDLL) -
     np.testing.assert_allclose(u, good, rtol=0, atol=1e-14)
 
 
-def test_settle_and_switch_refuse_what_is_not_finite(library: ctypes.CDLL) -> None:
+def test_settle_and_switch_refuse_what_is_not_finite(library):
     vsg, u, bump = Instance(library), np.zeros(3), np.zeros(1)
     assert vsg.step(REF, REF, u) == OK
     before, zero = vsg._memory.copy(), np.zeros(3)
@@ -360,7 +348,7 @@ def test_settle_and_switch_refuse_what_is_not_finite(library: ctypes.CDLL) -> No
 
 
 @pytest.mark.parametrize("laws", [LAWS, STAGED], ids=["plain", "staged"])
-def test_golden_rows_reach_a_bad_u_and_the_way_out(laws: Any) -> None:
+def test_golden_rows_reach_a_bad_u_and_the_way_out(laws):
     made = golden(make_modules(dict(list(laws.items())[:3]), T_S, "float64"), 210)
     at = {name: made.columns.index(name) for name in made.columns}
     result, op = made.words[:, at["result"]], made.words[:, at["op"]]

@@ -3,8 +3,6 @@
 The layout below is the interface's (natural alignment), not read from our header.
 """
 
-from __future__ import annotations
-
 import ctypes as c
 import os
 import shutil
@@ -123,7 +121,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     [("vsg-2", "none"), ("hybrid-angle", "none"), ("vsg-2", "cascaded"),
      ("mimo-gfm", "virtual-stator"), ("dvoc", "threshold-impedance")],
 )  # fmt: skip
-def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: str) -> None:
+def test_the_model_has_the_kernels_bits(built, law, inner, real):
     """Two instances in turn over 1,000 ticks of golden inputs, limits included."""
     stages = inner != "none"
     u = np.array([0.5, 1.0, 1.0, 0.05][: 3 + stages], real).astype(float)
@@ -149,7 +147,7 @@ def test_the_model_has_the_kernels_bits(built: Any, law: str, inner: str, real: 
     reason="no mingw or wine; they take half a gigabyte, so CI goes without",
 )
 @pytest.mark.parametrize("real", ["float32", "float64"])
-def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_path: Path) -> None:
+def test_the_model_has_the_same_bits_under_windows(built, real, tmp_path):
     folder, u = built("vsg-2", "cascaded", real).parent, [0.5, 1.0, 1.0, 0.05, 0.0]
     refs, ys = accepted(3, TICKS, real, True)
     ticks = np.hstack([refs, ys])
@@ -180,7 +178,7 @@ def test_the_model_has_the_same_bits_under_windows(built: Any, real: str, tmp_pa
 
 
 @pytest.mark.parametrize("inner", ["none", "cascaded"])
-def test_the_model_says_what_it_is(built: Any, inner: str) -> None:
+def test_the_model_says_what_it_is(built, inner):
     info = Model(built("vsg-2", inner, "float64")).info
     assert bytes(info.DLLInterfaceVersion) == bytes([1, 1, 0, 0])
     assert (info.ModelName, info.EMT_RMS_Mode, info.NumParameters) == (b"vsg-2", EMT, 0)
@@ -202,7 +200,7 @@ def test_the_model_says_what_it_is(built: Any, inner: str) -> None:
     assert info.NumFloatStates == 0 < info.NumDoubleStates
 
 
-def test_the_model_waits_for_measurements_and_stays_in_the_safe_state(built: Any) -> None:
+def test_the_model_waits_for_measurements_and_stays_in_the_safe_state(built):
     model = Model(built("vsg-2", "cascaded", "float64"))
     ref = np.array([s.default for s in group("ref")])
     y = np.array([1.0, 0.5, 1.0, 0.0, 1.0, 0.5, 0.0, 1.0, 0.0, 0.5, 0.0])
@@ -221,7 +219,7 @@ def test_the_model_waits_for_measurements_and_stays_in_the_safe_state(built: Any
     assert model.tick(ref, y) == OK and model.outputs[-1] == 0
 
 
-def test_only_the_interface_is_exported(built: Any, tmp_path: Path) -> None:
+def test_only_the_interface_is_exported(built, tmp_path):
     library = built("vsg-2", "cascaded", "float64")
     said = cc(tmp_path, "-D", "--defined-only", str(library), compiler="nm").stdout
     calls = ("CheckParameters", "FirstCall", "GetInfo", "Initialize", "Iterate", "Outputs",
@@ -234,7 +232,7 @@ def test_only_the_interface_is_exported(built: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])
-def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built: Any, real: str) -> None:
+def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built, real):
     """What the shipped run measured, 12 s, tick by tick, with the change of stage among them."""
     scenario = load_scenario("weakening_grid", link__type="inproc")
     run = run_in_memory(scenario)
@@ -261,7 +259,7 @@ def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built: Any, real: 
 
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("inner", ["none", "cascaded"])
-def test_a_scheduled_law_is_exported_whole(tmp_path: Path, style: str, inner: str) -> None:
+def test_a_scheduled_law_is_exported_whole(tmp_path, style, inner):
     command = ["firmware", "export", "mimo-gfm-scheduled", "--inner", inner, "--style", style]
     assert main([*command, "-o", str(tmp_path)]) == 0
     strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
@@ -274,9 +272,7 @@ def test_a_scheduled_law_is_exported_whole(tmp_path: Path, style: str, inner: st
     ).read_text(encoding="utf-8")
 
 
-def test_what_the_command_refuses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_command_refuses(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "dll", "vsg-1", "-o", str(tmp_path)]) == 2
     assert "apt-get install gcc libc6-dev" in capsys.readouterr().err

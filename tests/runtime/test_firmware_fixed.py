@@ -1,7 +1,5 @@
 """Firmware in fixed point: ranges and bounds against float64, bits on targets, the proof by EVA."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -105,7 +103,7 @@ def beside(m: Module, ticks: int, settles: bool) -> Any:
 # --- word lengths ---
 
 
-def test_formats_are_the_finest_that_hold_the_signal_table() -> None:
+def test_formats_are_the_finest_that_hold_the_signal_table():
     """3 p.u. fit 2^29, 6 fit 2^28, 1.3 fit 2^30, 2 do not fit 2^30."""
     assert [one.q for one in YS] == [29, 28, 30, 28, 29]
     assert [one.q for one in US] == [28, 30, 29]
@@ -116,7 +114,7 @@ def test_formats_are_the_finest_that_hold_the_signal_table() -> None:
         assert signal.low <= one.span[0] and one.span[1] <= signal.high
 
 
-def test_sums_of_powers_against_closed_forms() -> None:
+def test_sums_of_powers_against_closed_forms():
     total, peak = powers(np.array([[0.9]]))
     assert total[0, 0] == pytest.approx(10, rel=1e-8) and total[0, 0] >= 10 * (1 - 1e-12)
     assert peak[0, 0] == pytest.approx(1)
@@ -127,7 +125,7 @@ def test_sums_of_powers_against_closed_forms() -> None:
         powers(np.eye(1))
 
 
-def test_the_gain_of_a_clamped_row_against_its_closed_form() -> None:
+def test_the_gain_of_a_clamped_row_against_its_closed_form():
     """One state a, anti-windup w along it: the gain is (a w/2)/(1 - a (1 - w/2)), below 1."""
     a, w = 0.998, 0.005
     *_, gain = sector(ClampedRow(np.array([[a]]), np.ones(1), np.array([w])))
@@ -138,7 +136,7 @@ def test_the_gain_of_a_clamped_row_against_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize("name", EACH_LAW)
-def test_states_stay_in_their_ranges_and_sums_in_their_words(name: str) -> None:
+def test_states_stay_in_their_ranges_and_sums_in_their_words(name):
     """The float64 law from extreme to extreme of its inputs: no state leaves its proven range, and
     no sum of the exact reference reaches 2^63, though inputs and states are at their ends."""
     m = module(name)
@@ -162,7 +160,7 @@ def test_states_stay_in_their_ranges_and_sums_in_their_words(name: str) -> None:
 # --- arithmetic ---
 
 
-def test_no_dead_band_holds_an_integrator() -> None:
+def test_no_dead_band_holds_an_integrator():
     """An error of one unit of v_dc, 2^-29 p.u.: vsg-1 integrates 0.04 of it a tick, a 1,600th of a
     unit of its state, 2^-23 p.u.; after 20,000 ticks that is 12.5 units."""
     m = module("vsg-1")
@@ -178,7 +176,7 @@ def test_no_dead_band_holds_an_integrator() -> None:
     assert abs(one.x[0] - before - 0.04 * 2.0**-29 * 20_000 * 2**23) <= 1
 
 
-def test_equal_inputs_cancel_exactly() -> None:
+def test_equal_inputs_cancel_exactly():
     """At references equal to measurements no integrator moves: matched coefficients cancel."""
     for name in ("vsg-2", "mimo-gfm"):
         one = instance(module(name))
@@ -189,7 +187,7 @@ def test_equal_inputs_cancel_exactly() -> None:
         assert one.x[0] == 0 and one.x[-1] == 0
 
 
-def test_the_half_angle_against_libm() -> None:
+def test_the_half_angle_against_libm():
     rng, pairs = np.random.default_rng(2), ([0, 0], [0, 0], [0, 0])
     for a, b in rng.uniform(-math.pi, math.pi, (500, 2)):
         size, other = 2.0 ** rng.uniform(20, 60, 2)
@@ -205,7 +203,7 @@ def test_the_half_angle_against_libm() -> None:
 
 
 @pytest.mark.parametrize("name", EACH_LAW)
-def test_what_is_seen_is_within_what_is_proven(name: str) -> None:
+def test_what_is_seen_is_within_what_is_proven(name):
     m = module(name)
     assert m.fixed is not None
     rows = beside(m, CHECKED, settles=True)
@@ -230,7 +228,7 @@ def test_what_is_seen_is_within_what_is_proven(name: str) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["vsg-2", "mimo-gfm", "vsg-10"])
-def test_the_drift_of_integrators_is_within_its_bound(name: str) -> None:
+def test_the_drift_of_integrators_is_within_its_bound(name):
     """20,160 ticks without a settle; only rows with an integrator may drift."""
     m = module(name)
     assert m.fixed is not None
@@ -242,7 +240,7 @@ def test_the_drift_of_integrators_is_within_its_bound(name: str) -> None:
 
 @pytest.mark.parametrize("name", [pytest.param("vsg-11"), pytest.param(
     "mimo-gfm", marks=pytest.mark.full)])  # fmt: skip
-def test_float32_is_within_its_bound(name: str) -> None:
+def test_float32_is_within_its_bound(name):
     m = module(name)
     assert m.fixed is not None
     single = make_modules({name: LAWS[name]}, T_S, "float32")[0]
@@ -264,7 +262,7 @@ def test_float32_is_within_its_bound(name: str) -> None:
         assert difference[:, i].max() > 1e-9
 
 
-def test_small_signals_have_the_smaller_bound() -> None:
+def test_small_signals_have_the_smaller_bound():
     m = module("vsg-1")
     assert m.fixed is not None and NEAR == 0.05
     near, whole = (deviations(m.fixed, m.record, FIXED, close) for close in (True, False))
@@ -275,7 +273,7 @@ def test_small_signals_have_the_smaller_bound() -> None:
 # --- the folder ---
 
 
-def test_the_folder_says_formats_and_bounds(tmp_path: Path) -> None:
+def test_the_folder_says_formats_and_bounds(tmp_path):
     folder = exported(tmp_path, FIXED, "unrolled", "vsg-1")
     header = (folder / "gfm_vsg_1.h").read_text(encoding="utf-8")
     found = dict(re.findall(r"GFM_VSG_1_Q_(\w+) = (\d+)", header))
@@ -299,9 +297,7 @@ def test_the_folder_says_formats_and_bounds(tmp_path: Path) -> None:
         (["mimo-gfm-scheduled"], "law 'mimo-gfm-scheduled': is scheduled, which fixed point"),
     ],
 )
-def test_what_fixed_point_does_not_cover_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
-) -> None:
+def test_what_fixed_point_does_not_cover_is_refused(tmp_path, capsys, arguments, said):
     command = ["firmware", "export", *arguments, "--real", "fixed", "-o", str(tmp_path / "out")]
     assert main(command) == 2
     error = capsys.readouterr().err
@@ -309,7 +305,7 @@ def test_what_fixed_point_does_not_cover_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused() -> None:
+def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused():
     record = module("vsg-2").record.copy()
     record["high"][0] = 7.0
     with pytest.raises(LawError, match=r"limits.i_u = \[-5, 7\] must lie in"):
@@ -320,17 +316,13 @@ def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused() -> No
         make_fixed("x", record)
 
 
-def test_eva_refuses_a_folder_in_floating_point(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eva_refuses_a_folder_in_floating_point(tmp_path, capsys):
     folder = exported(tmp_path, "float32", "unrolled", "droop-1")
     assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
     assert "has float32; it proves --real fixed only" in capsys.readouterr().err
 
 
-def test_eva_names_its_package(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_eva_names_its_package(tmp_path, capsys, monkeypatch):
     folder = exported(tmp_path, FIXED, "unrolled", "droop-1")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
@@ -349,7 +341,7 @@ class TestCompiled:
         return exported(tmp_path_factory.mktemp("fixed"), FIXED, "unrolled")
 
     @pytest.mark.parametrize(("target", "flags"), [("host", "-O0"), ("m4f", "-O2")])
-    def test_every_law_has_the_references_bits(self, folder: Path, target: str, flags: str) -> None:
+    def test_every_law_has_the_references_bits(self, folder, target, flags):
         found = check(folder, target, flags, SHIPPED)
         assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {SHIPPED}
         assert sum(c.differ for c in found) == 0
@@ -362,13 +354,13 @@ class TestCompiled:
                 row = f"| {c.name} | {c.instructions[0]}…{c.instructions[1]} | {c.code} |"
                 assert row in table, "python docs/make_firmware_tables.py makes the table anew"
 
-    def test_many_rows_have_the_references_bits(self, tmp_path: Path) -> None:
+    def test_many_rows_have_the_references_bits(self, tmp_path):
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-2", "hybrid-angle")
         for target, flags in (("m4f", "-O2"), ("host", "-O3"), ("clang", "-O3")):
             found = check(folder, target, flags)
             assert [(c.rows, c.differ) for c in found] == [(CHECKED, 0)] * 2
 
-    def test_a_wrong_bit_is_found(self, tmp_path: Path) -> None:
+    def test_a_wrong_bit_is_found(self, tmp_path):
         """The negative control: a coefficient that is one off."""
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-1")
         source = folder / "gfm_vsg_1.c"
@@ -379,12 +371,12 @@ class TestCompiled:
         assert main(["firmware", "check", str(folder)]) == 3
 
     @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-    def test_the_code_compiles_without_a_warning(self, folder: Path, compiler: str) -> None:
+    def test_the_code_compiles_without_a_warning(self, folder, compiler):
         sources = [f"gfm_{name.replace('-', '_')}.c" for name in SOME]
         done = cc(folder, *STRICT, "-fsyntax-only", *sources, "selftest.c", compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
 
-    def test_sanitizers_find_nothing_and_nothing_else_is_called(self, tmp_path: Path) -> None:
+    def test_sanitizers_find_nothing_and_nothing_else_is_called(self, tmp_path):
         folder = exported(tmp_path, FIXED, "unrolled", *SOME)
         sources = sorted(p.name for p in folder.glob("*.c"))
         flags = ["-O1", "-fsanitize=undefined,address", "-fno-sanitize-recover=all"]
@@ -398,7 +390,7 @@ class TestCompiled:
                 said = cc(folder, "-u", "one.o", compiler="nm").stdout
                 assert set(said.split()) <= {"U", "_GLOBAL_OFFSET_TABLE_"}
 
-    def test_eva_has_no_alarm_but_with_a_wrong_exponent(self, tmp_path: Path) -> None:
+    def test_eva_has_no_alarm_but_with_a_wrong_exponent(self, tmp_path):
         """0 alarms for a linear law and the largest map; some where a coefficient is times 2^4."""
         folder = exported(tmp_path, FIXED, "unrolled", "vsg-1", "hybrid-angle")
         assert [p.alarms for p in prove(folder)] == [0, 0]

@@ -1,7 +1,5 @@
 """Laws as FMUs, validated and stepped by FMPy: the kernel's bits, states, and what they refuse."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path
@@ -115,9 +113,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     [("vsg-2", "cascaded", "float64"), ("vsg-2", "cascaded", "float32"),
      ("hybrid-angle", "none", "float64")],
 )  # fmt: skip
-def test_the_unit_has_the_kernels_bits(
-    built: Any, law: str, inner: str, real: str, fmi: str
-) -> None:
+def test_the_unit_has_the_kernels_bits(built, law, inner, real, fmi):
     """Two instances in turn; one of them goes back to tick 100 after 200 and gives the same."""
     folder = built(law, inner, real, fmi)
     assert validate_fmu(str(folder.with_suffix(".fmu"))) == []
@@ -154,7 +150,7 @@ def test_the_unit_has_the_kernels_bits(
 
 
 @pytest.mark.parametrize("fmi", FMI)
-def test_what_the_unit_says_of_itself(built: Any, fmi: str) -> None:
+def test_what_the_unit_says_of_itself(built, fmi):
     folder = built("vsg-2", "cascaded", "float64", fmi)
     of = fmpy.read_model_description(folder)
     rows = {
@@ -175,7 +171,7 @@ def test_what_the_unit_says_of_itself(built: Any, fmi: str) -> None:
 
 
 @pytest.mark.parametrize("fmi", FMI)
-def test_steps_that_are_no_whole_ticks_are_refused(built: Any, fmi: str) -> None:
+def test_steps_that_are_no_whole_ticks_are_refused(built, fmi):
     refs, ys = accepted(3, 4, "float64", True)
     units = [Unit(built("vsg-2", "cascaded", "float64", fmi)) for _ in range(2)]
     one, many = units
@@ -199,7 +195,7 @@ def test_steps_that_are_no_whole_ticks_are_refused(built: Any, fmi: str) -> None
 
 
 @pytest.mark.parametrize("fmi", FMI)
-def test_parameters_states_and_a_reset(built: Any, fmi: str) -> None:
+def test_parameters_states_and_a_reset(built, fmi):
     ref = [s.default for s in group("ref")]
     y = [1.0, 0.5, 1.0, 0.0, 1.0, 0.5, 0.0, 1.0, 0.0, 0.5, 0.0]
     unit = Unit(built("vsg-2", "cascaded", "float64", fmi))
@@ -230,7 +226,7 @@ def test_parameters_states_and_a_reset(built: Any, fmi: str) -> None:
 
 
 @pytest.mark.parametrize("fmi", FMI)
-def test_an_importer_builds_the_sources(built: Any, fmi: str, tmp_path: Path) -> None:
+def test_an_importer_builds_the_sources(built, fmi, tmp_path):
     """FMPy, with CMake and headers of its own, as the FMU's description of the build says."""
     folder = built("vsg-2", "cascaded", "float64", fmi)
     bare = tmp_path / "unpacked"
@@ -247,7 +243,7 @@ def test_an_importer_builds_the_sources(built: Any, fmi: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("fmi", FMI)
-def test_the_interface_is_whole_and_compiles_without_a_warning(built: Any, fmi: str) -> None:
+def test_the_interface_is_whole_and_compiles_without_a_warning(built, fmi):
     folder = built("vsg-2", "cascaded", "float64", fmi)
     headers = Path(fmpy.__file__).parent / "c-code"
     for compiler in ("gcc", "clang"):
@@ -264,7 +260,7 @@ def test_the_interface_is_whole_and_compiles_without_a_warning(built: Any, fmi: 
         assert exported == set(wanted) and len(wanted) > 70
 
 
-def test_a_scheduled_law_is_one_unit(built: Any) -> None:
+def test_a_scheduled_law_is_one_unit(built):
     """It begins with the first stage, whose bits it has; how it goes on is tested with the DLL."""
     refs, ys = accepted(5, 200, "float64", False)
     folder = built("mimo-gfm-scheduled", "none", "float64", "3")
@@ -278,16 +274,14 @@ def test_a_scheduled_law_is_one_unit(built: Any) -> None:
         assert unit.tick(ref, y) == u.tolist()
 
 
-def test_the_same_law_gives_the_same_file(built: Any, tmp_path: Path) -> None:
+def test_the_same_law_gives_the_same_file(built, tmp_path):
     first = built("vsg-2", "cascaded", "float64", "3").with_suffix(".fmu")
     command = ["firmware", "fmu", "vsg-2", "--inner", "cascaded", "--real", "float64"]
     assert main([*command, "-o", str(tmp_path / "again.fmu")]) == 0
     assert (tmp_path / "again.fmu").read_bytes() == first.read_bytes()
 
 
-def test_what_the_command_refuses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_command_refuses(tmp_path, capsys, monkeypatch):
     out = ["-o", str(tmp_path / "law.fmu")]
     assert main(["firmware", "fmu", "vsg-1", "-o", str(tmp_path / "no" / "law.fmu")]) == 2
     assert f"{tmp_path}/no/law.fmu: No such file or directory" in capsys.readouterr().err

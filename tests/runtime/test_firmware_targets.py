@@ -1,7 +1,5 @@
 """Firmware on processors in QEMU: every bit of every law, and counts that are kept."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -34,9 +32,7 @@ RISC_V = pytest.mark.skipif(
         pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
     ],
 )  # fmt: skip
-def test_every_law_has_the_kernels_bits_on_a_processor(
-    tmp_path: Path, target: str, real: str, style: str
-) -> None:
+def test_every_law_has_the_kernels_bits_on_a_processor(tmp_path, target, real, style):
     found = check(exported(tmp_path, real, style), target)
     assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
     assert sum(c.differ for c in found) == 0
@@ -63,9 +59,7 @@ def test_every_law_has_the_kernels_bits_on_a_processor(
         pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
     ],
 )  # fmt: skip
-def test_every_stage_has_the_kernels_bits_on_a_processor(
-    tmp_path: Path, target: str, real: str, style: str
-) -> None:
+def test_every_stage_has_the_kernels_bits_on_a_processor(tmp_path, target, real, style):
     found = check(exported(tmp_path, real, style, of=STAGED), target)
     assert [c.name for c in found] == list(STAGED) and {c.rows for c in found} == {CHECKED}
     assert sum(c.differ for c in found) == 0
@@ -76,7 +70,7 @@ def test_every_stage_has_the_kernels_bits_on_a_processor(
     [("s390x", "float32"), ("s390x", "float64"), ("aarch64", "float64"), ("i386", "float32"),
      ("i386", "float64"), ("m3", "float32"), ("m3", "float64")],
 )  # fmt: skip
-def test_other_processors_have_the_kernels_bits(tmp_path: Path, target: str, real: str) -> None:
+def test_other_processors_have_the_kernels_bits(tmp_path, target, real):
     """Big-endian, 64 bits, 32 bits with SSE2, and floats in software."""
     exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle", "dvoc")
     (tmp_path / "stage").mkdir()
@@ -87,7 +81,7 @@ def test_other_processors_have_the_kernels_bits(tmp_path: Path, target: str, rea
         assert [c.differ for c in found] == [0] * len(found)
 
 
-def test_a_scheduled_law_refuses_what_would_change_bits(tmp_path: Path) -> None:
+def test_a_scheduled_law_refuses_what_would_change_bits(tmp_path):
     command = ["firmware", "export", "mimo-gfm-scheduled", "-o", str(tmp_path)]
     assert main(command) == 0
     source = "gfm_mimo_gfm_scheduled.c"
@@ -105,7 +99,7 @@ def test_a_scheduled_law_refuses_what_would_change_bits(tmp_path: Path) -> None:
         assert "-fexcess-precision=fast" in done.stderr and "-msse2" not in done.stderr
 
 
-def test_the_table_of_stages_is_what_is_measured(tmp_path: Path) -> None:
+def test_the_table_of_stages_is_what_is_measured(tmp_path):
     compiler = TARGETS["m4f"].prefix + TARGETS["m4f"].compiler
     version = cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0]
     if version not in (PAGES / "tables" / "firmware_laws.md").read_text(encoding="utf-8"):
@@ -128,7 +122,7 @@ def test_the_table_of_stages_is_what_is_measured(tmp_path: Path) -> None:
         assert f"| {' | '.join(map(str, row))} |" in table, "make_firmware_tables.py makes it anew"
 
 
-def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
+def test_instructions_are_the_same_in_every_run(tmp_path):
     folder = exported(tmp_path, "float32", "unrolled", "droop-1", "mimo-gfm")
     first, again = (check(folder, "m4f", ticks=210) for _ in range(2))
     assert first == again
@@ -138,7 +132,7 @@ def test_instructions_are_the_same_in_every_run(tmp_path: Path) -> None:
     assert all(c.checks is not None and 60 <= c.checks <= 120 for c in first)
 
 
-def test_fused_multiply_add_is_found_on_a_processor(tmp_path: Path) -> None:
+def test_fused_multiply_add_is_found_on_a_processor(tmp_path):
     """The negative control: with it the bits differ, and the command says so by its exit code."""
     folder = str(exported(tmp_path, "float32", "unrolled", "vsg-1", "hybrid-angle"))
     command = ["firmware", "check", folder, "--target", "m4f"]

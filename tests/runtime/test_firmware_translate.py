@@ -1,7 +1,5 @@
 """Python functions as C: what becomes of them, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -58,7 +56,7 @@ def text(python: Any, unroll: bool = True, algebra: Algebra | None = None, c: An
     return "\n".join(map(printer.function, reached([entry])))
 
 
-def test_a_loop_with_known_bounds_becomes_one_sum_without_zeros() -> None:
+def test_a_loop_with_known_bounds_becomes_one_sum_without_zeros():
     assert text(stored) == (
         "static void stored(s_t *s)\n{\n    /* a comment */\n"
         "    s->x = 0x1p+1f /* a */ * s->x + 0x1p-1f * s->z[0] - s->z[2];\n}\n"
@@ -69,7 +67,7 @@ def test_a_loop_with_known_bounds_becomes_one_sum_without_zeros() -> None:
     assert operations(kept) == {"*": 4, "+": 2, "-": 1}
 
 
-def test_without_known_constants_the_loop_and_the_function_stay() -> None:
+def test_without_known_constants_the_loop_and_the_function_stay():
     at_run_time = Struct(
         {"a": Expr("var", ("c->a",)), "n": Expr("var", ("c->n",), "int"),
          "row": Array("c->row", (3,))}
@@ -84,7 +82,7 @@ def test_without_known_constants_the_loop_and_the_function_stay() -> None:
     )
 
 
-def test_a_branch_that_is_known_goes_and_a_function_of_numbers_stays() -> None:
+def test_a_branch_that_is_known_goes_and_a_function_of_numbers_stays():
     assert text(branches) == (
         "static real scaled(real value, real by)\n{\n"
         "    return value > 0.0f ? value * by : value;\n}\n\n"
@@ -142,12 +140,12 @@ def old_value(c: Any, s: Any) -> None:
         (unknown_index, "has no known index"),
     ],
 )
-def test_what_is_not_of_the_subset_is_refused(python: Any, why: str) -> None:
+def test_what_is_not_of_the_subset_is_refused(python, why):
     with pytest.raises(Untranslatable, match=why):
         text(python)
 
 
-def test_a_name_that_is_used_again_keeps_its_values_apart() -> None:
+def test_a_name_that_is_used_again_keeps_its_values_apart():
     assert text(old_value) == (
         "static void old_value(s_t *s)\n{\n    real y = s->x;\n    const real z = y;\n"
         "    y = s->z[0];\n    s->z[1] = y;\n    s->z[2] = z + y;\n}\n"
@@ -166,6 +164,6 @@ def test_a_name_that_is_used_again_keeps_its_values_apart() -> None:
         ("-", X, number(-0.0), Expr("-", (X, number(-0.0)))),  # -0 - -0 is 0
     ],
 )  # fmt: skip
-def test_only_what_changes_no_bit_goes(sign: str, a: Expr, b: Expr, gives: Expr) -> None:
+def test_only_what_changes_no_bit_goes(sign, a, b, gives):
     found = Algebra().binary(sign, a, b)
     assert repr(found) == repr(gives)

@@ -1,7 +1,5 @@
 """The estimate of the grid's reactance from synthetic swings."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -38,7 +36,7 @@ def swing(  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("X", [0.0174, 0.1, 0.5])
 @pytest.mark.parametrize("hz", [2.0, 8.0])
 @pytest.mark.parametrize("omega_g", [1.0, 0.998])
-def test_a_swing_tells_x(X: float, hz: float, omega_g: float) -> None:
+def test_a_swing_tells_x(X, hz, omega_g):
     """At any frequency of the grid, which the estimator does not know."""
     est = make_impedance(T_S, 1.0)
     found = feed(est, *swing(X, hz, dp=0.15, omega_g=omega_g))
@@ -46,21 +44,21 @@ def test_a_swing_tells_x(X: float, hz: float, omega_g: float) -> None:
 
 
 @pytest.mark.parametrize("P", [0.0, 0.5, 1.0])
-def test_at_any_operating_point(P: float) -> None:
+def test_at_any_operating_point(P):
     """On a weak grid sin(delta) differs from delta; the term p^2 corrects for it."""
     est = make_impedance(T_S, 0.02)
     found = feed(est, *swing(0.6, 4.0, dp=0.05, P=P))
     np.testing.assert_allclose(found[-5000:], 0.6, rtol=0.05)
 
 
-def test_a_change_of_the_grid_is_followed() -> None:
+def test_a_change_of_the_grid_is_followed():
     est = make_impedance(T_S, 1.0)
     feed(est, *swing(0.05, 5.0, dp=0.2))
     found = feed(est, *swing(0.2, 5.0, dp=0.2, seconds=8.0))
     np.testing.assert_allclose(found[-5000:], 0.2, rtol=0.05)
 
 
-def test_noise_does_not_bias_it_much() -> None:
+def test_noise_does_not_bias_it_much():
     rng = np.random.default_rng(1)
     p, omega_u, V = swing(0.1, 4.0, dp=0.2)
     est = make_impedance(T_S, 1.0)
@@ -70,7 +68,7 @@ def test_noise_does_not_bias_it_much() -> None:
 
 
 @pytest.mark.parametrize("omega_g", [1.0, 0.99])
-def test_held_without_excitation(omega_g: float) -> None:
+def test_held_without_excitation(omega_g):
     """A steady state, or noise on p alone, contains no information about X."""
     rng = np.random.default_rng(2)
     est = make_impedance(T_S, 0.3)
@@ -80,7 +78,7 @@ def test_held_without_excitation(omega_g: float) -> None:
     assert np.all(found == 0.3)
 
 
-def test_held_once_the_swing_is_over() -> None:
+def test_held_once_the_swing_is_over():
     est = make_impedance(T_S, 1.0)
     feed(est, *swing(0.1, 4.0, dp=0.2))
     found = feed(est, np.full(200_000, 0.5), np.ones(200_000), np.ones(200_000))
@@ -88,7 +86,7 @@ def test_held_once_the_swing_is_over() -> None:
     assert found[-1] == pytest.approx(0.1, rel=0.1)
 
 
-def test_a_swing_the_wrong_way_round_is_not_believed() -> None:
+def test_a_swing_the_wrong_way_round_is_not_believed():
     """p that falls while delta rises does not come from a grid."""
     p, omega_u, V = swing(0.1, 4.0, dp=0.2)
     est = make_impedance(T_S, 0.3)
@@ -98,13 +96,13 @@ def test_a_swing_the_wrong_way_round_is_not_believed() -> None:
 
 @pytest.mark.parametrize("name", ["T_s", "X_0", "omega_b"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
-def test_wrong_settings_are_named(name: str, value: float) -> None:
+def test_wrong_settings_are_named(name, value):
     settings = {"T_s": T_S, "X_0": 0.1, name: value}
     with pytest.raises(ValueError, match=rf"{name} = .* must be > 0"):
         make_impedance(**settings)
 
 
-def test_a_step_of_the_grids_frequency_is_not_taken_for_a_swing() -> None:
+def test_a_step_of_the_grids_frequency_is_not_taken_for_a_swing():
     """p moves because the grid moved: for a moment the converter's own angle has no meaning."""
     p, omega_u, V = swing(0.1, 4.0, dp=0.15, seconds=4.0)
     est = make_impedance(T_S, 1.0)

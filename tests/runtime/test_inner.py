@@ -1,7 +1,5 @@
 """The inner stage against what is known from outside: SciPy, closed forms, its own limits."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from dataclasses import replace
@@ -53,7 +51,7 @@ def current(c: Controller) -> complex:
     return complex(*c.states["i_ref"][int(c.ctl["active"][0])])
 
 
-def test_the_virtual_stator_is_its_differential_equation() -> None:
+def test_the_virtual_stator_is_its_differential_equation():
     """i* after a step of v against an adaptive integrator; the trapezoid is of second order."""
     stage = VirtualStator(I_max=100.0, X_v=0.3, R_v=0.1)
     v = 0.8 * cmath.exp(-0.2j)
@@ -75,7 +73,7 @@ def test_the_virtual_stator_is_its_differential_equation() -> None:
 
 
 @pytest.mark.parametrize("kind", STAGES)
-def test_a_change_of_law_and_stage_keeps_the_bridges_voltage(kind: str) -> None:
+def test_a_change_of_law_and_stage_keeps_the_bridges_voltage(kind):
     stages = [None, STAGES[kind](), Cascaded(k_ci=5.0)]
     c, e = controller(*stages), 1.0 + 0.05j
     y, u = measured(i=0.5 - 0.1j, v=0.98 - 0.02j), np.zeros(NU_INNER)
@@ -89,7 +87,7 @@ def test_a_change_of_law_and_stage_keeps_the_bridges_voltage(kind: str) -> None:
         assert abs((u - before)[1]) < 1e-12
 
 
-def test_what_a_change_leaves_behind_decays() -> None:
+def test_what_a_change_leaves_behind_decays():
     c, y, u = controller(VirtualStator(), None), measured(), np.zeros(NU_INNER)
     c.start(np.zeros(c.active_law.order), np.array([0.5, 1.0, 1.0]), y, 0.9 + 0.1j)
     c.select("law 1")
@@ -107,7 +105,7 @@ def test_what_a_change_leaves_behind_decays() -> None:
         ("angle", 1.2 * cmath.exp(1j * math.radians(-30.0))),
     ],
 )
-def test_priorities_of_the_limit(priority: str, wanted: complex) -> None:
+def test_priorities_of_the_limit(priority, wanted):
     """A cascaded stage that feeds i_o = 1.5 - 2 j forward asks for just that current."""
     assert priority in PRIORITIES
     stage = Cascaded(priority=priority, angle=-30.0, k_v=0.0, k_vi=0.0, k_ff=1.0, C_f=0.0)
@@ -119,7 +117,7 @@ def test_priorities_of_the_limit(priority: str, wanted: complex) -> None:
 
 
 @pytest.mark.parametrize("kind", STAGES)
-def test_the_bridge_never_gets_more_than_the_modulation_gives(kind: str) -> None:
+def test_the_bridge_never_gets_more_than_the_modulation_gives(kind):
     c, u = started(STAGES[kind](m=1.3)), np.zeros(NU_INNER)
     rng = np.random.default_rng(1)
     for _ in range(2000):
@@ -130,7 +128,7 @@ def test_the_bridge_never_gets_more_than_the_modulation_gives(kind: str) -> None
         assert math.hypot(u[2], u[3]) <= 1.3 * v_dc * (1 + 1e-12)
 
 
-def test_the_e_row_freezes_while_the_current_is_limited() -> None:
+def test_the_e_row_freezes_while_the_current_is_limited():
     """VSG-2 integrates the voltage's error; in a fault of 0.1 s that would be 3 p.u."""
     raws = {}
     for freeze in (True, False):
@@ -143,7 +141,7 @@ def test_the_e_row_freezes_while_the_current_is_limited() -> None:
     assert raws[True] < 1.05 < 1.4 < raws[False]
 
 
-def test_the_pll_finds_the_frequency_that_column_3_is_told() -> None:
+def test_the_pll_finds_the_frequency_that_column_3_is_told():
     """v turns against the converter's frame by 0.5 Hz: the PLL's omega is 1 + 0.01, column 3's."""
     c, u = started(VirtualStator(f_pll=20.0)), np.zeros(NU_INNER)
     for k in range(3000):
@@ -153,7 +151,7 @@ def test_the_pll_finds_the_frequency_that_column_3_is_told() -> None:
     assert c.states["ref"][0, 2] == c.states["omega_pll"][0]
 
 
-def test_the_power_limiter_lowers_the_frequency_only_beyond_its_limit() -> None:
+def test_the_power_limiter_lowers_the_frequency_only_beyond_its_limit():
     stage = VirtualStator(power=PowerLimiter(P_max=0.8, P_min=-0.8, k_p=0.02, k_i=0.0))
     c, u = started(stage), np.zeros(NU_INNER)
     law, _ = controller(None), np.zeros(3)
@@ -165,7 +163,7 @@ def test_the_power_limiter_lowers_the_frequency_only_beyond_its_limit() -> None:
         assert plain[1] - u[1] == pytest.approx(lower, abs=1e-12)
 
 
-def test_shipped_stages_load_and_differ() -> None:
+def test_shipped_stages_load_and_differ():
     found = {name: load_law("vsg-2", name).laws[0].inner for name in inner_names()}
     assert found.pop("none") is None
     assert {stage.kind for stage in found.values() if stage} == set(STAGES)
@@ -185,7 +183,7 @@ def test_shipped_stages_load_and_differ() -> None:
         ('type = "cascaded"\npriority = "both"', "priority: .*'circular', 'd', 'q' or 'angle'"),
     ],
 )
-def test_a_wrong_stage_is_refused_in_one_line(text: str, said: str, tmp_path: Any) -> None:
+def test_a_wrong_stage_is_refused_in_one_line(text, said, tmp_path):
     path = tmp_path / "stage.toml"
     path.write_text(text)
     with pytest.raises(LawError, match=said) as caught:

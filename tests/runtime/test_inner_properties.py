@@ -1,7 +1,5 @@
 """What the inner stage keeps for every measurement that a controller accepts, and in float32."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -76,9 +74,7 @@ def stages(kinds: Iterable[str] = tuple(STAGES)) -> st.SearchStrategy[InnerStage
 
 
 @given(stages(), st.lists(measurements, min_size=1, max_size=12), reals, st.sampled_from(LAWS))
-def test_no_measurement_passes_the_limits_of_current_and_modulation(
-    stage: InnerStage, ys: list[NDArray[np.float64]], real: type, law: str
-) -> None:
+def test_no_measurement_passes_the_limits_of_current_and_modulation(stage, ys, real, law):
     c, u = controller((law, stage), real=real), np.zeros(NU_INNER)
     some = 1 + 8 * EPS[real]
     for y in ys:
@@ -112,13 +108,8 @@ wide = st.sampled_from([*KINDS]).flatmap(
     reals,
 )
 def test_a_change_of_law_and_stage_leaves_the_bridges_voltage_where_it_was(
-    law: str,
-    other: str,
-    stage: InnerStage | None,
-    next_stage: InnerStage | None,
-    ys: list[NDArray[np.float64]],
-    real: type,
-) -> None:
+    law, other, stage, next_stage, ys, real
+):
     """The first e of the new stage is the last of the old one, whatever was measured between."""
     assume(stage is not None or next_stage is not None)
     c, u = controller((law, stage), (other, next_stage), real=real), np.zeros(NU_INNER)
@@ -135,7 +126,7 @@ def test_a_change_of_law_and_stage_leaves_the_bridges_voltage_where_it_was(
 @pytest.mark.full
 @pytest.mark.parametrize("kind", STAGES)
 @pytest.mark.parametrize("priority", PRIORITIES)
-def test_float32_stays_close_to_float64(kind: str, priority: str) -> None:
+def test_float32_stays_close_to_float64(kind, priority):
     """Over 0.3 s with a sag that the stage limits; the laws themselves agree to 2e-4, which the
     virtual impedance and the current loop turn into 1e-3 at most."""
     stage = STAGES[kind](priority=priority, angle=-20.0, power=POWER, f_pll=20.0)

@@ -1,7 +1,5 @@
 """The kernel's step: precision, layout, memory, limits and anti-windup."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from gfm_runtime import Law, Limits, discretise, get_law, law_dtype, state_dtype, step
-from gfm_runtime.elements import IF, INTEGRATOR, PI, Element, I, P
+from gfm_runtime.elements import IF, INTEGRATOR, PI, I, P
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.law import cell_name
 from gfm_runtime.signals import NU, NY, U_NAMES
@@ -38,7 +36,7 @@ def ticks_at(law, state, ref, y, u, i, limit, most):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_float32_stays_close_to_float64(name: str) -> None:
+def test_float32_stays_close_to_float64(name):
     """Over 0.5 s; the tolerance covers the rounding that an integrator accumulates."""
     discrete = discretise(LAWS[name], T_S)
     refs, ys = wander(5000, seed=4, size=0.01)
@@ -84,7 +82,7 @@ def in_float32(discrete: Running, refs: Vector, ys: Vector) -> list[list[np.floa
 
 
 @pytest.mark.parametrize("name", [n for n, law in LAWS.items() if law.error_map == "linear"])
-def test_a_float32_law_computes_in_float32(name: str) -> None:
+def test_a_float32_law_computes_in_float32(name):
     """Equal bit by bit, although references, measurements and u are float64."""
     loop = Running.of(discretise(LAWS[name], T_S), f32).unlimited()
     refs, ys = wander(40, seed=6)
@@ -92,7 +90,7 @@ def test_a_float32_law_computes_in_float32(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_precision_of_the_arguments_does_not_matter(name: str) -> None:
+def test_precision_of_the_arguments_does_not_matter(name):
     discrete = discretise(LAWS[name], T_S)
     refs, ys = (a.astype(f32) for a in wander(40, seed=7))
     wide, narrow = Running.of(discrete, f32), Running.of(discrete, f32)
@@ -108,7 +106,7 @@ def test_precision_of_the_arguments_does_not_matter(name: str) -> None:
 
 @pytest.mark.parametrize("make", [law_dtype, state_dtype])
 @pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_records_are_plain_structs(make: Any, real: type) -> None:
+def test_records_are_plain_structs(make, real):
     dtype = make(real)
     assert dtype.isalignedstruct and dtype.fields is not None
     end = 0
@@ -119,7 +117,7 @@ def test_records_are_plain_structs(make: Any, real: type) -> None:
     assert dtype.itemsize - end < 8
 
 
-def test_record_holds_the_matrices() -> None:
+def test_record_holds_the_matrices():
     discrete = discretise(get_law("vsg-12"), T_S)
     n = discrete.order
     record = Running.of(discrete).law[0]
@@ -134,7 +132,7 @@ def test_record_holds_the_matrices() -> None:
 
 
 @pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_a_step_allocates_nothing(real: type) -> None:
+def test_a_step_allocates_nothing(real):
     loops = [Running.of(discretise(LAWS[n], T_S), real) for n in ("vsg-12", "dvoc", "hybrid-angle")]
     u = np.zeros(NU)
     drive(loops[0].law, loops[0].state, REF, REF, u, 1)
@@ -148,7 +146,7 @@ def test_a_step_allocates_nothing(real: type) -> None:
     assert after.mi_alloc - before.mi_alloc <= 10 * len(loops)
 
 
-def test_what_decays_ends_at_zero() -> None:
+def test_what_decays_ends_at_zero():
     """Subnormal numbers are slow; a decaying filter must not pass through them."""
     law = Law("a", "", "", {(1, 1): IF(1.0, 1e-3)})
     loop = Running.of(discretise(law, T_S))
@@ -162,7 +160,7 @@ def test_what_decays_ends_at_zero() -> None:
 # --- limits and anti-windup ---
 
 
-def test_u_stays_within_its_limits() -> None:
+def test_u_stays_within_its_limits():
     law = get_law("mimo-gfm")
     loop = Running.of(discretise(law, T_S))
     rng = np.random.default_rng(8)
@@ -172,7 +170,7 @@ def test_u_stays_within_its_limits() -> None:
         assert {law.limits.low[i], law.limits.high[i]} & set(us[:, i]), "a limit was reached"
 
 
-def test_limits_are_exact_and_do_nothing_inside() -> None:
+def test_limits_are_exact_and_do_nothing_inside():
     law = get_law("vsg-2")
     refs, ys = wander(200, seed=9, size=0.01)
     free = Running.of(discretise(law, T_S)).unlimited().run(refs, ys)
@@ -225,9 +223,7 @@ def into_the_limit(
     INTEGRATORS,
     ids=[f"{n}-{cell_name(m, c)}" for n, m, c in INTEGRATORS],
 )
-def test_each_integrator_leaves_its_limit(
-    name: str, matrix: str, cell: tuple[int, int], upper: bool
-) -> None:
+def test_each_integrator_leaves_its_limit(name, matrix, cell, upper):
     """Within T_t; without anti-windup it stays there for seconds."""
     assert matrix == "phi"
     stays, T_t = into_the_limit(LAWS[name], cell, upper)
@@ -236,7 +232,7 @@ def test_each_integrator_leaves_its_limit(
     assert stays == 20_000
 
 
-def test_there_is_an_integrator_of_each_kind() -> None:
+def test_there_is_an_integrator_of_each_kind():
     """DC PI, droop-2's two, PSC's I, VSG's q and V, matching's and hybrid angle's PI, dVOC's."""
     found = {(name, cell_name(matrix, cell)) for name, matrix, cell in INTEGRATORS}
     assert found >= {
@@ -248,7 +244,7 @@ def test_there_is_an_integrator_of_each_kind() -> None:
 
 @pytest.mark.parametrize("T_t", [1e-5, 0.005, 0.1])
 @pytest.mark.parametrize("column_3", [None, P(10.0), P(-0.5), IF(5.0, 0.01)])
-def test_anti_windup_of_omega_u_with_its_loop(T_t: float, column_3: Element | None) -> None:
+def test_anti_windup_of_omega_u_with_its_loop(T_t, column_3):
     """The tracking time is T_t for any gain of the loop through column 3."""
     cells = {(1, 1): PI(0.01, 0.05)} | ({(1, 2): column_3} if column_3 else {})
     law = limited(Law("a", "", "", cells), T_t=T_t)
@@ -257,7 +253,7 @@ def test_anti_windup_of_omega_u_with_its_loop(T_t: float, column_3: Element | No
         assert stays <= max(ticks, 1)
 
 
-def test_back_calculation_settles_where_it_should() -> None:
+def test_back_calculation_settles_where_it_should():
     """With an error e that holds it at a limit, an I settles k_i e T_t beyond it in a few T_t."""
     law = limited(Law("a", "", "", {(2, 4): I(0.5)}, u_0=(0.0, 1.0, 1.0)), T_t=0.02)
     loop = Running.of(discretise(law, T_S))
@@ -267,7 +263,7 @@ def test_back_calculation_settles_where_it_should() -> None:
     assert beyond == pytest.approx(0.4 / 0.5 * 0.02, rel=0.01)
 
 
-def test_other_rows_do_not_feel_a_limit() -> None:
+def test_other_rows_do_not_feel_a_limit():
     law = get_law("vsg-2")
     tight = Running.of(discretise(limited(law, i_u=(-0.1, 0.1)), T_S))
     free = Running.of(discretise(law, T_S))
@@ -277,7 +273,7 @@ def test_other_rows_do_not_feel_a_limit() -> None:
     np.testing.assert_array_equal(a[:, 1:], b[:, 1:])
 
 
-def test_column_3_is_fed_the_omega_u_that_is_applied() -> None:
+def test_column_3_is_fed_the_omega_u_that_is_applied():
     """VSG-3 feeds omega_u to E_u: at the limit it must be the limited omega_u."""
     law = get_law("vsg-3", k_33=2.0, k_34=0.0, D_p=0.1)
     law = limited(law, omega_u=(0.99, 1.01))
@@ -290,12 +286,12 @@ def test_column_3_is_fed_the_omega_u_that_is_applied() -> None:
 
 
 @pytest.mark.parametrize("name", U_NAMES)
-def test_limits_that_cannot_be(name: str) -> None:
+def test_limits_that_cannot_be(name):
     with pytest.raises(ValidationError, match=rf"{name}\n.*ascending"):
         Limits(**{name: (9.0, 1.0)})
 
 
-def test_nan_passes_through_the_limits() -> None:
+def test_nan_passes_through_the_limits():
     """It must reach the controller's check, not be clamped to a plausible number."""
     loop = Running.of(discretise(get_law("mimo-gfm"), T_S))
     u: NDArray[np.float64] = loop.step(REF, np.array([np.nan, 0.5, 1.0, 0.0, 1.0]))

@@ -1,13 +1,11 @@
 """The laws with tuned gains: not in the catalogue's list, but available by name."""
 
-from __future__ import annotations
-
 import pytest
 
 from gfm_runtime import LawError, discretise, law_file, law_names, load_law, tuned_names
 
 
-def test_listed_apart() -> None:
+def test_listed_apart():
     assert tuned_names()
     assert not set(tuned_names()) & set(law_names())
     assert {name.removesuffix("-tuned") for name in tuned_names()} <= set(law_names())
@@ -15,7 +13,7 @@ def test_listed_apart() -> None:
 
 
 @pytest.mark.parametrize("name", tuned_names())
-def test_the_same_law_with_other_values_of_its_free_gains(name: str) -> None:
+def test_the_same_law_with_other_values_of_its_free_gains(name):
     tuned, own = law_file(name), law_file(name.removesuffix("-tuned"))
     assert tuned.name == name
     assert (tuned.phi, tuned.psi, tuned.u_0, tuned.error_map) == (
@@ -33,6 +31,6 @@ def test_the_same_law_with_other_values_of_its_free_gains(name: str) -> None:
             assert was.free[0] <= spec.value <= was.free[1]
 
 
-def test_an_unknown_one_says_where_the_tuned_are_listed() -> None:
+def test_an_unknown_one_says_where_the_tuned_are_listed():
     with pytest.raises(LawError, match=r"unknown; .*gfmhil laws --tuned"):
         load_law("droop-9-tuned")

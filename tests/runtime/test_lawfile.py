@@ -1,10 +1,7 @@
 """Law files: values are read as written, and every mistake gives one clear line."""
 
-from __future__ import annotations
-
 import json
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -80,7 +77,7 @@ def custom() -> Law:
     return build_law(parse_law(CUSTOM))
 
 
-def test_round_trip() -> None:
+def test_round_trip():
     law = custom()
     integral = Element.of((-9.0,), ((0.0, 1.0),))
     assert law.phi == {
@@ -102,20 +99,20 @@ def test_round_trip() -> None:
     assert law.parameters["D_p"].source == "Table III"
 
 
-def test_from_a_path(tmp_path: Path) -> None:
+def test_from_a_path(tmp_path):
     path = tmp_path / "my law.toml"
     path.write_text(CUSTOM, encoding="utf-8")
     assert load_law(str(path)).laws == (custom(),)
 
 
-def test_parameters_can_be_changed() -> None:
+def test_parameters_can_be_changed():
     law = build_law(parse_law(CUSTOM), {"D_p": 0.02, "k_p": 10.0})
     assert law.phi[1, 1] == O(0.02, 0.03, 0.7) * PD(1.0, 0.02)
     assert law.phi[2, 4](1.0) == pytest.approx(-1.0)
     assert law.parameters["D_p"].value == 0.02
 
 
-def test_a_shape_may_be_a_list_of_one() -> None:
+def test_a_shape_may_be_a_list_of_one():
     one = 'name = "a"\ntitle = ""\nsource = ""\n[phi]\n22 = {}\n'
     element = '{ type = "P", k = 0.01 }'
     a, b = (build_law(parse_law(one.format(e))) for e in (element, f"[{element}]"))
@@ -232,7 +229,7 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_clear_line(mistake: str) -> None:
+def test_a_mistake_is_one_clear_line(mistake):
     old, new, says = MISTAKES[mistake]
     assert CUSTOM.count(old) == 1
     with pytest.raises(LawError) as caught:
@@ -244,7 +241,7 @@ def test_a_mistake_is_one_clear_line(mistake: str) -> None:
     ).replace("; known", "").replace("; did you", ""), f"one message for one mistake: {message}"
 
 
-def test_all_mistakes_at_once() -> None:
+def test_all_mistakes_at_once():
     text = CUSTOM.replace("T = 2.0 }", "T = true }").replace("T_t = 0.03", 'T_t = "x"')
     with pytest.raises(LawError) as caught:
         parse_law(text, "law file a.toml")
@@ -252,7 +249,7 @@ def test_all_mistakes_at_once() -> None:
     assert "phi.34.T" in caught.value.why and "limits.T_t" in caught.value.why
 
 
-def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path):
     text = CUSTOM.replace('k = "D_p"', 'k = "D_q"').replace("34 = {", "46 = {")
     text = text.replace('type = "hybrid-angle"', 'type = "hybrid_angle"')
     text = text.replace(", T_f = 0.001", "")
@@ -272,7 +269,7 @@ def test_all_mistakes_of_a_law_at_once_name_its_file(tmp_path: Path) -> None:
         assert sum(part in line for line in lines) == 1, part
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(LawError, match=r"law file .*nowhere\.toml: cannot be read: .*No such file"):
         read_law_file(tmp_path / "nowhere.toml")
     with pytest.raises(LawError, match="cannot be read"):
@@ -297,7 +294,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         ({(1, 1): Element((1.0,), ((0.0, 1.0), (0.0, 1.0)))}, "phi_22: unstable: a double integ"),
     ],
 )
-def test_laws_made_in_python_pass_the_same_checks(phi: Any, says: str) -> None:
+def test_laws_made_in_python_pass_the_same_checks(phi, says):
     with pytest.raises(LawError) as caught:
         Law("a", "", "", phi)
     assert says in str(caught.value)
@@ -380,7 +377,7 @@ def toml(value: Any) -> str:
 
 @repeatable
 @given(law_files, st.sampled_from([1e-4, 1e-3, 1.0]))
-def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: float) -> None:
+def test_any_law_file_builds_or_raises_law_error(content, T_s):
     text = "\n".join(f"{key} = {toml(value)}" for key, value in content.items())
     try:
         law = build_law(parse_law(text))
@@ -394,7 +391,7 @@ def test_any_law_file_builds_or_raises_law_error(content: dict[str, Any], T_s: f
 
 @repeatable
 @given(st.text(max_size=60))
-def test_any_text_is_a_law_or_a_law_error(text: str) -> None:
+def test_any_text_is_a_law_or_a_law_error(text):
     with pytest.raises(LawError):
         parse_law(text)
 
@@ -409,7 +406,7 @@ phi.22 = { type = "P", k = "D_p" }
 """
 
 
-def test_a_base_gives_what_the_file_does_not_say() -> None:
+def test_a_base_gives_what_the_file_does_not_say():
     softer, own = parse_law(BASED), law_file("vsg-2")
     assert (softer.name, softer.title, softer.base) == ("softer", "VSG-2 with more damping", None)
     assert softer.parameters["D_p"].value == 0.02
@@ -422,7 +419,7 @@ def test_a_base_gives_what_the_file_does_not_say() -> None:
     assert (softer.u_0, softer.limits, softer.psi) == (own.u_0, own.limits, own.psi)
 
 
-def test_a_base_may_be_a_file_beside_the_law_with_a_base_of_its_own(tmp_path: Path) -> None:
+def test_a_base_may_be_a_file_beside_the_law_with_a_base_of_its_own(tmp_path):
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "softer.toml").write_text(BASED)
     (tmp_path / "own.toml").write_text(
@@ -442,7 +439,7 @@ def test_a_base_may_be_a_file_beside_the_law_with_a_base_of_its_own(tmp_path: Pa
         ('base = "../vsg-2"', "base: no law of the catalogue"),
     ],
 )
-def test_a_base_that_is_none(tmp_path: Path, text: str, words: str) -> None:
+def test_a_base_that_is_none(tmp_path, text, words):
     path = tmp_path / "circle.toml"
     path.write_text(f'name = "mine"\n{text}\n')
     with pytest.raises(LawError) as problem:
@@ -451,7 +448,7 @@ def test_a_base_that_is_none(tmp_path: Path, text: str, words: str) -> None:
     assert str(path) in line and words in line
 
 
-def test_the_schema_lets_a_file_with_a_base_leave_the_rest_out() -> None:
+def test_the_schema_lets_a_file_with_a_base_leave_the_rest_out():
     schema = jsonschema.Draft202012Validator(LawFile.model_json_schema())
     content = tomllib.loads(BASED)
     assert schema.is_valid(content)
@@ -465,7 +462,7 @@ def told(text: str) -> list[str]:
     return caught.value.lines
 
 
-def test_a_number_alone_is_a_parameter() -> None:
+def test_a_number_alone_is_a_parameter():
     bare = CUSTOM.replace('{ value = 0.01, unit = "p.u.", source = "Table III" }', "0.01")
     valued = CUSTOM.replace(', unit = "p.u.", source = "Table III" }', " }")
     for text in (bare, valued):
@@ -477,7 +474,7 @@ def test_a_number_alone_is_a_parameter() -> None:
 
 
 @pytest.mark.parametrize("name", [*law_names(), *tuned_names()])
-def test_the_catalogue_says_unit_and_source_of_every_parameter(name: str) -> None:
+def test_the_catalogue_says_unit_and_source_of_every_parameter(name):
     for parameter in law_file(name).parameters.values():
         assert {"unit", "source"} <= parameter.model_fields_set and parameter.source.strip()
 
@@ -492,13 +489,13 @@ def test_the_catalogue_says_unit_and_source_of_every_parameter(name: str) -> Non
         ("D_p = {", "D_pp = {", "unknown parameter 'D_p'; known: ['D_pp', 'X_half', 'k_p']; did"),
     ],
 )  # fmt: skip
-def test_one_wrong_word_is_one_line_in_the_files_own_words(old: str, new: str, line: str) -> None:
+def test_one_wrong_word_is_one_line_in_the_files_own_words(old, new, line):
     assert old in CUSTOM
     (found,) = told(CUSTOM.replace(old, new))
     assert line in found
 
 
-def test_a_name_in_many_places_is_one_line_and_the_hint_stands_before_a_long_list() -> None:
+def test_a_name_in_many_places_is_one_line_and_the_hint_stands_before_a_long_list():
     cells = "".join(f'{i}{j} = {{ type = "P", k = "D_q" }}\n' for i in "123" for j in "12345")
     names = "".join(f"{name} = 1.0\n" for name in ("D_p", "a", "b", "c", "d", "e", "f"))
     text = f'name = "a"\ntitle = ""\nsource = ""\n[parameters]\n{names}[phi]\n{cells}'

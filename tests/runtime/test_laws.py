@@ -72,13 +72,13 @@ def in_table(cell: str) -> tuple[list[str], list[str]]:
     )
 
 
-def test_the_catalogue_is_table_ii_and_what_the_text_names() -> None:
+def test_the_catalogue_is_table_ii_and_what_the_text_names():
     assert sorted(law_names()) == sorted([*ROWS, *BESIDE])
     assert law_names().index("vsg-2") < law_names().index("vsg-10"), "natural order"
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_elements_are_those_of_table_ii(name: str) -> None:
+def test_elements_are_those_of_table_ii(name):
     file, law = law_file(name), get_law(name)
     cells = ROWS[name].replace("|", " ").split()[1:]
     for (i, j), cell in zip(itertools.product(range(NU), range(NY)), cells, strict=True):
@@ -94,7 +94,7 @@ def test_elements_are_those_of_table_ii(name: str) -> None:
         assert law.element("psi", (i, j)).is_zero == (not psi)
 
 
-def test_every_cell_of_a_law_is_in_force() -> None:
+def test_every_cell_of_a_law_is_in_force():
     """The printed MIMO-GFM has zeros where Eq. (36) has an element; no other law has."""
     for name, law in LAWS.items():
         zero = {c for cells in (law.phi, law.psi) for c, e in cells.items() if e.is_zero}
@@ -102,14 +102,14 @@ def test_every_cell_of_a_law_is_in_force() -> None:
         assert zero == ({(1, 3), (1, 4), (2, 1)} if printed else set())
 
 
-def test_if_and_o_are_shared_where_the_table_marks_them() -> None:
+def test_if_and_o_are_shared_where_the_table_marks_them():
     """IF_1 of VSG-10 and O of VSG-11 and VSG-12 are the same on the error and on the feedback."""
     for name in ("vsg-10", "vsg-11", "vsg-12"):
         law = get_law(name)
         assert set(law.phi[1, 1].den) <= set(law.psi[1, 1].den)
 
 
-def test_psc_2_psc_3_and_vsg_8_share_the_frequency_control() -> None:
+def test_psc_2_psc_3_and_vsg_8_share_the_frequency_control():
     rows = {}
     for name in ("psc-2", "psc-3", "vsg-8"):
         file = law_file(name)
@@ -122,7 +122,7 @@ def test_psc_2_psc_3_and_vsg_8_share_the_frequency_control() -> None:
 
 
 @pytest.mark.parametrize("omega", [0.1, 3.0, 100 * np.pi, 1e4])
-def test_printed_mimo_gfm(omega: float) -> None:
+def test_printed_mimo_gfm(omega):
     """Section IV-A, number by number."""
     s = 1j * omega
     printed = [
@@ -135,7 +135,7 @@ def test_printed_mimo_gfm(omega: float) -> None:
 
 
 @pytest.mark.parametrize("omega", [0.1, 3.0, 100 * np.pi, 1e4])
-def test_printed_vsg_2(omega: float) -> None:
+def test_printed_vsg_2(omega):
     s = 1j * omega
     printed = [
         [90 + 400 / s, 0, 0, 0, 0],
@@ -145,7 +145,7 @@ def test_printed_vsg_2(omega: float) -> None:
     np.testing.assert_allclose(get_law("vsg-2")(s), printed, rtol=1e-13)
 
 
-def test_printed_structure_constraints() -> None:
+def test_printed_structure_constraints():
     """Eq. (33) to (35): phi_24 = D_q phi_25 and phi_34 = D_q phi_35, to the four digits printed."""
     law = get_law("mimo-gfm", k_24=0.3)
     assert law.phi[1, 3](1j) == pytest.approx(0.05 * law.phi[1, 4](1j))
@@ -153,7 +153,7 @@ def test_printed_structure_constraints() -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_number_of_states(name: str) -> None:
+def test_number_of_states(name):
     law = LAWS[name]
     assert realise(law).order == discretise(law, 1e-4).order == ORDERS[law.name]
 
@@ -185,14 +185,14 @@ def loewner_rank(law: Law) -> int:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_order_is_the_mcmillan_degree(name: str) -> None:
+def test_order_is_the_mcmillan_degree(name):
     law = LAWS[name]
     assert loewner_rank(law) == realise(law).order
 
 
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("s", [0.5 + 0j, 1j, 30j, 3000j, -0.2 + 4j])
-def test_realisation_has_the_elements_values(name: str, s: complex) -> None:
+def test_realisation_has_the_elements_values(name, s):
     law = LAWS[name]
     from_r, from_y = realise(law)(s)
     phi = np.array([[law.element("phi", (i, j))(s) for j in range(NY)] for i in range(NU)])
@@ -208,7 +208,7 @@ def cascade(T: float) -> Law:
 
 
 @pytest.mark.parametrize("T", [1e-3, 1.0])
-def test_spread_time_constants_stay_accurate(T: float) -> None:
+def test_spread_time_constants_stay_accurate(T):
     law = cascade(T)
     for s in (1e-5j / T, 1j / T, 100j / T):
         assert realise(law)(s)[0][1, 1] == pytest.approx(law.phi[1, 1](s), rel=1e-8)
@@ -225,7 +225,7 @@ def answer(name: str, column: int, on_reference: bool, ticks: int = 4000) -> np.
     return np.array([loop.step(ref, y)[1] for _ in range(ticks)]) - 1.0
 
 
-def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref() -> None:
+def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref():
     """Section II-C: equal for a disturbance at the output side, not at the input side."""
     t = (np.arange(4000) + 0.5) * 1e-4  # Tustin sees a step in the middle of its first interval
     lag = 0.01 * (1 - np.exp(-t / 0.2))
@@ -235,28 +235,28 @@ def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref() -> None:
     np.testing.assert_allclose(answer("droop-5", 1, on_reference=True), 0.01, rtol=1e-9)
 
 
-def test_a_scheduled_law_has_its_stages_in_order() -> None:
+def test_a_scheduled_law_has_its_stages_in_order():
     laws = load_law("mimo-gfm-scheduled")
     assert laws.schedule is not None and len(laws.laws) == len(laws.schedule.stages) >= 2
     assert get_law("mimo-gfm-scheduled") == laws.laws[0]
 
 
-def test_unknown_law_lists_the_known() -> None:
+def test_unknown_law_lists_the_known():
     with pytest.raises(LawError, match=r"law 'vsg-13': unknown; .*'vsg-12'"):
         load_law("vsg-13")
 
 
-def test_unknown_parameter_lists_the_known() -> None:
+def test_unknown_parameter_lists_the_known():
     with pytest.raises(LawError, match=r"parameter H: unknown to vsg-2; known: \['D_p'"):
         load_law("vsg-2", H=3.0)
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_every_parameter_has_a_source(name: str) -> None:
+def test_every_parameter_has_a_source(name):
     for parameter in LAWS[name].parameters.values():
         assert parameter.source and np.isfinite(parameter.value)
 
 
-def test_laws_are_plain_data() -> None:
+def test_laws_are_plain_data():
     assert isinstance(get_law("vsg-1").phi[1, 1], Element)
     assert union([e.den for e in get_law("mimo-gfm").phi.values()])

@@ -1,7 +1,5 @@
 """Gain scheduling: stages over the estimated reactance, hysteresis, dwell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -48,13 +46,13 @@ def at(c: Controller, X: float, ticks: int = 2) -> str:
     return c.active
 
 
-def test_the_estimate_counts_in_the_converters_frequency() -> None:
+def test_the_estimate_counts_in_the_converters_frequency():
     omega_b = 120 * np.pi
     c = Controller([load_law("mimo-gfm-scheduled")], T_S, list(REF), omega_b=omega_b)
     assert c.est["omega_b"][0] == omega_b
 
 
-def test_stages_follow_the_estimate_with_hysteresis() -> None:
+def test_stages_follow_the_estimate_with_hysteresis():
     c = scheduled()
     walk = [
         (0.05, 0), (0.105, 0), (0.109, 0), (0.111, 1), (0.1, 1), (0.091, 1), (0.089, 0),
@@ -65,7 +63,7 @@ def test_stages_follow_the_estimate_with_hysteresis() -> None:
         assert c.ctl["bump"][0] <= 1e-12
 
 
-def test_a_stage_stays_for_its_dwell() -> None:
+def test_a_stage_stays_for_its_dwell():
     c, u = scheduled(dwell_s=20 * T_S), np.zeros(3)
     c.est["X"] = 0.5
     stages = []
@@ -81,7 +79,7 @@ def test_a_stage_stays_for_its_dwell() -> None:
     assert stages[41:] == ["three[0]"] * 59
 
 
-def test_the_first_stage_is_that_of_x_0() -> None:
+def test_the_first_stage_is_that_of_x_0():
     s = load_law("mimo-gfm-scheduled")
     assert s.schedule is not None
     for X_0, stage in ((s.schedule.stages[0].X, 0), (s.schedule.stages[0].X * 1.01, 1)):
@@ -91,7 +89,7 @@ def test_the_first_stage_is_that_of_x_0() -> None:
         assert c.est["X"][0] == X_0
 
 
-def test_leaving_a_scheduled_law_ends_its_schedule() -> None:
+def test_leaving_a_scheduled_law_ends_its_schedule():
     c = scheduled()
     c.select("vsg-2")
     assert at(c, 0.5, 10) == "vsg-2"
@@ -100,7 +98,7 @@ def test_leaving_a_scheduled_law_ends_its_schedule() -> None:
     assert c.active == "three[0]" and c.est["X"][0] == 0.05, "the estimate starts again"
 
 
-def test_the_estimator_is_restarted_in_place() -> None:
+def test_the_estimator_is_restarted_in_place():
     """A compiled loop may hold the record."""
     c = scheduled()
     held = c.est
@@ -108,7 +106,7 @@ def test_the_estimator_is_restarted_in_place() -> None:
     assert c.est is held
 
 
-def test_too_many_stages() -> None:
+def test_too_many_stages():
     s = load_law("mimo-gfm-scheduled")
     with pytest.raises(LawError, match=f"9 stages; the controller holds {MAX_STAGES}"):
         Controller([LawSet("many", (s.laws[0],) * 9, s.schedule)], T_S, list(REF))

@@ -1,7 +1,5 @@
 """A change of law: no bump, the trend continues, the remaining difference decays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +33,7 @@ def change(
 
 
 @pytest.mark.parametrize("old", LAWS)
-def test_no_bump_from_any_law_to_any_other(old: str) -> None:
+def test_no_bump_from_any_law_to_any_other(old):
     """At the tick of change the new law's u equals the old law's."""
     for k, new in enumerate(LAWS):
         before = running(old, seed=k)
@@ -49,14 +47,14 @@ def test_no_bump_from_any_law_to_any_other(old: str) -> None:
         np.testing.assert_array_equal(after.step(ref, y), u)
 
 
-def test_float32_bump_is_rounding() -> None:
+def test_float32_bump_is_rounding():
     for k, new in enumerate(LAWS):
         before = running("vsg-12", k, np.float32)
         _, _, bump = change(before, DISCRETE[new], REF, REF + 0.003, np.float32)
         assert bump <= 2e-6, new
 
 
-def test_float32_states_are_those_of_float64() -> None:
+def test_float32_states_are_those_of_float64():
     """The maps must not lose the state in rounding, as they would from u[k] and u[k+1]."""
     for name in ("vsg-7", "vsg-10", "vsg-12"):
         states = []
@@ -73,7 +71,7 @@ WITH_TREND = {
 
 
 @pytest.mark.parametrize("name", WITH_TREND)
-def test_trend_is_carried_by_rows_with_two_states(name: str) -> None:
+def test_trend_is_carried_by_rows_with_two_states(name):
     """With constant inputs, u continues its trend."""
     before = running("vsg-2", seed=0)
     ref = y = REF.copy()
@@ -91,7 +89,7 @@ def test_trend_is_carried_by_rows_with_two_states(name: str) -> None:
     assert u[1] == pytest.approx(u_before[1], abs=2e-6)
 
 
-def test_trend_survives_the_change_itself() -> None:
+def test_trend_survives_the_change_itself():
     """A second change right after the first still knows the trend of u."""
     before = running("vsg-2", seed=0)
     for k in range(3000):
@@ -104,7 +102,7 @@ def test_trend_survives_the_change_itself() -> None:
 
 
 @pytest.mark.parametrize("T_off", [0.05, 0.2])
-def test_offset_of_stateless_rows_decays(T_off: float) -> None:
+def test_offset_of_stateless_rows_decays(T_off):
     """matching-2 has no states: the difference that it cannot absorb decays as exp(-t/T_off)."""
     law = replace(get_law("matching-2", k_dc=-1.0, k_31=-2.0), limits=Limits(T_off=T_off))
     before = running("vsg-2", seed=1)
@@ -120,13 +118,13 @@ def test_offset_of_stateless_rows_decays(T_off: float) -> None:
     assert np.abs(u - plain).min() > 1e-4
 
 
-def test_a_row_with_states_has_no_offset() -> None:
+def test_a_row_with_states_has_no_offset():
     before = running("droop-5", seed=2)
     after, _, _ = change(before, DISCRETE["vsg-2"], REF, REF + 0.002)
     assert np.abs(after.state["offset"]).max() < 1e-15
 
 
-def test_tighter_limits_are_reported_as_a_bump() -> None:
+def test_tighter_limits_are_reported_as_a_bump():
     before = running("vsg-2", seed=1)
     ref, y = REF, REF - [0.0, 0.0, 0.0, 0.0, 0.001]
     expected = before.step(ref, y)
@@ -139,7 +137,7 @@ def test_tighter_limits_are_reported_as_a_bump() -> None:
     assert u[:2] == pytest.approx(expected[:2], abs=1e-12)
 
 
-def test_limited_omega_u_does_not_spoil_the_other_rows() -> None:
+def test_limited_omega_u_does_not_spoil_the_other_rows():
     """VSG-3 feeds omega_u to E_u: a tighter limit of omega_u makes a bump of omega_u alone."""
     before = running("vsg-2", seed=1)
     expected = running("vsg-2", seed=1).step(REF, REF)
@@ -151,7 +149,7 @@ def test_limited_omega_u_does_not_spoil_the_other_rows() -> None:
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_law_at_rest_is_taken_over_at_rest(name: str) -> None:
+def test_a_law_at_rest_is_taken_over_at_rest(name):
     """If u is already the new law's resting output, it stays there without a transient."""
     discrete = DISCRETE[name]
     before = Running.of(DISCRETE["matching-2"])
@@ -187,7 +185,7 @@ def custom(element: Element, u_start: float = 1.0) -> DiscreteLaw:
     ],
     ids=["I-IF", "PI-IF-IF", "I-O", "four", "fast"],
 )
-def test_rows_of_many_states(element: Element) -> None:
+def test_rows_of_many_states(element):
     """Integrators, double and spread poles in one row: no bump, and no kick afterwards."""
     before = running("vsg-2", seed=4)
     ref, y = REF, REF + np.array([0.0, 0.0, 0.0, 0.0, 0.01])
@@ -200,7 +198,7 @@ def test_rows_of_many_states(element: Element) -> None:
     np.testing.assert_array_equal(us[0], u)
 
 
-def test_set_points_that_follow_a_reference() -> None:
+def test_set_points_that_follow_a_reference():
     """matching-1's i_0 is P_ref, E_0 is V_ref: they count as part of the new law's output."""
     ref = REF + np.array([0.0, 0.3, 0.0, 0.0, 0.02])
     before = running("vsg-2", seed=5)

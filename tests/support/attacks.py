@@ -11,8 +11,6 @@ measured through the fixture ``attack_now``::
 writes the table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The parts of a CAN node separately, with messages as bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfm_hil.links.can.layout import Plan

@@ -1,7 +1,5 @@
 """Reference of a run over CAN: the same run in one process, with cantools instead of our codec."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

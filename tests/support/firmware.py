@@ -1,7 +1,5 @@
 """Exported firmware to compile in tests, and the compilers."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Mapping
 from dataclasses import replace

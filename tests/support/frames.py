@@ -1,7 +1,5 @@
 """Frames with a good CRC and wrong content."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from typing import Any

@@ -1,7 +1,5 @@
 """Links to test, and both sides of a run in two threads of this process."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """An independent computation of the loop's matrix, from the emulator's record of its delay."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Helpers of the Modbus server's tests."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

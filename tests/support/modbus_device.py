@@ -1,7 +1,5 @@
 """A Modbus device over a made-up run."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 

@@ -1,7 +1,5 @@
 """Starts `gfmhil` as a process, finds its roles' processes, waits for their recording."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

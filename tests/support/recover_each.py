@@ -6,8 +6,6 @@ each line of its input, the words of a command in JSON. For each it prints a lin
 said.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -19,12 +17,17 @@ from pathlib import Path
 from gfm_hil.cli import main
 
 PATIENCE_S = 60
-FILES_KB = 0  # mapped from files by this process: a child has them too, but does not count them
+FILES_KB = 0  # mapped from files by this process: a child has them too, but counts what it touches
+
+
+def mapped_files_kB() -> int:
+    """What this process has mapped from files and touched, in kB."""
+    return int(Path("/proc/self/status").read_text().partition("RssFile:")[2].split()[0])
 
 
 def call(words: list[str]) -> dict[str, object]:
     """Carry out a command in a child."""
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as touched:
         child = os.fork()
         if child == 0:
             os.dup2(said.fileno(), 1)
@@ -37,15 +40,18 @@ def call(words: list[str]) -> dict[str, object]:
             except BaseException:
                 sys.excepthook(*sys.exc_info())
             finally:
+                os.write(touched.fileno(), str(mapped_files_kB()).encode())
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(code)
         _, status, used = os.wait4(child, 0)
         said.seek(0)
+        touched.seek(0)
+        untouched_kB = max(FILES_KB - int(touched.read() or 0), 0)
         return {
             "code": os.WEXITSTATUS(status) if os.WIFEXITED(status) else None,
             "cpu_s": used.ru_utime + used.ru_stime,
-            "peak_MB": (used.ru_maxrss + FILES_KB) / 1e3,
+            "peak_MB": (used.ru_maxrss + untouched_kB) / 1e3,
             "said": said.read(200_000).decode("utf-8", "replace"),
         }
 
@@ -53,7 +59,7 @@ def call(words: list[str]) -> dict[str, object]:
 if __name__ == "__main__":
     with contextlib.redirect_stdout(sys.stderr):
         main(["recover", sys.argv[1]])
-    FILES_KB = int(Path("/proc/self/status").read_text().partition("RssFile:")[2].split()[0])
+    FILES_KB = mapped_files_kB()
     print("ready", flush=True)
     for line in sys.stdin:
         print(json.dumps(call(json.loads(line))), flush=True)

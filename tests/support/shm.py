@@ -1,7 +1,5 @@
 """Endpoints and headers of shared-memory links."""
 
-from __future__ import annotations
-
 import secrets
 import struct
 from collections.abc import Iterator

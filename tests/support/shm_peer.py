@@ -4,8 +4,6 @@
 the other side's n, all in compiled code, and prints how many arrived and how many were wrong.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -1,7 +1,5 @@
 """The soak test's measurements of each process, and its clients that connect and disconnect."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import itertools

@@ -1,7 +1,5 @@
 """A kernel with CAN as a process: user-mode Linux on the host's files, which runs one job."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """A run in name only for the XCP slave, and packets as XCP's tables have them."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

@@ -239,7 +239,8 @@ def why_it_ended(run: Run | NetworkRun) -> str:
     """As ``why_unstable``, of a run that did not last, or still oscillated at its end, under laws
     of ours."""
     each = [*run.values()] if isinstance(run, NetworkRun) else [run]
-    if all(one.status in ("completed", "interrupted") for one in each) or run.folder is None:
+    early = [one for one in each if one.status not in ("completed", "interrupted")]
+    if run.folder is None or not any(one.summary["ticks"] for one in early):  # none ever began
         return ""
     ours = all(target_of(one.summary["controller"]) is not None for one in each)
     return why_unstable(run.scenario, run.folder / "scenario.toml") if ours else ""

@@ -152,10 +152,10 @@ def _print(result: Conformity, wall_s: float) -> None:
         for case in result.cases:
             verdict = result.matrix[result.laws[0], case.id]
             wrong = [
-                f"{f.part}: {text}" if f.part else text
+                ": ".join(filter(None, [f.part, *said]))
                 for f in result.of(result.laws[0], case.id)
                 if f.verdict == verdict != PASS
-                for text in dict.fromkeys(v.text for v in f.wrong) or [f.reason]
+                for said in dict.fromkeys((v.clause, v.text) for v in f.wrong) or [(f.reason,)]
             ]
             rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
         console.print(Table(("test", "", "why"), rows, text=None))

@@ -73,9 +73,22 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+class _Parser(argparse.ArgumentParser):
+    """Names the choice that is most like an unknown one."""
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as problem:
+            from gfm_runtime.errors import meant
+
+            problem.message += meant(value, action.choices or ())
+            raise
+
+
 def parser(command: str | None = None) -> argparse.ArgumentParser:
     """The parser of one command with its options; that of no command only lists all of them."""
-    top = argparse.ArgumentParser(
+    top = _Parser(
         prog="gfmhil", description="Hardware-in-the-loop bench for grid-forming converter control."
     )
     top.add_argument("--version", action=_Version, help="print the version")
@@ -147,7 +160,12 @@ def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Ex
             for inside in action.choices.values() if isinstance(action.choices, dict) else ():
                 yield from options(inside)
 
-    close = meant(words[0].partition("=")[0], set(options(top)))
+    known, first = set(options(top)), words[0]
+    close = meant(first.partition("=")[0], known)
+    if first.endswith(".toml") and "--law" in known:
+        close = f"; a law's file comes after --law, a scenario's before all options: --law {first}"
+    elif "=" in first and not first.startswith("-"):
+        close = "; a scenario's file says such values, an option changes what --help lists"
     return UserError(f"{' '.join(words)}: gfmhil {command} does not know it{close}")
 
 

@@ -15,7 +15,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
 from gfm_hil.realtime.priority import processors
-from gfm_hil.recording.log import Outcome
+from gfm_hil.recording.log import Outcome, read_events
 from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.scenario import Scenario
 from gfm_runtime.children import end_now, guarded
@@ -241,6 +241,12 @@ class Processes:
             crashes = [process.crash for process in first or crashed]
             if crashes and self.interrupt.came:
                 found[name] = Outcome("interrupted", "stopped by the operator", 0)
-            elif crashes:
+            elif first or (crashes and not self._says_why(name)):
                 found[name] = Outcome("safe", "; ".join(crashes), 0)
         return found
+
+    def _says_why(self, name: str) -> bool:
+        """Whether a role recorded why the run of a converter did not complete. That counts before
+        our signal, which ended a process that was left over."""
+        lines = read_events(self._places[name], self.scenario.ticks)
+        return any(e["event"] == "end" and e["status"] != "completed" for e in lines)

@@ -31,8 +31,9 @@ class Rise(Windowed):
         there = sign * (m.raw("p")[m.tick : m.last] - w.before) >= self.part * way
         took = float(np.argmax(there)) * m.T_s if there.any() else math.inf
         text = (
-            f"p has done {100 * self.part:g} % of the way to its peak of {way:.3g} p.u. after "
-            f"{1e3 * took:.3g} ms; at most {1e3 * self.within:g} ms are allowed."
+            f"p has done {100 * self.part:g} % of its way to the peak, which is a change of "
+            f"{way:.3g} p.u., after {1e3 * took:.3g} ms; at most {1e3 * self.within:g} ms are "
+            "allowed."
         )
         limit = f"within {1e3 * self.within:g} ms"
         return m.says(took <= self.within + 1e-9, 1e3 * took, "ms", limit, text, "p")
