@@ -61,8 +61,7 @@ def test_stage_delay_sensors_and_frequency():
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("law", "inner"),
-    [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")],
+    ("law", "inner"), [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")]
 )
 def test_one_percent_from_1_hz_to_1_khz(law, inner):
     found = gfmhil.scan(law, inner=inner)

@@ -118,10 +118,7 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
         ),
         ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: must be > 0, not 0.0"),
         ('{type = "virtual-stator", I_thr = 1.0}', "inner.I_thr = 1.0: unknown key"),
-        (
-            '{type = "cascaded", priority = "e"}',
-            "priority: must be 'circular', 'd', 'q' or",
-        ),
+        ('{type = "cascaded", priority = "e"}', "priority: must be 'circular', 'd', 'q' or"),
         ('{type = "cascaded", I_max = "x"}', "inner.I_max: unknown parameter 'x'; known: ['D_p',"),
         (
             '{type = "cascaded", power = {P_max = 0.1, P_min = 0.2}}',
