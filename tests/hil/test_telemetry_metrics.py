@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from gfm_hil.cli import main
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams.follow import Follower
 from gfm_hil.ports.streams.metrics import METRICS
@@ -119,11 +120,11 @@ def test_before_a_run_there_is_nothing_to_collect():
         assert scraped(port) == {}
 
 
-def test_what_is_missing_is_said(refused, monkeypatch, recorded):
+def test_what_is_missing_is_said(capsys, refused, monkeypatch, recorded):
     with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
-        command = ["stream", str(recorded.folder), "--port", "0", "--prometheus"]
-        line = refused(*command, str(port))
-    assert f"--prometheus {port}: 127.0.0.1: Address already in use" in line
+        words = ["stream", str(recorded.folder), "--port", "0", "--prometheus", str(port)]
+        assert main(words) == 2
+    assert f"--prometheus {port}: 127.0.0.1: Address already in use" in capsys.readouterr().err
     monkeypatch.setattr("gfm_hil.core.errors.importlib.util.find_spec", lambda name: None)
     assert "pip install 'gfmhil[metrics]'" in refused("stream", "x", "--prometheus", "0")
 
