@@ -14,7 +14,7 @@ from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import signals_of

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gfm_design.norms.performance import PAPER_WEIGHTS
-from gfm_design.tuning.paper_problem import LATE
+from gfm_design.tuning.paper import LATE
 from gfm_hil.api.law import Law
 from gfm_hil.cli.main import main
 from gfm_runtime import law_file

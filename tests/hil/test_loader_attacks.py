@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gfm_design.norms.weights import read_weights
+from gfm_design.norms.performance import read_weights
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.setup import make_bench

@@ -9,7 +9,7 @@ import pytest
 import gfmhil
 from gfm_design.norms.performance import PAPER_WEIGHTS
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import write_scenario

@@ -14,21 +14,25 @@ import pytest
 from gfm_hil.cli import main
 from gfm_runtime import LawError
 from gfm_runtime.firmware import CHECKED, FIXED, SHIPPED, TARGETS, check, make_modules, prove
-from gfm_runtime.firmware.deviation import NEAR, deviations
 from gfm_runtime.firmware.fixed import (
     G_MOST,
+    NEAR,
     REFS,
     TREND,
     US,
     WORD,
     YS,
     ClampedRow,
+    Instance,
     X,
+    deviations,
     make_fixed,
     powers,
+    refusal,
     sector,
+    sine_of_half,
+    to_integers,
 )
-from gfm_runtime.firmware.fixed_tick import Instance, refusal, sine_of_half, to_integers
 from gfm_runtime.firmware.golden import RESET, SEGMENT, SWITCH, inputs
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.kernel import state_dtype, step
