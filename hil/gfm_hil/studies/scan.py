@@ -593,7 +593,7 @@ class _Path:
             speeds = np.column_stack([speed, speed_g])
             stretches.append((begin * T_s, (end - begin) * T_s, at, speeds))
             angle = angle + speed * (end - begin) * T_s
-        modes, sources = plant.wiring.modes(frozenset(), False)
+        modes, sources = plant.wiring.modes(frozenset(), None)
         drive = modes.drive[:, [sources.index(plant.wiring.units[0].bridge),
                                 sources.index(GRID_SOURCE)]]  # fmt: skip
         rates = modes.rates - 1j * steady
