@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
+from gfm_hil.engine.compiling import compile_external, compiled_benches
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import (
     Notice,
@@ -234,10 +234,10 @@ def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
             if kind in seen:
                 continue
             if job.external is not None:
-                compiled_bench(scenario, notice, ("plant",))
+                compiled_benches(scenario, notice, ("plant",))
                 compile_external(scenario, notice)
             else:
-                (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
+                compiled_benches(scenario, notice)
             seen.add(kind)
 
 
