@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from gfm_plant.build import CONNECTION, FAR, LINE
 from gfm_plant.circuit import GROUND, Branch
 from gfm_plant.components.finite_grid import FiniteGrid
-from gfm_plant.emulator import reconnect, synchronise
+from gfm_plant.emulator import clear, reconnect, synchronise
 from gfm_plant.model import DELTA
-from gfm_plant.names import FAULTED_PHASES
+from gfm_plant.names import CLEARINGS, FAULTED_PHASES
 from gfm_plant.network import Network
 from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
 from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
@@ -99,6 +99,7 @@ def fault(
     kind: str = "3ph",
     phases: str | None = None,
     Z_0: complex | None = None,
+    clearing: str = "zero",
 ) -> None:
     """Short phases through `R`: all three or one (LG) or two (LLG) of them to ground, or two (LL).
 
@@ -120,6 +121,8 @@ def fault(
         Z_0: Impedance R + jX, X at nominal frequency, between the place and ground for the zero
             sequence of LG and LLG, p.u. of the first converter; None: that of the closed lines
             between the place and earthed star points, with their own L and R.
+        clearing: "zero": from the end of its duration on, or a call of `clear_fault`, each phase
+            opens as soon as its current passes zero; "instant": all phases open at once.
 
     Raises:
         ValueError: If there is no such place or kind, or a value is out of range. The plant is then
@@ -133,7 +136,9 @@ def fault(
     _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    place = FaultPlace(node, inside, position or 0.0, R, kind, phases, Z_0)
+    if clearing not in CLEARINGS:
+        raise ValueError(f"clearing = {clearing!r}: must be one of {list(CLEARINGS)}")
+    place = FaultPlace(node, inside, position or 0.0, R, kind, phases, Z_0, clearing)
     changed = replace(wiring, fault=place)
     if kind in ("LG", "LLG") and changed.zero_sequence() is None:
         raise ValueError(
@@ -141,7 +146,8 @@ def fault(
             f" grid or of a transformer; an {kind} fault needs a path to ground"
         )
     plant.rewire(changed)
-    plant.now["faulted"], plant.now["fault_left"] = 1, math.inf if duration is None else duration
+    plant.now["faulted"], plant.now["clearing"] = 1, 0
+    plant.now["fault_left"] = math.inf if duration is None else duration
     reconnect(plant.records)
 
 
@@ -195,9 +201,8 @@ def _place(
 
 
 def clear_fault(plant: Network) -> None:
-    """Clear the fault, if there is one."""
-    plant.now["faulted"] = 0
-    reconnect(plant.records)
+    """Clear the fault, if there is one: at once, or phase by phase as their currents pass zero."""
+    clear(plant.records)
 
 
 def grid_unbalance(

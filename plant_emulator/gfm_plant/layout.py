@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
 
+MOST_FAULTS = 8
+"""None, one of three phases, and what is left of it as these open: two of them, or one."""
+
 Record = NDArray[np.void]
 _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
 
@@ -28,7 +31,8 @@ _NET: _Arrays = {
     "emf": (float, ("n_s",)),  # p.u.; the constant voltage of a component, at its source's place
     # one sampling period in stretches, between the instants at which a command begins to act; each
     # is cut into pieces for Simpson's rule, and each piece in halves. Another cut of each, n_parts
-    # places further on, lets a peak-current limit look at the current
+    # places further on, lets a peak-current limit look at the current; the last one is for what
+    # ends where a phase of a fault opens, see `clearing`
     "stretch": (float, ("n_parts",)),  # s
     "pieces": (int, ("n_cuts",)),
     "half_h": (float, ("n_cuts",)),  # s
@@ -36,6 +40,7 @@ _NET: _Arrays = {
     # of first-order lags over a piece, the sensors of each converter first: weights of the last
     # value, and of the parabola through the input
     "lag_weights": (float, ("n_cuts", "n_lags", 4)),
+    "lag_rate": (float, ("n_lags",)),  # 1/s
     # the modes of each circuit
     "n_modes": (int, ("n_c",)),
     "rate": (complex, ("n_c", "n_z")),  # 1/s
@@ -45,6 +50,10 @@ _NET: _Arrays = {
     "modes": (complex, ("n_c", "n_z", "n_w")),
     "unbalanced": (int, ("n_c",)),
     "mirror": (complex, ("n_c", "n_z")),  # see `circuit.Modes`
+    # of the faults: the current of each phase by w, and the fault that is left when it opens (-1:
+    # it carries none), see `Wiring.faults`
+    "fault_current": (complex, ("n_faults", 3, "n_w")),
+    "fault_next": (int, ("n_faults", 3)),
     # of a synchro-check: the voltages of its two sides by w and by the sources
     "check_w": (float, ("n_c", 2, "n_w")),
     "check_s": (float, ("n_c", 2, "n_s")),
@@ -81,6 +90,7 @@ net_dtype = _header(
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
+        ("fault_w", "i8"),  # place of the fault's own current, -1: it has none
         # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;
         # for how long, s
         ("check_limits", "f8", (3,)),
@@ -90,16 +100,16 @@ net_dtype = _header(
 )
 """Of the parameters of a network.
 
-Circuits come in pairs of one row each without and with the fault: row 0 as the converters are, and
-row 1 + k with the bridge of converter k blocked besides. Sources are the bridges, then the positive
-and the negative sequence of the grid, then the voltages and the currents of components; in an
-unbalanced circuit their mirror images follow in the same order. Such a circuit has up to two modes
-a state.
+Circuits come in groups, one for each of `Wiring.faults`, the first of which is none: row 0 of a
+group as the converters are, and row 1 + k with the bridge of converter k blocked besides. Sources
+are the bridges, then the positive and the negative sequence of the grid, then the voltages and the
+currents of components; in an unbalanced circuit their mirror images follow in the same order. Such
+a circuit has up to two modes a state.
 """
 
 now_dtype = _header(
     [
-        ("row", "i8"),  # of the circuits, without the fault
+        ("row", "i8"),  # in the group of circuits
         # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
         ("closed", "i8"),
         ("omega_g", "f8"),
@@ -114,8 +124,9 @@ now_dtype = _header(
         # positive and negative sequence over V_g, and s until they are 1 and 0 again
         ("sequence", "c16", (2,)),
         ("unbalance_left", "f8"),
-        ("faulted", "i8"),
+        ("faulted", "i8"),  # place in `Wiring.faults`
         ("fault_left", "f8"),  # s until the fault is cleared
+        ("clearing", "i8"),  # whether each of its phases opens as soon as its current passes zero
         # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
         # `check_limits`, for how long they have been within, and the time that is left, s; ticks in
         # a row in which both sides were alive
@@ -144,8 +155,9 @@ def make_net_and_now(
     """
     lengths = {
         "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
-        "n_phasors": 2 * sources, "n_c": 2 * (converters + 1), "n_parts": parts,
-        "n_cuts": 2 * parts, "n_lags": lags,
+        "n_phasors": 2 * sources, "n_faults": MOST_FAULTS,
+        "n_c": MOST_FAULTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
+        "n_lags": lags,
     }  # fmt: skip
     return _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
 

@@ -51,6 +51,10 @@ FAULTED_PHASES: dict[str, tuple[str, ...]] = {
 """The phases that each kind of fault may connect, the usual ones first. Of an unbalanced kind they
 stand in the order of the phase that differs from the two others: a, b, c."""
 
+CLEARINGS = "zero", "instant"
+"""How a fault is cleared: phase by phase where their currents pass zero, as the breakers around it
+do, or in all phases at one instant."""
+
 SENSED = tuple(k for k, name in enumerate(Y_NAMES) if name not in U_NAMES)
 """Indices of the y that pass the sensors; omega_u is a command and known exactly."""
 

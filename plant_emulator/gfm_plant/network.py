@@ -100,7 +100,7 @@ class Network:
         now, N, wiring = self.now[0], len(self.par), self.wiring
         turn = np.exp(1j * x[:, DELTA])
         now["unit"][:N] = turn
-        modes, sources = wiring.modes(wiring.blocked, False)
+        modes, sources = wiring.modes(wiring.blocked, None)
         order, omega_b, place_of = wiring.order, wiring.omega_b, wiring.sources()
         volts = {unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(wiring.units)}
         turns = {unit.bridge: float(u[k, 1]) for k, unit in enumerate(wiring.units)}
@@ -145,7 +145,11 @@ class Network:
             ValueError: as ``connect``; the plant is then unchanged.
         """
         before, w = self.wiring, self.now["w"][0].copy()
+        fault = before.faults[int(self.now["faulted"][0])]
         self.connect(wiring)
+        if fault is not None:  # what is left of it may be another kind, for want of a way to ground
+            phases = ["" if one is None else one.phases for one in wiring.faults]
+            self.now["faulted"] = phases.index(fault.phases) if fault.phases in phases else 0
         if wiring.split is not None and wiring.split != before.split:
             there = wiring.order.index(wiring.split)
             self.now["w"][0, wiring.order.index("beyond")] = w[there]
@@ -189,9 +193,10 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     found, which = {}, {}
     for k in range(N + 1):
         blocked = frozenset(wiring.blocked | ({k - 1} if k > 0 else set()))
-        for fault in (False, True) if wiring.fault else (False,):
-            which[k + (N + 1) * fault] = blocked, fault
-            found[k + (N + 1) * fault] = wiring.modes(blocked, fault)
+        for j, fault in enumerate(wiring.faults):
+            which[k + (N + 1) * j] = blocked, fault
+            found[k + (N + 1) * j] = wiring.modes(blocked, fault)
+    _pack_faults(net, wiring)
     _pack_pieces(plant, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     places = wiring.sources()
     net["check_w"] = net["check_s"] = 0.0
@@ -218,6 +223,22 @@ def _connect(plant: Network, wiring: Wiring) -> None:
                 net["check_s"][circuit, side, places[source]] = factor
 
 
+def _pack_faults(net: Any, wiring: Wiring) -> None:
+    """Set what the phases of a fault carry, and what is left of it when one of them opens."""
+    faults, order = wiring.faults, wiring.order
+    to_ground = wiring.zero_sequence() is not None
+    net["fault_next"] = -1
+    net["fault_w"] = order.index("fault") if "fault" in order else -1
+    for j, fault in enumerate(faults):
+        if fault is not None:
+            net["fault_current"][j, :, : len(order)] = wiring.fault_current(fault)
+            for p, phase in enumerate("abc"):
+                carries = phase in fault.phases and fault.clearing == "zero"
+                net["fault_next"][j, p] = (
+                    faults.index(fault.opened(phase, to_ground)) if carries else -1
+                )
+
+
 def _pack_pieces(plant: Network, fastest: float) -> None:
     """Choose the pieces of Simpson's rule, and the DC link's steps in them, by the fastest mode."""
     net = plant.net[0]
@@ -233,7 +254,7 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
     each = np.concatenate([stretch, stretch])
     most = np.repeat([longest, _LOOK], parts)
     pieces = np.ceil(each * np.maximum(fastest / (2 * _PIECE), (1 - 1e-9) / most))
-    net["pieces"], net["half_h"] = pieces, each / pieces / 2
+    net["pieces"][:-1], net["half_h"][:-1] = pieces, each / pieces / 2
     for r in plant.par:
         per_C = r["omega_b"] / r["C_dc"]
         rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
@@ -245,9 +266,11 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
                 f" rad/s; allowed are {_DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
             )
         r["dc_steps"] = max(1, math.ceil(rate * 2 * max(net["half_h"][:parts]) / _DC_STEP))
-    for part, half in enumerate(net["half_h"]):
+    lags = [lag for _, one, _ in plant.fed() if (lag := one.lag()) is not None]
+    net["lag_rate"] = [*plant.par["omega_s"], *(1 / lag for lag in lags)]
+    for part, half in enumerate(net["half_h"][:-1]):
         spans = [float(r["omega_s"] * 2 * half) for r in plant.par]
-        spans += [2 * half / lag for _, one, _ in plant.fed() if (lag := one.lag()) is not None]
+        spans += [2 * half / lag for lag in lags]
         net["lag_weights"][part] = [_low_pass(float(x)) for x in spans]
 
 

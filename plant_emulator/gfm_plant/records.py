@@ -112,7 +112,8 @@ converter_state_dtype = np.dtype(
         ("seen", "f8", (3, 3)),
         ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
-        ("before", "f8", (8,)),  # at the last tick: delta, v_dc, DC source (2), sensors (4)
+        # when kept: delta, v_dc, DC source (2), sensors (4), and what the bridge was commanded (3)
+        ("before", "f8", (11,)),
         # protection: ticks in a row that each threshold was crossed, and the latched trip
         ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
         # one cycle: ticks looked at; sums over them of i^2 and of the turn of the capacitor's

@@ -53,14 +53,15 @@ def turned(x: float) -> complex:
 
 
 @compiled
-def mirror_at(n: Any, tick: int) -> complex:
-    """Return e^(-2 j omega_b t) at a tick: the mirror image of x is conj(x) times that."""
+def mirror_at(n: Any, tick: float) -> complex:
+    """Return e^(-2 j omega_b t) at a tick, or between two: the mirror image of x is conj(x) times
+    that."""
     angle = -2.0 * n.omega_b * n.T_s * tick
     return complex(math.cos(angle), math.sin(angle))
 
 
 @compiled
-def mirror_sources(n: Any, now: Any, tick: int) -> None:
+def mirror_sources(n: Any, now: Any, tick: float) -> None:
     """Set the unit phasors of the sources' mirror images."""
     unit, turn = field(now, "unit"), mirror_at(n, tick)
     for k in range(now.n_s):
@@ -200,13 +201,59 @@ def read_states(n: Any, now: Any, c: int) -> None:
 @compiled
 def circuit(n: Any, now: Any) -> int:
     """Return which circuit is in force."""
-    return now.row + (n.n_converters + 1 if now.faulted else 0)
+    return now.row + (n.n_converters + 1) * now.faulted
 
 
 @compiled
-def enter(n: Any, now: Any, tick: int, c: int) -> None:
-    """Start the modes of circuit c at a tick from w, which is projected onto what that circuit can
-    hold."""
+def cut_to(n: Any, now: Any, c: int, h: float, longest: float) -> int:
+    """Make the last cut ready for a part of a stretch, in circuit c; returns its place.
+
+    Args:
+        n, now, c: as for `drive`.
+        h: how long the part is, s.
+        longest: that a piece may be, s.
+    """
+    cut = 2 * n.n_parts
+    pieces = max(1, math.ceil(h / longest))
+    half = 0.5 * h / pieces
+    field(n, "pieces")[cut], field(n, "half_h")[cut] = pieces, half
+    rate, decay = field(n, "rate"), field(n, "decay")
+    for m in range(field(n, "n_modes")[c]):
+        decay[c, cut, m] = turned(rate[c, m].imag * half) * math.exp(rate[c, m].real * half)
+    known, lags, weights = field(now, "gain_omega"), field(n, "lag_rate"), field(n, "lag_weights")
+    for k in range(now.n_phasors):
+        known[cut, k] = math.inf
+    for k in range(len(lags)):
+        weights[cut, k, 0], f_1, f_2, f_3 = _integrals(2.0 * half * lags[k])
+        x = 2.0 * half * lags[k]
+        weights[cut, k, 1] = x * (f_1 - 3.0 * f_2 + 4.0 * f_3)
+        weights[cut, k, 2] = x * (4.0 * f_2 - 8.0 * f_3)
+        weights[cut, k, 3] = x * (4.0 * f_3 - f_2)
+    return cut
+
+
+@compiled
+def _integrals(x: float) -> tuple[float, float, float, float]:
+    """Return e^-x and the integrals over t from 0 to 1 of e^(-x (1 - t)) t^(k - 1) / (k - 1)! for
+    k = 1, 2, 3."""
+    if x > 1.0:
+        whole = math.exp(-x)
+        f_1 = (1.0 - whole) / x
+        f_2 = (1.0 - f_1) / x
+        return whole, f_1, f_2, (0.5 - f_2) / x
+    f_3, term = 0.0, 1.0 / 6.0
+    for k in range(4, 24):  # of (-x)^n / (n + 3)!
+        f_3 += term
+        term *= -x / k
+    f_2 = 0.5 - x * f_3
+    f_1 = 1.0 - x * f_2
+    return 1.0 - x * f_1, f_1, f_2, f_3
+
+
+@compiled
+def enter(n: Any, now: Any, tick: float, c: int) -> None:
+    """Start the modes of circuit c at a tick, or between two, from w, which is projected onto what
+    that circuit can hold."""
     known, modes, mirror = field(now, "gain_omega"), field(n, "modes"), field(n, "mirror")
     z, w = field(now, "z"), field(now, "w")
     for part in range(len(known)):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,7 @@ class FaultPlace:
         phases: one of that kind.
         Z_0: R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the
             grid, see `Wiring.zero_sequence`.
+        clearing: of `CLEARINGS`.
     """
 
     node: str
@@ -92,6 +93,7 @@ class FaultPlace:
     kind: str = "3ph"
     phases: str = "abc"
     Z_0: complex | None = None
+    clearing: str = "instant"
 
     @property
     def balanced(self) -> bool:
@@ -102,6 +104,29 @@ class FaultPlace:
     def angle(self) -> float:
         """The axis of the phase that differs, rad."""
         return 2 * math.pi / 3 * FAULTED_PHASES[self.kind].index(self.phases)
+
+    def opened(self, phase: str, to_ground: bool) -> FaultPlace | None:
+        """What is left where the current of a phase has been interrupted; None: nothing.
+
+        Args:
+            to_ground: whether a zero sequence has a path. Without one, one phase carries nothing.
+        """
+        left = self.phases.replace(phase, "")
+        if self.kind == "LL" or not left or (len(left) == 1 and not to_ground):
+            return None
+        kind = "LG" if len(left) == 1 else "LLG" if to_ground else "LL"
+        return replace(self, kind=kind, phases="ca" if left == "ac" else left)
+
+    def phase_current(self, phase: str) -> tuple[float, float]:
+        """The current of a phase as factors of those that the fault takes on the two axes.
+
+        A zero sequence comes with them: i_0 = i_alpha / 2 for LG, -i_alpha for LLG.
+        """
+        if phase not in self.phases:
+            return 0.0, 0.0
+        behind = 2 * math.pi / 3 * "abc".index(phase) - self.angle
+        zero = {"LG": 0.5, "LLG": -1.0}.get(self.kind, 0.0)
+        return math.cos(behind) + zero, math.sin(behind)
 
     def seen(self, axis: int, Z_0: complex | None) -> complex | None:
         """The impedance that the fault puts between the circuit of an axis and ground, p.u.; None:
@@ -175,10 +200,10 @@ class Wiring:
     def order(self) -> tuple[str, ...]:
         """Names of the states as w has them: three a converter, the branches, the banks' voltages,
         and what a fault adds: the current beyond it within a branch, and its own through the
-        inductance of the zero sequence's path."""
+        inductance of the zero sequence's path, which a fault of three phases has as they open."""
         own = tuple(name for unit in self.units for name in unit.states)
         beyond: tuple[str, ...] = () if self.split is None else ("beyond",)
-        if self.fault is not None and self.fault.kind in ("LG", "LLG"):
+        if any(one is not None and one.kind in ("LG", "LLG") for one in self.faults):
             beyond += ("fault",)
         others = [part.name for part in (*self.branches, *self.fed_branches)]
         others += [bank.name for bank in self.capacitors]
@@ -265,29 +290,72 @@ class Wiring:
         to_ground: tuple[Shunt | CurrentSource, ...] = (*self.shunts, *self.sinks)
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
-    def modes(self, blocked: frozenset[int], faulted: bool) -> tuple[Modes, list[str]]:
+    @property
+    def faults(self) -> tuple[FaultPlace | None, ...]:
+        """No fault, the fault, and what may be left of it while its phases open one by one."""
+        found: list[FaultPlace | None] = [None]
+        if self.fault is None:
+            return (None,)
+        waiting: list[FaultPlace | None] = [self.fault]
+        to_ground = self.zero_sequence() is not None
+        while waiting:
+            one = waiting.pop(0)
+            if one in found or one is None:
+                continue
+            found.append(one)
+            if one.clearing == "zero":
+                waiting += [one.opened(phase, to_ground) for phase in one.phases]
+        return tuple(found)
+
+    def fault_current(self, fault: FaultPlace) -> NDArray[np.complex128]:
+        """The currents of phases a, b, c through a fault, (3, n_w): each is the real part of what
+        this gives with w, in the frame that stands still."""
+        place = "beyond" if self.split else fault.node
+        to_axis = np.zeros((2, len(self.order)))
+        for axis in (ALPHA, BETA):
+            seen = fault.seen(axis, self.zero_sequence())
+            if seen is None:
+                continue
+            if seen.imag > 0:
+                to_axis[axis, self.order.index("fault")] = 1.0
+                continue
+            branches, capacitors, _, shunts, _ = self._circuit(frozenset(), fault, axis)
+            bank = next((one.name for one in capacitors if one.node == place), None)
+            if bank is not None:
+                to_axis[axis, self.order.index(bank)] = 1 / seen.real
+                continue
+            R = next(one.R for one in shunts if one.node == place)  # with what else is there
+            for branch in branches:
+                for end, sign in ((branch.end, 1.0), (branch.start, -1.0)):
+                    if end == place:
+                        share = R / seen.real if seen.real > 0 else 1.0
+                        to_axis[axis, self.order.index(branch.name)] += sign * share
+        factors = [fault.phase_current(phase) for phase in "abc"]
+        turn = np.exp(-1j * fault.angle)
+        return np.array([turn * (a * to_axis[ALPHA] - 1j * b * to_axis[BETA]) for a, b in factors])
+
+    def modes(self, blocked: frozenset[int], fault: FaultPlace | None) -> tuple[Modes, list[str]]:
         """The modes of a circuit, and the names of its sources and sinks in their order.
 
         Args:
             blocked: indices of the converters whose bridges block.
-            faulted: whether the fault is there.
+            fault: one of ``faults``.
 
         Raises:
             ValueError: as ``find_modes``.
         """
         sinks = [sink for sink in self.sinks if sink.name not in self.opened]
-        unbalanced = faulted and self.fault is not None and not self.fault.balanced
+        unbalanced = fault is not None and not fault.balanced
         found = []
         for axis in (ALPHA, BETA) if unbalanced else (ALPHA,):
-            branches, capacitors, sources, shunts, _ = self._circuit(blocked, faulted, axis)
+            branches, capacitors, sources, shunts, _ = self._circuit(blocked, fault, axis)
             parts = branches, capacitors, sources
             found.append(find_modes(*parts, self.omega_b, self.order, shunts, sinks))
         names = [part.name for part in sources] + [part.name for part in sinks]
-        if not unbalanced:
+        if fault is None or fault.balanced:
             return found[0], names
-        assert self.fault is not None
         alpha, beta = found
-        return join_axes(alpha, beta, self.fault.angle), names
+        return join_axes(alpha, beta, fault.angle), names
 
     def zero_sequence(self) -> complex | None:
         """The impedance between the place of the fault and ground for a zero sequence at nominal
@@ -325,15 +393,15 @@ class Wiring:
         return complex(np.linalg.inv(Y)[nodes.index(place), nodes.index(place)])
 
     def voltage(
-        self, node: str, blocked: frozenset[int], faulted: bool
+        self, node: str, blocked: frozenset[int], fault: FaultPlace | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The voltage of a node in a balanced circuit as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on.
 
         Args:
-            blocked, faulted: as for ``modes``.
+            blocked, fault: as for ``modes``.
         """
-        parts = self._circuit(blocked, faulted, ALPHA)
+        parts = self._circuit(blocked, fault, ALPHA)
         branches, capacitors, sources, shunts, hanging = parts
         there = {end for branch in branches for end in (branch.start, branch.end)}
         there |= {part.node for part in capacitors} | {part.node for part in sources}
@@ -350,16 +418,16 @@ class Wiring:
         return np.zeros(len(self.order)), np.zeros(len(sources))
 
     def _circuit(
-        self, blocked: frozenset[int], faulted: bool, axis: int
+        self, blocked: frozenset[int], fault: FaultPlace | None, axis: int
     ) -> tuple[list[Branch], list[Capacitor], list[VoltageSource], list[Shunt], list[Branch]]:
         """The parts of a circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         through_fault = []
-        if faulted and self.fault is not None:
-            node = "beyond" if self.split else self.fault.node
-            seen = self.fault.seen(axis, self.zero_sequence())
+        if fault is not None:
+            node = "beyond" if self.split else fault.node
+            seen = fault.seen(axis, self.zero_sequence())
             if seen is not None and seen.imag > 0:
                 through_fault.append(Branch("fault", node, GROUND, seen.imag, seen.real))
             elif seen is not None:

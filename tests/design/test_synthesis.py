@@ -7,8 +7,7 @@ import pytest
 
 from gfm_design.model.least_stable import least_stable
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.paper import PAPER_START, PaperProblem, tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_runtime import law_file
 

@@ -9,7 +9,7 @@ import pytest
 import gfmhil
 from gfm_design.norms.performance import PAPER_WEIGHTS
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import write_scenario
@@ -189,41 +189,6 @@ def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop():
     loop = law.closed_loop("rig_pref_step")
     assert loop.T_s is not None
     assert gfmhil.design.gamma(law, on="rig_pref_step").value == loop.gamma()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["gamma", "--law", "vsg-2", "--scenario", THREE], "--converter names the one of ['A', "),
-        (["gamma", "--law", "vsg-2", "--converter", "A"], "--converter A: needs --scenario"),
-        (
-            ["tune", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--full-order"],
-            "omit --scenario",
-        ),
-        (
-            ["gamma", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--discrete"],
-            "a scenario is sampled in any case",
-        ),
-        (
-            ["tune", "--law", "vsg-2", "--decay", "-1"],
-            "decay = -1.0: must be finite and not negative",
-        ),
-        (["margins", "--scenario", THREE], "--converter names it, one of ['A', 'B', 'C']"),
-        (["bode", "--scenario", THREE, "--converter", "D"], "must be one of ['A', 'B', 'C']"),
-        (["bode", "--converter", "A"], "--converter A: the scenario has no network"),
-        (
-            ["poles", "--scenario", THREE, "--law", "vsg-2"],
-            "--law vsg-2: does not replace the own law of A, B, C; name the converter that gets it",
-        ),
-        (["step", "--scenario", THREE, "--of", "P_ref"], "'P_ref' is no input of the network"),
-        (["margins", "--scenario", THREE, "--converter", "A", "--figures", "x"], "--figures: they"),
-        (["poles", "--scenario", THREE, "--converter", "A", "--law", "no-such"], "no-such"),
-    ],
-)
-def test_refuses_in_one_line(arguments, words, capsys):
-    assert main(["design", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count("\n") == 1
 
 
 def test_python_refuses_in_one_line():

@@ -1,5 +1,7 @@
 """With an inner stage a converter rides through what trips it without one."""
 
+import os
+import random
 from typing import Any
 
 import numpy as np
@@ -46,6 +48,31 @@ def test_it_starts_at_rest(inner):
     s = run({"type": "reference", "P_ref": 0.5}, 0.1, inner=inner).signals
     for name in ("true_p", "true_V", "true_i", "u_E_u", "u_omega_u"):
         assert np.ptp(s[name][:]) < 1e-11, name
+
+
+RANDOM_FAULTS = int(os.environ.get("GFMHIL_FAULTS", "40"))
+
+
+def test_no_clearing_on_the_line_stops_the_law():
+    """Random faults: kind, place, resistance, power, SCR 1.5 to 20. At once, the most of them end
+    as safe or tripped within a cycle and a half of their clearing."""
+    chance, ended = random.Random(3), {"zero": [], "instant": []}
+    for _ in range(RANDOM_FAULTS):
+        lasts = round(chance.uniform(0.06, 0.25), 5)
+        event = {
+            "type": "fault", "kind": chance.choice(("3ph", "LG", "LL", "LLG")), "duration": lasts,
+            "position": round(chance.uniform(0.02, 0.95), 4), "R": chance.choice((0.0, 0.01, 0.05)),
+        }  # fmt: skip
+        plant = {"i_peak": 2.5, "grid": {"scr": 1.5 * 13.3 ** chance.random(), "x_over_r": 6.0}}
+        references = {"P_ref": chance.uniform(-0.8, 0.8)}
+        for clearing, stops in ended.items():
+            after = {**event, "clearing": clearing}
+            found = run(after, 1.0, plant=plant, references=references)
+            since = found.signals["t"][-1] - 0.2 - lasts
+            if found.status != "completed" and 0.0 <= since < 0.03:
+                stops.append((after, found.summary["reason"]))
+    assert ended["zero"] == []
+    assert len(ended["instant"]) > RANDOM_FAULTS / 4
 
 
 @pytest.mark.parametrize("law", ["vsg-2", "droop-3"])

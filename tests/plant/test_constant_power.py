@@ -109,7 +109,7 @@ def start_at(plant: Network, E: Any, omega: float) -> np.ndarray:
     for _ in range(2):
         plant.start(x, u, [((), omega)] * len(plant.wiring.fed))
         w = plant.now["w"][0]
-        modes, sources = plant.wiring.modes(frozenset(), False)
+        modes, sources = plant.wiring.modes(frozenset(), None)
         slip = W_B * (omega - 1)
         v = complex(w[plant.wiring.order.index("c")])
         names, loads = zip(*plant.wiring.fed, strict=True)

@@ -36,7 +36,7 @@ def rest(plant: Network, angles: list[float]) -> np.ndarray:
     volts = {"a.bridge": 1.01 * np.exp(0.02j)}
     for (name, machine), angle in zip(plant.wiring.fed, angles, strict=True):
         volts[f"{name}.emf"] = machine.E * np.exp(1j * angle)
-    modes, sources = plant.wiring.modes(frozenset(), False)
+    modes, sources = plant.wiring.modes(frozenset(), None)
     w = modes.states @ (modes.drive @ [volts[name] for name in sources] / -modes.rates)
     own = w[:3] * np.exp(-0.02j)
     x[0, 0:6:2], x[0, 1:6:2] = own.real, own.imag

@@ -49,7 +49,7 @@ def start(plant: Network, E: Any, delta: Any, omega: float = 1.0) -> np.ndarray:
     rests = [(np.zeros(0), omega)] * len(plant.wiring.fed)
     plant.start(x, u, rests)
     # w as the phasors have it, which `start` takes from x for the converters' own states
-    modes, sources = plant.wiring.modes(frozenset(), False)
+    modes, sources = plant.wiring.modes(frozenset(), None)
     volts = [u[k, 2] * np.exp(1j * x[k, DELTA]) for k in range(N)]
     volts += [1.0] if "grid" in sources else []
     speed = plant.wiring.omega_b * (omega - 1)
@@ -303,7 +303,7 @@ def test_a_fault_in_two_axes_is_one_in_three_phases():
         x[:, DELTA], x[:, V_DC] = [0.05, 0.02], 1.0
         plant.start(x, u, [(np.zeros(1), 1.0), (np.zeros(0), 1.0)])
         go(plant, u, 20)
-        fault(plant, 0.6, 0.0, duration=0.03, line="l", **more)
+        fault(plant, 0.6, 0.0, duration=0.03, line="l", clearing="instant", **more)
         for _ in range(5):
             go(plant, u, 100)
             take_out(plant)

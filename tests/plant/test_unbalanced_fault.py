@@ -22,7 +22,7 @@ STIFF = {"mode": "regulated", "k_p": 200.0}
 W = 100 * math.pi
 TURN = cmath.exp(2j * math.pi / 3)
 AXES = np.array([1, TURN, TURN.conjugate()])  # of the phases a, b, c
-SHORTED = {"a": [0], "b": [1], "bc": [1, 2], "ca": [2, 0], "ab": [0, 1]}
+SHORTED = {"abc": [0, 1, 2], "a": [0], "b": [1], "bc": [1, 2], "ca": [2, 0], "ab": [0, 1]}
 
 
 def phases(vector: Any) -> NDArray[np.float64]:
@@ -64,7 +64,7 @@ class Phases:
                 rows[k], right[k] = matrix[k], -constant[k]
             elif self.kind != "LL":
                 rows[k, k], right[k] = 1.0, self.R * known[k]
-        if self.kind == "LL":
+        if self.kind == "LL" and self.shorted:
             one, two = self.shorted
             rows[one] = matrix[one] + matrix[two]
             right[one] = -constant[one] - constant[two]
@@ -130,7 +130,7 @@ def test_fault_and_clearing_against_three_phases(rest, at, R, kind, which):
     w = plant.now["w"][0, [I_F, V, I_O, I_O]]
     model = (Phases if at else AtCapacitor)(plant, at, R, kind, which)
     s = np.concatenate([phases(x * cmath.exp(1j * W * t)) for x in w])
-    fault(plant.plant, at, R, duration=0.02, kind=kind, phases=which)
+    fault(plant.plant, at, R, duration=0.02, kind=kind, phases=which, clearing="instant")
     plant.advance(100)
     s = solve_ivp(model.slope, (t, t + 0.01), s, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     back = cmath.exp(-1j * W * (t + 0.01))
@@ -145,6 +145,50 @@ def test_fault_and_clearing_against_three_phases(rest, at, R, kind, which):
     found = plant.now["w"][0, [I_F, V, I_O]]
     assert plant.now["faulted"][0] == 0
     assert found == pytest.approx(exact[:3], abs=1e-9)
+
+
+def through_fault(k: int) -> Any:
+    """The current of a phase through a fault on the line, for `solve_ivp` to find its zero."""
+    return lambda t, s: s[6 + k] - s[9 + k]
+
+
+@pytest.mark.parametrize("scr", [3.0, 10.0])
+@pytest.mark.parametrize(
+    ("at", "R", "kind", "which"),
+    [
+        (0.5, 0.0, "3ph", "abc"), (0.4, 0.05, "3ph", "abc"), (0.4, 0.0, "LG", "b"),
+        (0.6, 0.02, "LL", "ca"), (0.5, 0.03, "LLG", "bc"), (0.3, 0.0, "LLG", "ab"),
+    ],
+)  # fmt: skip
+def test_each_phase_opens_where_its_current_passes_zero(rest, at, R, kind, which, scr):
+    """Against the equations of three phases, whose events are the zeros."""
+    plant = rest(grid={**WEAK, "scr": scr}, protection=NO_TRIP, dc_source=STIFF)
+    t, end = 0.0, 0.06
+    w = plant.now["w"][0, [I_F, V, I_O, I_O]]
+    model = Phases(plant, at, R, kind, which)
+    fault(plant.plant, at, R, duration=0.0123, kind=kind, phases=which)
+    plant.advance(600)
+    assert plant.now["faulted"][0] == plant.now["clearing"][0] == 0
+    s = np.concatenate([phases(x) for x in w])
+    tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+    s = solve_ivp(model.slope, (t, 0.0123), s, **tight).y[:, -1]
+    t, opened = 0.0123, []
+    while model.shorted:
+        events = [through_fault(k) for k in model.shorted]
+        for event in events:
+            event.terminal = True
+        part = solve_ivp(model.slope, (t, end), s, events=events, **tight)
+        (first,) = (k for k, times in enumerate(part.t_events) if len(times))
+        t, s = part.t[-1], part.y[:, -1]
+        opened.append(t)
+        model.shorted = (
+            [] if kind == "LL" else [k for k in model.shorted if k != model.shorted[first]]
+        )
+    assert len(opened) == (1 if kind == "LL" else len(which))
+    s = solve_ivp(model.slope, (t, end), s, **tight).y[:, -1]
+    back = cmath.exp(-1j * W * end)
+    exact = np.array([vector(x) * back for x in s.reshape(4, 3)])
+    assert plant.now["w"][0, [I_F, V, I_O]] == pytest.approx(exact[:3], abs=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -222,7 +266,7 @@ def test_two_phases_to_an_ideal_ground_are_all_three(rest):
     for more in ({"kind": "LLG", "phases": "ab", "Z_0": 0j}, {}):
         plant = rest(grid=WEAK, protection=NO_TRIP, dc_source=STIFF)
         plant.advance(13)
-        fault(plant.plant, 0.4, 0.0, duration=0.015, **more)
+        fault(plant.plant, 0.4, 0.0, duration=0.015, clearing="instant", **more)
         plant.advance(50)
         grid_unbalance(plant.plant, (1.0, 0.6, 0.8j), duration=0.008)
         plant.advance(50)

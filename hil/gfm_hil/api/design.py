@@ -13,12 +13,17 @@ from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.least_stable import least_stable
-from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel
-from gfm_design.norms.weights import read_weights
+from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import LATE, PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import EVALUATIONS, starts_for, tune_paper
+from gfm_design.tuning.paper import (
+    EVALUATIONS,
+    LATE,
+    PAPER_START,
+    PaperProblem,
+    starts_for,
+    tune_paper,
+)
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from gfm_plant.components.part import Dynamic
-from gfm_plant.components.swing import SWING, slopes, swing, swing_at_rest
+from gfm_plant.components.swing import KEPT, SWING, slopes, swing, swing_at_rest
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import grid_source, read_states
@@ -68,7 +68,8 @@ class FiniteGrid(Dynamic):
     how_many: ClassVar = "one"
     record: ClassVar = np.dtype(SWING, align=True)
     hooks: ClassVar = {
-        "at_rest": _at_rest, "begin": _bound, "middle": _middle, "end": _bound, "tick": _tick
+        "at_rest": _at_rest, "begin": _bound, "middle": _middle, "end": _bound, "tick": _tick,
+        **KEPT,
     }  # fmt: skip
 
     S: Positive = Field(description="rating of the grid over that of the converter")

@@ -12,6 +12,7 @@ from pydantic import Field
 from gfm_plant.circuit import Branch
 from gfm_plant.components.part import Fed, LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
+    KEPT,
     SWING,
     pack_swing,
     slopes,
@@ -95,7 +96,7 @@ class Machine(Fed):
     )  # fmt: skip
     hooks: ClassVar = {
         "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
-        "tick": _tick,
+        "tick": _tick, **KEPT,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is")

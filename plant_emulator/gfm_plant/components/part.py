@@ -69,7 +69,7 @@ class Dynamic(Component):
     """
 
     record: ClassVar[np.dtype[np.void]]
-    #: at_rest, once at the start; keep, before a tick, and go_back, after one that diverged;
+    #: at_rest, once at the start; keep, at an instant, and go_back to it, as often as it takes;
     #: begin of a piece; drive, where sources add to the forcing of the modes; middle and end of the
     #: piece; tick, after each tick
     hooks: ClassVar[Mapping[str, Callable[..., None]]]

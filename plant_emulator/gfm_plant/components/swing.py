@@ -25,6 +25,7 @@ SWING = [
     # p.u. of its rating: power of the turbines, set point of the governor, load
     *((name, "f8") for name in ("P_turbine", "P_set", "P_load")),
     ("energy", "f8"),  # that came since the last tick, p.u. of the network and s
+    ("energy_kept", "f8"),
 ]
 """Fields of a record that swings."""
 
@@ -59,6 +60,20 @@ def swing_matrix(
     comes, p.u. of the network."""
     own = np.array([[-D / (2 * H), 1 / (2 * H)], [-1 / (droop * T_gov), -1 / T_gov]])
     return own, 1 / (2 * H * S)
+
+
+@compiled
+def _keep(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    one.energy_kept = one.energy
+
+
+@compiled
+def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    one.energy = one.energy_kept
+
+
+KEPT = {"keep": _keep, "go_back": _go_back}
+"""Hooks of a record that swings."""
 
 
 @compiled

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from gfm_design.margins.all_margins import ChannelMargins, LoopMargins, Margins, UnstableLoop
-from gfm_design.margins.disk import DiskMargin
+from gfm_design.margins.locus import DiskMargin
 from gfm_design.margins.tolerance import End, GridStrength, Range
 from gfm_hil.cli.common import EXIT_OTHERWISE
 from gfm_hil.core.terminal import terminal

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gfm_design.tuning.paper_tune import EVALUATIONS
+from gfm_design.tuning.paper import EVALUATIONS
 from gfm_hil.api.design import NotTuned, Tuning, tune
 from gfm_hil.api.law import Law
 from gfm_hil.api.tuned_law import problem_name, write_law

@@ -1,4 +1,4 @@
-"""A fault."""
+"""A fault, and its end."""
 
 from __future__ import annotations
 
@@ -50,6 +50,11 @@ class Fault(PlantEvent):
     duration: float | None = Field(
         None, gt=0, description="s until it is cleared; none: fault-clear clears it"
     )
+    clearing: Literal["zero", "instant"] = Field(
+        "zero",
+        description="zero: when it is cleared, each phase opens where its current next passes "
+        "zero, as a breaker's poles do; instant: all phases open at once",
+    )
 
     @model_validator(mode="after")
     def _has_one_place(self) -> Fault:
@@ -85,8 +90,17 @@ class Fault(PlantEvent):
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.fault(
             plant, self.position, self.R, self.duration, line=self.line, node=self.node,
-            kind=self.kind, phases=self.phases, Z_0=self.Z_0,
+            kind=self.kind, phases=self.phases, Z_0=self.Z_0, clearing=self.clearing,
         )  # fmt: skip
 
 
-EVENT = Fault
+class FaultClear(PlantEvent):
+    """The fault is cleared."""
+
+    type: Literal["fault-clear"] = Field(description="kind of event")
+
+    def label(self) -> str:
+        return "fault cleared"
+
+    def apply(self, plant: gfm_plant.Network) -> None:
+        gfm_plant.clear_fault(plant)
