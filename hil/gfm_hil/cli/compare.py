@@ -1,7 +1,5 @@
 """gfmhil compare: one scenario under several laws, in one table and one figure."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

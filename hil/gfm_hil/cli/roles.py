@@ -1,7 +1,5 @@
 """gfmhil controller and gfmhil plant: one side alone, so that two machines can be used."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 
@@ -40,7 +38,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry one side out; returns the exit code."""
     role: Role = options.command
     scenario = _of_one(role, resolve(options, named=True, law=options.law), options.converter)
     if scenario.in_process:
@@ -75,11 +72,8 @@ def _bench_context(scenario: Scenario) -> BenchContext:
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
-    """The scenario of a controller, which has one converter.
-
-    Raises:
-        UserError: --converter is missing, or does not fit.
-    """
+    """The scenario of a controller, which has one converter. Raises UserError: --converter is
+    missing, or does not fit."""
     known = scenario.parts
     if role == "plant" or not known:
         if converter is not None:
@@ -93,11 +87,8 @@ def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
 
 
 def _given(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:
-    """The endpoint of each converter that has one by --endpoint.
-
-    Raises:
-        UserError: one is missing, or is that of no converter.
-    """
+    """The endpoint of each converter that has one by --endpoint. Raises UserError: one is missing,
+    or is that of no converter."""
     known = scenario.parts or [scenario.converter or ""]
     if not scenario.parts and "" in named:
         named = {known[0]: named[""]}

@@ -1,7 +1,5 @@
 """gfmhil run: one scenario, one run folder."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json
