@@ -3,15 +3,7 @@
 import argparse
 import sys
 
-from gfm_hil.cli.common import (
-    add_map,
-    add_scenario_options,
-    endpoints,
-    exit_code,
-    new_folder,
-    print_run,
-    resolve,
-)
+from gfm_hil.cli import common
 from gfm_hil.controllers import FORMS, BenchContext, open_controller, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
@@ -25,7 +17,7 @@ from gfm_runtime.errors import meant
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    add_scenario_options(command)
+    common.add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--converter", help="of a network: the one that this controller controls")
     command.add_argument("-o", "--out", help="run folder; runs/<role>-<time> by default")
@@ -33,16 +25,18 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
     )  # fmt: skip
-    add_map(command, "--model")
+    common.add_map(command, "--model")
     command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
     role: Role = options.command
-    scenario = _of_one(role, resolve(options, named=True, law=options.law), options.converter)
+    scenario = _of_one(
+        role, common.resolve(options, named=True, law=options.law), options.converter
+    )
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
-    given = _given(scenario, endpoints(options))
+    given = _given(scenario, common.endpoints(options))
     if options.model is not None and role == "plant":
         raise UserError("--model: the plant has no model; start the controller with it")
     external = None
@@ -50,7 +44,7 @@ def call(options: argparse.Namespace) -> int:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
             external = open_controller(options.model, ports, _bench_context(scenario))
-    folder = new_folder(options.out, role)
+    folder = common.new_folder(options.out, role)
     if options.part:  # of `gfmhil run`, which puts the parts together
         run_part(role, scenario, folder, given, external)
         return 0
@@ -61,8 +55,8 @@ def call(options: argparse.Namespace) -> int:
 
     run = run_side(role, scenario, folder, given, notice, write_report, external)
     if not options.quiet:
-        print_run(run, folder)
-    return exit_code(run)
+        common.print_run(run, folder)
+    return common.exit_code(run)
 
 
 def _bench_context(scenario: Scenario) -> BenchContext:
