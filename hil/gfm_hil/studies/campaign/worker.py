@@ -35,11 +35,7 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
 
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
-    """The records of some runs.
-
-    Raises:
-        RunFailed: an error that is not the run's own.
-    """
+    """The records of some runs. Raises RunFailed: an error that is not the run's own."""
     room: dict[bool, tuple[Kept, Kept]] = {}
     records = []
     for run, law in jobs:
