@@ -21,13 +21,11 @@ import gfmhil
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.studies.campaign import worker
-from gfm_hil.studies.campaign.axes import find_axes
-from gfm_hil.studies.campaign.execute import CHUNK
+from gfm_hil.studies.campaign.execute import CHUNK, Store
 from gfm_hil.studies.campaign.figure import fill_map
 from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_hil.studies.campaign.result import summary, verdict
+from gfm_hil.studies.campaign.result import find_axes, summary, verdict
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.store import Store
 from gfm_hil.studies.campaign.worker import Record, run_chunk
 from gfm_hil.studies.workers import WorkerLost, processes, run_tasks
 

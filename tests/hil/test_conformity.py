@@ -24,11 +24,11 @@ from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, toml_text
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
+from gfm_hil.studies.conformity.criteria.base import judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.judge import judge
-from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import (
     Case,
+    TestPart,
     load_cases,
     load_under_test,
     scaled,
