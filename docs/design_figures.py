@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from _figures import delay_loci, h_infinity, tuning
 
-from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.paper import tune_paper
 
 
 def main() -> None:

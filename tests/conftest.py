@@ -14,7 +14,7 @@ The mark ``alone`` is for tests of the last two that fail beside another one on 
 
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -38,16 +38,33 @@ _MOST_WORKERS = 8  # more would compile the same functions once more each
 #: Files that take longest in the other tiers, the longest first. Workers begin with them, and then
 #: with those of most tests: one that begins last leaves all processors but one idle.
 _LONGEST = (
-    "hil/test_network_links.py", "hil/test_scope_crowd.py", "hil/test_faults.py",
-    "hil/test_recover.py", "hil/test_identification.py", "hil/test_testing.py",
-    "hil/test_telemetry.py", "hil/test_e2e_loops.py", "hil/test_scope_browser.py",
-    "hil/test_campaign.py", "runtime/test_firmware_c.py", "hil/test_pil.py",
-    "runtime/test_firmware_targets.py", "runtime/test_firmware_fixed.py", "hil/test_models.py",
-    "hil/test_network.py", "runtime/test_firmware.py", "hil/test_conformity.py",
-    "hil/test_inner_links.py", "plant/test_network.py", "hil/test_network_design.py",
+    "hil/engine/test_network_links.py", "hil/ports/test_scope_crowd.py", "hil/links/test_faults.py",
+    "hil/recording/test_recover.py", "hil/studies/test_identification.py",
+    "hil/api/test_testing.py", "hil/ports/test_telemetry.py", "hil/engine/test_e2e_loops.py",
+    "hil/ports/test_scope_browser.py", "hil/studies/test_campaign.py", "runtime/test_firmware_c.py",
+    "hil/controllers/test_pil.py", "runtime/test_firmware_targets.py",
+    "runtime/test_firmware_fixed.py", "hil/controllers/test_controllers.py",
+    "hil/run/test_network.py", "runtime/test_firmware.py", "hil/studies/test_conformity.py",
+    "hil/links/test_inner_links.py", "plant/test_network.py", "hil/cli/test_network_design.py",
 )  # fmt: skip
 _TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Carries out a command that cannot be done; returns the one line in which it says so."""
+
+    from gfm_hil.cli import main  # not before the variables above are set
+
+    def call(*words: str) -> str:
+        assert main(words) == 2
+        out, error = capsys.readouterr()
+        assert out == "" and error.startswith("gfmhil: ") and error.endswith("\n"), error
+        assert error[:-1].isprintable(), error
+        return error
+
+    return call
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from gfm_design.norms.performance import PAPER_WEIGHTS, WeightedChannel
 from gfm_design.tuning.gains import FreeGain
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
+from gfm_design.tuning.paper import PAPER_START, PaperProblem
 from gfm_hil.core.terminal import markdown
 from gfm_runtime import law_file
 from gfm_runtime.lawfile import tied

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gfm_design.norms.performance import PAPER_WEIGHTS, StateSpace, Weight, WeightedChannel
 from gfm_design.tuning.full_order import full_order
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.paper import PAPER_START, PaperProblem, tune_paper
 from gfm_design.tuning.synthesis import Tuned
 from gfm_hil.results.figures import COLOURS
 from gfm_runtime import law_file

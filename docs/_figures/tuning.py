@@ -11,8 +11,7 @@ from _ext.outputs import command
 from _figures.common import DOCS, TABLES, write_table
 
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.paper import PAPER_START, PaperProblem, tune_paper
 from gfm_runtime import law_file
 
 LAW, TUNED = "my-tunable.toml", "my-tuned.toml"

@@ -22,21 +22,15 @@ from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_la
 
 @dataclass(frozen=True)
 class LawSet:
-    """The laws of one name: a single law, or the stages of a gain-scheduled one.
+    """The laws of one name: a single law, or the stages of a gain-scheduled one."""
 
-    Attributes:
-        name: what results call it.
-        laws: one law, or one for each stage in ascending order of the stage's reactance.
-        schedule: None, or the limits of the stages.
-        inner: the inner stage that replaces the law file's own, by name or path; None: its own.
-        asked: the name or path by which it is asked for; its name if empty.
-    """
-
-    name: str
+    name: str  #: what results call it
+    #: one law, or one for each stage in ascending order of the stage's reactance
     laws: tuple[Law, ...]
-    schedule: Schedule | None = None
+    schedule: Schedule | None = None  #: None, or the limits of the stages
+    #: the inner stage that replaces the law file's own, by name or path; None: its own
     inner: str | None = None
-    asked: str = ""
+    asked: str = ""  #: the name or path by which it is asked for; its name if empty
 
 
 def law_titles(names: Iterable[str]) -> dict[str, str]:

@@ -102,15 +102,10 @@ def _trimmed(polynomial: Sequence[Coefficient]) -> Polynomial:
 
 @dataclass(frozen=True)
 class Element:
-    """A scalar transfer function num(s) / prod(den).
+    """A scalar transfer function num(s) / prod(den)."""
 
-    Attributes:
-        num: numerator coefficients, ascending powers of s.
-        den: the denominator's factors, sorted; empty for a constant.
-    """
-
-    num: Polynomial
-    den: tuple[Factor, ...] = ()
+    num: Polynomial  #: numerator coefficients, ascending powers of s
+    den: tuple[Factor, ...] = ()  #: the denominator's factors, sorted; empty for a constant
 
     @staticmethod
     def of(num: Sequence[Coefficient], den: Sequence[Factor] = ()) -> Element:

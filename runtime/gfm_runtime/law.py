@@ -87,33 +87,26 @@ class HomeGrid(Table):
 
 @dataclass(frozen=True)
 class Law:
-    """One grid-forming law as data.
+    """One grid-forming law as data."""
 
-    Attributes:
-        name: e.g. ``"vsg-2"``.
-        title, source: for tables and reports; the source names table, equation or paper.
-        phi: elements on the errors, by zero-based (row, column); absent means 0.
-        psi: the ``{}`` terms on the measurements alone; u_i is lowered by psi_ij(s) y_j.
-        u_0: set-points of u; a number in p.u., or the name of the reference it follows.
-        error_map: name in ``gfm_runtime.error_maps.ERROR_MAPS``.
-        error_parameters: (R, X) in p.u. for maps that need an impedance, else ().
-        limits: clamps and anti-windup.
-        parameters: the named numbers the elements were computed from.
-        home_grid: grid on which the defaults are stable.
-        inner: the inner stage between the law and the bridge; None: the bridge produces E_u.
-    """
-
-    name: str
+    name: str  #: e.g. ``"vsg-2"``.
+    #: title, source: for tables and reports; the source names table, equation or paper
     title: str
     source: str
+    #: elements on the errors, by zero-based (row, column); absent means 0
     phi: Mapping[Cell, Element]
+    #: the ``{}`` terms on the measurements alone; u_i is lowered by psi_ij(s) y_j
     psi: Mapping[Cell, Element] = field(default_factory=dict)
+    #: set-points of u; a number in p.u., or the name of the reference it follows
     u_0: tuple[float | str, float | str, float | str] = (0.0, 1.0, 1.0)
-    error_map: str = "linear"
+    error_map: str = "linear"  #: name in ``gfm_runtime.error_maps.ERROR_MAPS``
+    #: (R, X) in p.u. for maps that need an impedance, else ().
     error_parameters: tuple[float, ...] = ()
-    limits: Limits = field(default_factory=Limits)
+    limits: Limits = field(default_factory=Limits)  #: clamps and anti-windup
+    #: the named numbers the elements were computed from
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
-    home_grid: HomeGrid = field(default_factory=HomeGrid)
+    home_grid: HomeGrid = field(default_factory=HomeGrid)  #: grid on which the defaults are stable
+    #: the inner stage between the law and the bridge; None: the bridge produces E_u
     inner: InnerStage | None = None
 
     def __post_init__(self) -> None:

@@ -29,31 +29,20 @@ Vector = Literal["y", "u"]
 
 @dataclass(frozen=True)
 class Signal:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        group: the vector it belongs to.
-        name: identifier in code and files; unique within its group.
-        symbol: as printed, LaTeX.
-        unit: unit of the value on the link; ``p.u.`` of the base named in ``base``.
-        base: what 1 p.u. is.
-        scale: resolution of an integer transport, in ``unit`` per count.
-        low, high: plausible range in ``unit``; a measurement outside is refused by the
-            controller (safe state), a reference outside is refused by the scenario.
-        default: value at start if nothing else is said.
-        description: one line for tables and tooltips.
-    """
-
-    group: Group
-    name: str
-    symbol: str
-    unit: str
-    base: str
-    scale: float
+    group: Group  #: the vector it belongs to
+    name: str  #: identifier in code and files; unique within its group
+    symbol: str  #: as printed, LaTeX
+    unit: str  #: unit of the value on the link; ``p.u.`` of the base named in ``base``
+    base: str  #: what 1 p.u. is.
+    scale: float  #: resolution of an integer transport, in ``unit`` per count
+    #: low, high: plausible range in ``unit``; a measurement outside is refused by the controller
+    #: (safe state), a reference outside is refused by the scenario
     low: float
     high: float
-    default: float
-    description: str
+    default: float  #: value at start if nothing else is said
+    description: str  #: one line for tables and tooltips
 
 
 SIGNALS: tuple[Signal, ...] = (

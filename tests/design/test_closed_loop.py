@@ -15,7 +15,7 @@ from gfm_design.margins.locus import locus_at_u, locus_at_y
 from gfm_design.model.closed_loop import INPUTS, REFERENCES, T_S, ClosedLoop, response
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import LawError, law_file
 from gfm_runtime.lawfile import parse_law, tied

@@ -14,7 +14,7 @@ from gfm_design.model.closed_loop import INPUTS, REFERENCES, ClosedLoop
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import linearise_plant
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.recording.columns import signals_of
@@ -23,13 +23,7 @@ from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
 from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import (
-    Cascaded,
-    InnerStage,
-    PowerLimiter,
-    ThresholdImpedance,
-    VirtualStator,
-)
+from gfm_runtime.inner import Cascaded, InnerStage, PowerLimiter, ThresholdImpedance, VirtualStator
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER

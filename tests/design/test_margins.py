@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from gfm_design.margins.all_margins import loop_margins
-from gfm_design.margins.classical import gain_phase
 from gfm_design.margins.delays import DelayMargins, first_loss, longest, overall_delay
-from gfm_design.margins.disk import disk_margin, mu_bound
-from gfm_design.margins.locus import locus_at_u, locus_at_y
+from gfm_design.margins.locus import disk_margin, gain_phase, locus_at_u, locus_at_y, mu_bound
 from gfm_design.margins.tolerance import (
     CEILING,
     FLOOR,

@@ -4,9 +4,8 @@ import control
 import numpy as np
 import pytest
 
-from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, channel_system
-from gfm_design.norms.weights import read_weights
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, channel_system, read_weights
+from gfm_design.tuning.paper import PaperProblem
 from gfm_runtime import law_file
 
 NONE = np.zeros(0)

@@ -7,8 +7,7 @@ from gfm_design.model.least_stable import least_stable
 from gfm_design.norms.peaks import model, peaks
 from gfm_design.norms.performance import StateSpace
 from gfm_design.tuning.gains import Encoding, free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
-from gfm_design.tuning.polish import polish
+from gfm_design.tuning.paper import PaperProblem, polish
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
 

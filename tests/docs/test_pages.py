@@ -13,8 +13,7 @@ import gfmhil
 import gfmhil.design
 import gfmhil.envelopes
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_design.norms.performance import PAPER_WEIGHTS
-from gfm_design.norms.weights import read_weights
+from gfm_design.norms.performance import PAPER_WEIGHTS, read_weights
 from gfm_hil.run.runner import Run, run_scenario
 from gfm_hil.scenario import load_scenario
 from gfm_plant import Plant

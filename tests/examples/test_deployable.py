@@ -14,7 +14,7 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.model.linear import linearise_law, linearise_plant
 from gfm_design.model.operating_point import operating_point
 from gfm_design.tuning.gains import FreeGain, free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_plant import make_plant
 from gfm_runtime import discretise, get_law, law_file

@@ -7,7 +7,7 @@ import pytest
 
 from gfm_design.model.least_stable import LeastStable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_runtime import law_file, law_names, tuned_names
 from law_comparison.row import LEFT_OUT, as_shipped
 from law_comparison.search import ALPHA, LateProblem, as_it_is, gamma

@@ -6,18 +6,10 @@ import pytest
 from gfm_design.model.closed_loop import T_S
 from gfm_design.model.least_stable import LeastStable, least_stable
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
-from law_comparison.search import (
-    ALPHA,
-    LateProblem,
-    as_it_is,
-    gamma,
-    late_loop,
-    search,
-    stands,
-)
+from law_comparison.search import ALPHA, LateProblem, as_it_is, gamma, late_loop, search, stands
 
 from ..support.loops import reference_loop
 

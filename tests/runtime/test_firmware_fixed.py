@@ -14,21 +14,25 @@ import pytest
 from gfm_hil.cli import main
 from gfm_runtime import LawError
 from gfm_runtime.firmware import CHECKED, FIXED, SHIPPED, TARGETS, check, make_modules, prove
-from gfm_runtime.firmware.deviation import NEAR, deviations
 from gfm_runtime.firmware.fixed import (
     G_MOST,
+    NEAR,
     REFS,
     TREND,
     US,
     WORD,
     YS,
     ClampedRow,
+    Instance,
     X,
+    deviations,
     make_fixed,
     powers,
+    refusal,
     sector,
+    sine_of_half,
+    to_integers,
 )
-from gfm_runtime.firmware.fixed_tick import Instance, refusal, sine_of_half, to_integers
 from gfm_runtime.firmware.golden import RESET, SEGMENT, SWITCH, inputs
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.kernel import state_dtype, step
@@ -36,7 +40,7 @@ from gfm_runtime.signals import NU, group
 from gfm_runtime.states import OK
 from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import SOME, T_S, cc, exported
+from ..support.firmware import SOME, STRICT, T_S, cc, exported
 from ..support.laws import LAWS
 
 PAGES = Path(__file__).parents[2] / "docs"
@@ -44,7 +48,6 @@ PAGES = Path(__file__).parents[2] / "docs"
 FAST = ("vsg-2", "psc-dc", "dvoc", "hybrid-angle", "vsg-11")
 EACH_LAW = [pytest.param(name, marks=() if name in FAST else pytest.mark.full) for name in LAWS]
 COMPILERS = [pytest.mark.compilers, pytest.mark.timeout(300)]
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 
 
 def module(name: str) -> Module:
@@ -289,22 +292,6 @@ def test_the_folder_says_formats_and_bounds(tmp_path):
         assert proven.drift / T_S <= said["drift"] <= 1.2 * proven.drift / T_S + 1e-12
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["vsg-2", "--style", "records"], "--style records: fixed point has its constants in"),
-        (["vsg-2", "--inner", "cascaded"], "law 'vsg-2': has an inner stage, which fixed point"),
-        (["mimo-gfm-scheduled"], "law 'mimo-gfm-scheduled': is scheduled, which fixed point"),
-    ],
-)
-def test_what_fixed_point_does_not_cover_is_refused(tmp_path, capsys, arguments, said):
-    command = ["firmware", "export", *arguments, "--real", "fixed", "-o", str(tmp_path / "out")]
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused():
     record = module("vsg-2").record.copy()
     record["high"][0] = 7.0
@@ -316,17 +303,14 @@ def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused():
         make_fixed("x", record)
 
 
-def test_eva_refuses_a_folder_in_floating_point(tmp_path, capsys):
-    folder = exported(tmp_path, "float32", "unrolled", "droop-1")
-    assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
-    assert "has float32; it proves --real fixed only" in capsys.readouterr().err
-
-
-def test_eva_names_its_package(tmp_path, capsys, monkeypatch):
-    folder = exported(tmp_path, FIXED, "unrolled", "droop-1")
+@pytest.mark.parametrize(
+    ("real", "said"),
+    [("float32", "has float32; it proves --real fixed only"), (FIXED, "install frama-c-base")],
+)
+def test_eva_refuses_floats_and_names_its_package(real, said, tmp_path, refused, monkeypatch):
+    folder = exported(tmp_path, real, "unrolled", "droop-1")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
-    assert "apt-get install frama-c-base" in capsys.readouterr().err
+    assert said in refused("firmware", "check", str(folder), "--target", "eva")
 
 
 # --- compiled ---

@@ -32,21 +32,13 @@ _TURN = 2.0  # rad; a larger turn between two frequencies may hide one the other
 
 @dataclass(frozen=True)
 class GridStability:
-    """Whether a converter is stable on a grid, from its admittance.
+    """Whether a converter is stable on a grid, from its admittance."""
 
-    Attributes:
-        stable: None: the frequencies do not suffice to judge; ``reason`` says why.
-        unstable: how many poles of the closed loop are unstable; None as ``stable``.
-        margin: least distance of an eigenvalue of Z Y from -1 over the frequencies.
-        at_hz: where, Hz.
-        reason: empty if ``stable`` is not None.
-    """
-
-    stable: bool | None
-    unstable: int | None
-    margin: float
-    at_hz: float
-    reason: str = ""
+    stable: bool | None  #: None: the frequencies do not suffice to judge; ``reason`` says why
+    unstable: int | None  #: how many poles of the closed loop are unstable; None as ``stable``
+    margin: float  #: least distance of an eigenvalue of Z Y from -1 over the frequencies
+    at_hz: float  #: where, Hz
+    reason: str = ""  #: empty if ``stable`` is not None
 
 
 def line_impedance(

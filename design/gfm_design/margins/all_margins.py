@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gfm_design.margins.classical import GainPhase, gain_phase
 from gfm_design.margins.delays import DelayMargin, DelayMargins, longest
-from gfm_design.margins.disk import DiskMargin, disk_margin
-from gfm_design.margins.locus import Locus, locus_at_u, locus_at_y
+from gfm_design.margins.locus import (
+    DiskMargin,
+    GainPhase,
+    Locus,
+    disk_margin,
+    gain_phase,
+    locus_at_u,
+    locus_at_y,
+)
 from gfm_design.margins.tolerance import GridStrength, Range, element_ranges, grid_strength
 from gfm_design.model.closed_loop import U_CARRIED, Y_CARRIED, ClosedLoop
 from gfm_design.model.linear import Mode
@@ -47,21 +53,16 @@ class ChannelMargins:
 
 @dataclass(frozen=True)
 class LoopMargins:
-    """The margins of a loop at one operating point.
+    """The margins of a loop at one operating point."""
 
-    Attributes:
-        worst: the mode that is damped least, its damping ratio the smallest.
-        u, y: each channel that the loop uses.
-        disk_u, disk_y: all channels of u, of y at once.
-        delay: additional delay of all of u; the scan ended at ``longest``, s.
-    """
-
-    worst: Mode
+    worst: Mode  #: the mode that is damped least, its damping ratio the smallest
+    #: u, y: each channel that the loop uses
     u: tuple[ChannelMargins, ...]
     y: tuple[ChannelMargins, ...]
+    #: disk_u, disk_y: all channels of u, of y at once
     disk_u: DiskMargin
     disk_y: DiskMargin
-    delay: DelayMargin
+    delay: DelayMargin  #: additional delay of all of u; the scan ended at ``longest``, s
     longest: float
 
 

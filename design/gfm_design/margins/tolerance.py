@@ -25,18 +25,14 @@ _BEYOND = 1e-4  # relative distance at which the unstable mode is determined
 
 @dataclass(frozen=True)
 class End:
-    """One end of a range.
+    """One end of a range."""
 
-    Attributes:
-        factor: over the present value; the floor or the ceiling if the loop is stable up to there.
-        lost: the mode that is unstable beyond; None at the floor or ceiling, or if there is no
-            operating point beyond.
-        bounded: the range ends before the floor or ceiling.
-    """
-
+    #: over the present value; the floor or the ceiling if the loop is stable up to there
     factor: float
+    #: the mode that is unstable beyond; None at the floor or ceiling, or if there is no operating
+    #: point beyond
     lost: Mode | None
-    bounded: bool
+    bounded: bool  #: the range ends before the floor or ceiling
 
 
 @dataclass(frozen=True)

@@ -79,23 +79,14 @@ _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
 
 @dataclass(frozen=True)
 class Origin:
-    """What a loop was made of; ``ClosedLoop.changed`` makes it anew with other elements.
+    """What a loop was made of; ``ClosedLoop.changed`` makes it anew with other elements."""
 
-    Attributes:
-        plant: its options.
-        law: at its sampling time.
-        ideal: the loop is continuous and has the law before it was discretised.
-        ref: references, shape (5,), p.u.
-        par: the plant's record.
-        op: the operating point.
-    """
-
-    plant: Plant
-    law: DiscreteLaw
-    ideal: bool
-    ref: Matrix
-    par: Record
-    op: OperatingPoint
+    plant: Plant  #: its options
+    law: DiscreteLaw  #: at its sampling time
+    ideal: bool  #: the loop is continuous and has the law before it was discretised
+    ref: Matrix  #: references, shape (5,), p.u.
+    par: Record  #: the plant's record
+    op: OperatingPoint  #: the operating point
 
 
 class Surroundings(Protocol):

@@ -64,15 +64,12 @@ _D = INPUTS[NY:]
 
 @dataclass(frozen=True)
 class NetworkMode(Mode):
-    """A mode of a network.
+    """A mode of a network."""
 
-    Attributes:
-        participation: of each part, largest first; they add up to 1. That of a part is
-            |sum of l_i r_i| over the states i of the part, with the mode's left and right
-            eigenvectors l and r, divided by the sum over all parts (Pérez-Arriaga, Verghese and
-            Schweppe, 1982). It does not depend on the coordinates that describe the part.
-    """
-
+    #: of each part, largest first; they add up to 1. That of a part is |sum of l_i r_i| over the
+    #: states i of the part, with the mode's left and right eigenvectors l and r, divided by the sum
+    #: over all parts (Pérez-Arriaga, Verghese and Schweppe, 1982). It does not depend on the
+    #: coordinates that describe the part.
     participation: Mapping[str, float] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
@@ -82,23 +79,16 @@ class NetworkMode(Mode):
 
 @dataclass(frozen=True)
 class LinearConverter:
-    """A converter of the network.
+    """A converter of the network."""
 
-    Attributes:
-        name: its own.
-        title: its name and that of its law.
-        law, stage: around the operating point.
-        op: the operating point.
-        ref: the references, shape (5,), p.u.
-        u, y: its places among the commands and the measurements of all.
-    """
-
-    name: str
-    title: str
+    name: str  #: its own
+    title: str  #: its name and that of its law
+    #: law, stage: around the operating point
     law: LinearLaw
     stage: LinearStage | None
-    op: OperatingPoint
-    ref: Matrix
+    op: OperatingPoint  #: the operating point
+    ref: Matrix  #: the references, shape (5,), p.u.
+    #: u, y: its places among the commands and the measurements of all
     u: slice
     y: slice
 
@@ -116,19 +106,15 @@ class LinearConverter:
 
 @dataclass(frozen=True)
 class LinearNetwork:
-    """The network without its controllers: continuous, in deviations from its rest.
+    """The network without its controllers: continuous, in deviations from its rest."""
 
-    Attributes:
-        plant: with the commands and the measurements of all converters one after the other; C_true
-            is (5 N, n). Its last states are the angles of the islands' references.
-        turn: what a turn of each island by 1 rad does to the other states, (n - r, r) for r
-            islands.
-        parts: by the name of each part the matrix (n, n) that keeps the part's share of the states,
-            which are absolute angles here; the matrices add up to 1.
-    """
-
+    #: with the commands and the measurements of all converters one after the other; C_true is (5 N,
+    #: n). Its last states are the angles of the islands' references.
     plant: LinearPlant
+    #: what a turn of each island by 1 rad does to the other states, (n - r, r) for r islands
     turn: Matrix
+    #: by the name of each part the matrix (n, n) that keeps the part's share of the states, which
+    #: are absolute angles here; the matrices add up to 1
     parts: dict[str, Matrix]
 
     @property

@@ -35,23 +35,16 @@ _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The common equilibrium of plant and law, all in p.u.
+    """The common equilibrium of plant and law, all in p.u."""
 
-    Attributes:
-        x: the plant's state, shape (8,), order as in ``gfm_plant.model``, in the frame of the law:
-            its E_u lies on the d axis.
-        u: the law's output, shape (3,); i_u is the current of the DC source, also of a regulated
-            one.
-        y: the outputs as the sensors report them, shape (5,).
-        x_law: the law's state, shape (n,).
-        e: the bridge's voltage e_d + j e_q in that frame; E_u without an inner stage.
-    """
-
+    #: the plant's state, shape (8,), order as in ``gfm_plant.model``, in the frame of the law: its
+    #: E_u lies on the d axis
     x: Vector
+    #: the law's output, shape (3,); i_u is the current of the DC source, also of a regulated one
     u: Vector
-    y: Vector
-    x_law: Vector
-    e: complex
+    y: Vector  #: the outputs as the sensors report them, shape (5,)
+    x_law: Vector  #: the law's state, shape (n,)
+    e: complex  #: the bridge's voltage e_d + j e_q in that frame; E_u without an inner stage
 
     @property
     def commands(self) -> Vector:

@@ -1,22 +1,124 @@
-"""The peaks of weighted channels, and their heights at nearby gains.
+"""How high the weighted channels W_ij T_ij reach: for a search, and near a minimum.
 
-A peak's height has derivatives over whatever the loop's matrices depend on smoothly: with the
-resolvent R = (j omega - A)^-1, T = C R B + D, and dR = R dA R. A peak also moves along the
-frequency as the gains move: over (x, ln omega) it is a saddle, and ln omega is eliminated.
+``Screen`` is a fast estimate of gamma for a search that needs it thousands of times. It decomposes
+the loops of a whole population into their modes at once, and evaluates all channels on a grid that
+follows the modes, with points across every narrow resonance. The result is a lower bound close to
+the norm; ``norms.hinf`` confirms the result of a search.
+
+``peaks`` and ``model`` are for the last steps. A peak's height has derivatives over whatever the
+loop's matrices depend on smoothly: with the resolvent R = (j omega - A)^-1, T = C R B + D, and
+dR = R dA R. A peak also moves along the frequency as the gains move: over (x, ln omega) it is a
+saddle, and ln omega is eliminated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.norms.performance import StateSpace, Weight
-from gfm_design.norms.weights import sizes_of
 
 Vector = NDArray[np.float64]
+
+
+class Sizes:
+    """Magnitudes |W(j omega)| of several weights."""
+
+    def __init__(self, weights: Sequence[Weight]) -> None:
+        self._num, self._den = (
+            _stacked([_squared_size(c) for c in side])
+            for side in ([w.num for w in weights], [w.den for w in weights])
+        )
+
+    def squared(self, omega: Vector) -> Vector:
+        """|W|^2 at omega [rad/s] of any shape; the weights are a last axis."""
+        y = (omega * omega)[..., None]
+        num, den = (y ** np.arange(c.shape[1]) @ c.T for c in (self._num, self._den))
+        return np.asarray(num / den)
+
+    def bend(self, omega: Vector, which: NDArray[np.intp]) -> Vector:
+        """Second derivative of ln |W| with respect to omega, at omega (K,), for the weights
+        ``which`` (K,)."""
+        y, out = omega * omega, np.zeros(len(omega))
+        for sign, c in ((0.5, self._num[which]), (-0.5, self._den[which])):
+            k = np.arange(c.shape[1])
+            powers = [y[:, None] ** np.maximum(k - m, 0) for m in range(3)]
+            factors = [np.ones_like(k), k, k * (k - 1)]
+            p, dp, ddp = ((c * f * q).sum(axis=1) for f, q in zip(factors, powers, strict=True))
+            out += sign * (2 * dp / p + 4 * y * (ddp / p - (dp / p) ** 2))
+        return out
+
+
+@cache
+def sizes_of(weights: tuple[Weight, ...]) -> Sizes:
+    """The sizes of these weights; a polish asks for the same ones at every step."""
+    return Sizes(weights)
+
+
+def _squared_size(c: tuple[float, ...]) -> Vector:
+    """|c(j omega)|^2 as a polynomial in omega^2, ascending."""
+    ascending = np.asarray(c)[::-1]
+    signs = (-1.0) ** np.arange(len(c))
+    return np.convolve(ascending, ascending * signs)[::2] * signs
+
+
+def _stacked(polynomials: list[Vector]) -> Vector:
+    out = np.zeros((len(polynomials), max(len(p) for p in polynomials)))
+    for row, p in zip(out, polynomials, strict=True):
+        row[: len(p)] = p
+    return out
+
+
+_BASE = np.concatenate(  # rad/s; as good as 0 and infinity at the ends, where many laws are worst
+    [[1e-6, 1e-3], np.logspace(-2, 0, 10), np.logspace(0.05, 3, 70), np.logspace(3.1, 5, 20), [1e7]]
+)
+_NARROW = np.array([-2.0, -0.8, -0.3, 0.0, 0.3, 0.8, 2.0])  # half widths around a resonance
+
+
+class Screen:
+    """Screens closed loops against one set of weights."""
+
+    def __init__(self, weights: tuple[Weight, ...]) -> None:
+        self._rows = [w.i - 1 for w in weights]
+        self._columns = [w.j - 1 for w in weights]
+        self._sizes = Sizes(weights)
+        self._on_base = self._sizes.squared(_BASE)
+
+    def __call__(self, loops: StateSpace) -> tuple[Vector, Vector]:
+        """(largest weighted gains, spectral abscissae in 1/s) of loops stacked on axis 0.
+
+        The gain of an unstable loop is inf.
+        """
+        A, B, C, D = loops
+        values, vectors = np.linalg.eig(A)
+        values, vectors = values.astype(complex), vectors.astype(complex)
+        abscissae = values.real.max(axis=1)
+        gains = np.full(len(A), np.inf)
+        good = np.flatnonzero(abscissae < 0.0)
+        if len(good) == 0:
+            return gains, abscissae
+        values, vectors = values[good], vectors[good]
+        seen = np.swapaxes((C[good] @ vectors)[:, self._rows], 1, 2)
+        moved = np.linalg.solve(vectors, B[good].astype(complex))[:, :, self._columns]
+        residues, through = seen * moved, D[good][:, None, self._rows, self._columns]
+
+        def largest(omega: Vector, weight: Vector) -> Vector:
+            response = (1.0 / (1j * omega[..., None] - values[:, None, :])) @ residues + through
+            sizes = (response.real**2 + response.imag**2) * weight
+            return np.sqrt(sizes.max(axis=(1, 2)))
+
+        near = np.abs(values.imag[:, :, None] + _NARROW * values.real[:, :, None])
+        near = near.reshape(len(good), -1)
+        gains[good] = np.maximum(
+            largest(_BASE[None, :], self._on_base), largest(near, self._sizes.squared(near))
+        )
+        return gains, abscissae
+
+
 Complex = NDArray[np.complex128]
 Loops = Callable[[Vector], StateSpace]
 

@@ -9,12 +9,17 @@ controller's own reference omega_g stays where it is (no PLL, as in the paper's 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.norms.hinf import Norm, hinf_norm
+from gfm_runtime.errors import printable
+from gfm_runtime.toml_file import read_toml
 from gfm_runtime.tustin import tustin
 
 Matrix = NDArray[np.float64]
@@ -138,3 +143,39 @@ def channel_norms(
         norm: Norm = hinf_norm(*channel_system(loop, weight, T_s), T_s=T_s)
         channels.append(WeightedChannel(weight.i, weight.j, norm.gain, norm.omega))
     return tuple(channels)
+
+
+_DEGREE = 8
+
+
+def read_weights(path: Path) -> tuple[Weight, ...]:
+    """The weights of a file.
+
+    Raises:
+        ValueError: it cannot be read, is not TOML, or has an invalid weight; it names the first.
+    """
+    content = read_toml(path)
+    if not content:
+        raise ValueError("holds no weight; e.g. [W_11] with num and den")
+    return tuple(_weight(name, entry) for name, entry in content.items())
+
+
+def _weight(name: str, entry: Any) -> Weight:
+    found = re.fullmatch(r"W_([1-4])([12])", name)
+    if not found:
+        raise ValueError(f"{printable(name)}: a weight is W_ij, i = 1..4 of z and j = 1..2 of w")
+    if not isinstance(entry, dict) or set(entry) != {"num", "den"}:
+        raise ValueError(f"{name}: needs num and den, and nothing else")
+    num, den = (_coefficients(f"{name}.{side}", entry[side]) for side in ("num", "den"))
+    return Weight(int(found[1]), int(found[2]), num, den)
+
+
+def _coefficients(where: str, value: Any) -> tuple[float, ...]:
+    if not isinstance(value, list) or not 1 <= len(value) <= _DEGREE + 1:
+        raise ValueError(f"{where}: must be a list of 1 to {_DEGREE + 1} numbers")
+    if not all(isinstance(c, (int, float)) and not isinstance(c, bool) for c in value):
+        raise ValueError(f"{where}: must be a list of 1 to {_DEGREE + 1} numbers")
+    try:
+        return tuple(float(c) for c in value)
+    except OverflowError:
+        raise ValueError(f"{where}: a number is too large") from None

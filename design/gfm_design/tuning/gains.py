@@ -2,27 +2,29 @@
 
 The paper pulls its gains out of the loop into a static K (Section III-B): the law's matrices are
 then affine in the gains. ``GainedLaw`` tests this once for a law file. If it holds, a law for new
-gains costs a few additions; if not, ``model.batch`` builds the laws of a whole population from the
-file in one pass.
+gains costs a few additions; if not, ``realise_each`` builds the laws of a whole population from the
+file in one pass. ``gfm_runtime.realisation`` builds one law with all checks, in some milliseconds;
+a search asks for thousands.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.batch import realise_each
 from gfm_design.model.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
 from gfm_design.model.operating_point import OperatingPoint
+from gfm_runtime.elements import ZERO, Element, P, make, usable
 from gfm_runtime.errors import LawError
 from gfm_runtime.expressions import evaluate
-from gfm_runtime.lawfile import LawFile, build_law, tied
-from gfm_runtime.realisation import realise
+from gfm_runtime.lawfile import LawFile, build_law, element_numbers, tied
+from gfm_runtime.realisation import LawStateSpace, assemble, realise, row_of
+from gfm_runtime.signals import NU, NY, U_NAMES
 
 Vector = NDArray[np.float64]
 
@@ -214,3 +216,33 @@ class Encoding:
         """The coordinates of gains."""
         ratio = np.log(np.where(self._by_ratio, values, 1.0))
         return np.where(self._by_ratio, ratio, np.arcsinh(values / self._linear))
+
+
+Columns = Mapping[str, NDArray[np.float64]]  # parameters by name, shape (N,) each
+
+
+@np.errstate(all="ignore")  # such a row is not usable
+def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
+    """The law at N sets of parameters: as ``realise``, every matrix with a leading axis of N.
+
+    Rows in which an element is out of its bounds are NaN. In row 0 different factors must have
+    different values.
+    """
+    good = np.ones(max(len(c) for c in numbers.values()), dtype=bool)
+    cells: dict[str, dict[str, Element]] = {"phi": {}, "psi": {}}
+    for matrix, of in (("phi", file.phi), ("psi", file.psi)):
+        for key, specs in of.items():
+            product = P(1.0)
+            for spec in specs:
+                own = element_numbers(f"{matrix}_{key}", spec, numbers)
+                good &= usable(own)
+                product = product * make(f"{matrix}_{key}", spec.type, own)
+            cells[matrix][key] = product
+    rows = []
+    for i in range(NU):
+        phi, psi = ([of.get(f"{i + 1}{j + 1}", ZERO) for j in range(NY)] for of in cells.values())
+        rows.append(row_of(phi, psi, smooth=True))
+    out = assemble(rows, [getattr(file.u_0, name) for name in U_NAMES])
+    A, D_y = (np.broadcast_to(m, (len(good), *m.shape[-2:])).copy() for m in (out.A, out.D_y))
+    A[~good], D_y[~good] = np.nan, np.nan
+    return replace(out, A=A, D_y=D_y)

@@ -49,20 +49,14 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class Tuned:
-    """The result of a search.
+    """The result of a search."""
 
-    Attributes:
-        values: the free gains, in the given order.
-        cost: of these gains.
-        evaluations, seconds: the effort.
-        seed: of the random numbers; a seed always gives the same result.
-    """
-
-    values: Vector
-    cost: float
+    values: Vector  #: the free gains, in the given order
+    cost: float  #: of these gains
+    #: evaluations, seconds: the effort
     evaluations: int
     seconds: float
-    seed: int
+    seed: int  #: of the random numbers; a seed always gives the same result
 
 
 class NotStabilised(ArithmeticError):

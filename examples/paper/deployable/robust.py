@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from deployable.box import SOURCES, Point, Source
 from gfm_design.model.closed_loop import INPUTS, T_S, ClosedLoop
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
-from gfm_design.tuning.paper_problem import PaperProblem
+from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law

@@ -20,7 +20,7 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn
 
-from gfm_design.tuning.paper_tune import EVALUATIONS
+from gfm_design.tuning.paper import EVALUATIONS
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_hil.cli.common import EXIT_INTERRUPTED, EXIT_OTHERWISE, new_folder, progress, split_laws
 from gfm_hil.core.errors import UserError

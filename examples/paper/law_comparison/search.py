@@ -23,8 +23,7 @@ from gfm_design.model.linear import LinearLaw, Mode
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, WeightedChannel
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
-from gfm_design.tuning.paper_problem import PAPER_START, PaperProblem
-from gfm_design.tuning.paper_tune import tune_paper
+from gfm_design.tuning.paper import PAPER_START, PaperProblem, tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_plant import Plant
 from gfm_runtime.lawfile import LawFile, build_law

@@ -1,8 +1,6 @@
 """gfmhil schema: what a scenario, law, inner stage, campaign or test file may hold, as JSON
 Schema."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -13,8 +11,8 @@ from pydantic import TypeAdapter
 from gfm_hil.core.files import write_text
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
-from gfm_hil.studies.conformity.model import Test
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.criteria.base import UnderTest
+from gfm_hil.studies.conformity.sets import Test
 from gfm_runtime.inner import Inner
 from gfm_runtime.lawfile import LawFile
 
@@ -45,7 +43,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Print or write the schema; returns the exit code."""
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **MODELS[options.kind].json_schema(),

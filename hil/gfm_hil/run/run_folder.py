@@ -5,8 +5,6 @@ files are made of, and ``recover`` can make them again. ``merge_roles`` makes on
 that the sides of a run leave if they were started apart.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json
@@ -47,11 +45,9 @@ _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 def check_free(folder: Path, ticks: int, inner: bool = False) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
 
-    ``inner``: the run has an inner stage.
-
-    Raises:
-        UserError: it holds something, cannot be made or written, or the disk is too full; a
-            memory-mapped file on a full disk would end the process without a word.
+    ``inner``: the run has an inner stage. Raises UserError: it holds something, cannot be made or
+    written, or the disk is too full; a memory-mapped file on a full disk would end the process
+    without a word.
     """
     there = folder
     while not there.exists():
@@ -153,45 +149,39 @@ class _LinkEnd(BaseModel):
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """While this process runs the run of ``folder``, ``recover`` refuses it.
-
-    Raises:
-        UserError: another process is just recovering it.
-    """
-    with contextlib.ExitStack() as stack:
-        handle = _open_lock(folder)
-        stack.callback(os.close, handle)
-        try:
-            scratch.lock(handle, fcntl.LOCK_SH)
-        except TimeoutError as problem:
-            raise UserError(f"{folder}: {problem}") from None
+    """While this process runs the run of ``folder``, ``recover`` refuses it. Raises UserError:
+    another process is just recovering it."""
+    with _locked(folder, fcntl.LOCK_SH, scratch.PATIENCE_S):
         yield
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Keep others from a folder, and from its parts where those lie elsewhere."""
-    with contextlib.ExitStack() as stack:
-        handle = _open_lock(folder)
-        stack.callback(os.close, handle)
-        try:
-            scratch.lock(handle, fcntl.LOCK_EX, patience_s=0.0)
-        except TimeoutError:
-            raise UserError(f"{folder}: the run is still going on") from None
+    locked = _locked(folder, fcntl.LOCK_EX, 0.0, "the run is still going on")
+    with locked, contextlib.ExitStack() as stack:
         place = place_of(folder)
         if place is not None and place.parent != folder:
             stack.callback(scratch.release, scratch.hold(place))
         yield
 
 
-def _open_lock(folder: Path) -> int:
-    """The file that is locked while a run folder is in use; only our user can open it, so that no
-    other user can keep it locked."""
+@contextlib.contextmanager
+def _locked(folder: Path, operation: int, patience_s: float, why: str = "") -> Iterator[None]:
+    """Lock a file of a run folder that only our user can open, so that no other user can keep it
+    locked; ``why`` says what it means if another process has."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        return os.open(folder / _LOCK, flags, 0o600)
+        handle = os.open(folder / _LOCK, flags, 0o600)
     except OSError as problem:
         raise UserError(f"{folder / _LOCK}: {problem.strerror}") from None
+    with contextlib.ExitStack() as stack:
+        stack.callback(os.close, handle)
+        try:
+            scratch.lock(handle, operation, patience_s)
+        except TimeoutError as problem:
+            raise UserError(f"{folder}: {why or problem}") from None
+        yield
 
 
 @contextlib.contextmanager
@@ -265,10 +255,8 @@ def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
 def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
     """Write the folder of a run in memory, or copy that of another; returns it.
 
-    A law that was an object is there as ``law.toml``, which the scenario names.
-
-    Raises:
-        UserError: the folder holds something already, or cannot be written.
+    A law that was an object is there as ``law.toml``, which the scenario names. Raises UserError:
+    the folder holds something already, or cannot be written.
     """
     folder = Path(folder)
     check_empty(folder)

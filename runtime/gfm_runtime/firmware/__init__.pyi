@@ -1,5 +1,5 @@
 from .a2l import Entry, a2l_text, unit_of
-from .check import OPTIMISED, TARGETS, Checked, check, need_tools
+from .check import EVA, OPTIMISED, TARGETS, Checked, Proved, check, need_tools, prove
 from .dll import build_dll, dll_sources
 from .elf import elf_a2l, elf_entries
 from .fixed import FIXED
@@ -8,7 +8,6 @@ from .folder import export
 from .golden import CHECKED, SHIPPED, Golden, golden
 from .loop import CHANGE, FROM, START, TICK, TO, LoopProgram, build_loop
 from .module import REALS, STYLES, Module, Style, make_modules, sources
-from .proof import EVA, Proved, prove
 from .schedule import stage_names
 
 __all__ = [

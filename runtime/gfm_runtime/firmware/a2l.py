@@ -32,34 +32,21 @@ _LAST_ADDRESS = 2**32 - 1
 
 @dataclass(frozen=True)
 class Entry:
-    """One number, or one array of numbers, in a memory.
+    """One number, or one array of numbers, in a memory."""
 
-    Attributes:
-        name: of the entry, unique; parts of a struct are joined by dots.
-        text: what it is, one line.
-        kind: a key of ``TYPES``.
-        address: of its first byte.
-        unit: with its base, e.g. ``p.u. (S_n)``; empty for a number without one.
-        low, high: plausible range; the whole range of its type if None.
-        shape: of an array in C's order; empty for a number.
-        words: meanings of the values of a code.
-        symbol: how C names it, e.g. ``law.u[0]``; empty if no program has it.
-        calibrated: whether a tool may write it (a CHARACTERISTIC), or only measure it.
-        fixed: of what is calibrated: lies in memory that cannot be written.
-    """
-
-    name: str
-    text: str
-    kind: str
-    address: int
-    unit: str = ""
+    name: str  #: of the entry, unique; parts of a struct are joined by dots
+    text: str  #: what it is, one line
+    kind: str  #: a key of ``TYPES``
+    address: int  #: of its first byte
+    unit: str = ""  #: with its base, e.g. ``p.u. (S_n)``; empty for a number without one.
+    #: low, high: plausible range; the whole range of its type if None
     low: float | None = None
     high: float | None = None
-    shape: tuple[int, ...] = ()
-    words: tuple[tuple[int, str], ...] = ()
-    symbol: str = ""
-    calibrated: bool = False
-    fixed: bool = False
+    shape: tuple[int, ...] = ()  #: of an array in C's order; empty for a number
+    words: tuple[tuple[int, str], ...] = ()  #: meanings of the values of a code
+    symbol: str = ""  #: how C names it, e.g. ``law.u[0]``; empty if no program has it.
+    calibrated: bool = False  #: whether a tool may write it (a CHARACTERISTIC), or only measure it
+    fixed: bool = False  #: of what is calibrated: lies in memory that cannot be written
 
 
 def unit_of(signal: Signal) -> str:
@@ -96,46 +83,21 @@ def a2l_text(
         if not 0 <= entry.address <= _LAST_ADDRESS:
             raise LawError(entry.name, f"address {entry.address:#x} must have at most 32 bits")
         names.add(entry.name)
-        method = _method(entry, methods)
-        blocks += _characteristic(entry, method) if entry.calibrated else _measured(entry, method)
+        blocks += _block(entry, _method(entry, methods))
         kinds |= {entry.kind} if entry.calibrated else set()
     name = f"gfmhil_{identifier(project)}"
     order = "MSB_FIRST" if big_endian else "MSB_LAST"
-    layouts = [
-        line
-        for kind in sorted(kinds)
-        for line in (
-            f"/begin RECORD_LAYOUT {kind}_rows",
-            f"  FNC_VALUES 1 {kind} ROW_DIR DIRECT",
-            "/end RECORD_LAYOUT",
-        )
-    ]
-    module = [
-        f"/begin MODULE {name} {_quoted(about)}",
-        *_in(
-            [
-                '/begin MOD_COMMON ""',
-                f"  BYTE_ORDER {order}",
-                "/end MOD_COMMON",
-                *more,
-                *(line for lines in methods.values() for line in lines),
-                *layouts,
-                *blocks,
-            ]
-        ),
-        "/end MODULE",
-    ]
-    lines = [
-        "ASAP2_VERSION 1 71",
-        f"/begin PROJECT {name} {_quoted(about)}",
-        *_in(module),
-        "/end PROJECT",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _in(lines: Iterable[str]) -> list[str]:
-    return [f"  {line}" for line in lines]
+    module = ['/begin MOD_COMMON ""', f"  BYTE_ORDER {order}", "/end MOD_COMMON", *more]
+    module += [line for lines in methods.values() for line in lines]
+    for kind in sorted(kinds):
+        module += [f"/begin RECORD_LAYOUT {kind}_rows", f"  FNC_VALUES 1 {kind} ROW_DIR DIRECT",
+                   "/end RECORD_LAYOUT"]  # fmt: skip
+    head = f"{name} {_quoted(about)}"
+    return (
+        f"ASAP2_VERSION 1 71\n/begin PROJECT {head}\n  /begin MODULE {head}\n"
+        + "".join(f"    {line}\n" for line in (*module, *blocks))
+        + "  /end MODULE\n/end PROJECT\n"
+    )
 
 
 def _quoted(text: str) -> str:
@@ -155,58 +117,34 @@ def _method(entry: Entry, methods: dict[str, list[str]]) -> str:
     first = f"{identifier(own)}_code" if entry.words else f"in_{identifier(entry.unit)}"
     for k in range(len(methods) + 1):  # two units may be the same as an identifier
         name = f"{first}_{k}" if k else first
-        lines = _coded(name, entry.words) if entry.words else _in_unit(name, entry.unit)
+        if entry.words:
+            lines = [
+                f'/begin COMPU_METHOD {name} "" TAB_VERB "%3.0" ""',
+                f"  COMPU_TAB_REF {name}_words",
+                "/end COMPU_METHOD",
+                f'/begin COMPU_VTAB {name}_words "" TAB_VERB {len(entry.words)}',
+                *(f"  {code} {_quoted(word or 'none')}" for code, word in entry.words),
+                "/end COMPU_VTAB",
+            ]
+        else:
+            text = f'"" IDENTICAL "%12.6" {_quoted(entry.unit)}'
+            lines = [f"/begin COMPU_METHOD {name} {text}", "/end COMPU_METHOD"]
         if methods.setdefault(name, lines) == lines:
             return name
     raise AssertionError(first)
 
 
-def _in_unit(name: str, unit: str) -> list[str]:
-    return [
-        f'/begin COMPU_METHOD {name} "" IDENTICAL "%12.6" {_quoted(unit)}',
-        "/end COMPU_METHOD",
-    ]
-
-
-def _coded(name: str, words: Sequence[tuple[int, str]]) -> list[str]:
-    return [
-        f'/begin COMPU_METHOD {name} "" TAB_VERB "%3.0" ""',
-        f"  COMPU_TAB_REF {name}_words",
-        "/end COMPU_METHOD",
-        f'/begin COMPU_VTAB {name}_words "" TAB_VERB {len(words)}',
-        *(f"  {code} {_quoted(word or 'none')}" for code, word in words),
-        "/end COMPU_VTAB",
-    ]
-
-
-def _range(entry: Entry) -> str:
+def _block(entry: Entry, method: str) -> list[str]:
+    """The MEASUREMENT or the CHARACTERISTIC of an entry."""
     _, least, most = TYPES[entry.kind]
     low = least if entry.low is None else max(entry.low, least)
     high = most if entry.high is None else min(entry.high, most)
-    return f"{_number(low)} {_number(high)}"
-
-
-def _rest(entry: Entry) -> list[str]:
-    rest = [f"  MATRIX_DIM {' '.join(map(str, entry.shape))}"] if entry.shape else []
-    return rest + ([f'  SYMBOL_LINK "{entry.symbol}" 0'] if entry.symbol else [])
-
-
-def _measured(entry: Entry, method: str) -> list[str]:
-    return [
-        f"/begin MEASUREMENT {entry.name} {_quoted(entry.text)}",
-        f"  {entry.kind} {method} 0 0 {_range(entry)}",
-        f"  ECU_ADDRESS {entry.address:#x}",
-        *_rest(entry),
-        "/end MEASUREMENT",
-    ]
-
-
-def _characteristic(entry: Entry, method: str) -> list[str]:
-    block = "VAL_BLK" if entry.shape else "VALUE"
-    return [
-        f"/begin CHARACTERISTIC {entry.name} {_quoted(entry.text)}",
-        f"  {block} {entry.address:#x} {entry.kind}_rows 0 {method} {_range(entry)}",
-        *_rest(entry),
-        *(["  READ_ONLY"] if entry.fixed else []),
-        "/end CHARACTERISTIC",
-    ]
+    ends, what = f"{_number(low)} {_number(high)}", "MEASUREMENT"
+    lines = [f"  {entry.kind} {method} 0 0 {ends}", f"  ECU_ADDRESS {entry.address:#x}"]
+    if entry.calibrated:
+        what, kind = "CHARACTERISTIC", "VAL_BLK" if entry.shape else "VALUE"
+        lines = [f"  {kind} {entry.address:#x} {entry.kind}_rows 0 {method} {ends}"]
+    lines += [f"  MATRIX_DIM {' '.join(map(str, entry.shape))}"] if entry.shape else []
+    lines += [f'  SYMBOL_LINK "{entry.symbol}" 0'] if entry.symbol else []
+    lines += ["  READ_ONLY"] if entry.calibrated and entry.fixed else []
+    return [f"/begin {what} {entry.name} {_quoted(entry.text)}", *lines, f"/end {what}"]

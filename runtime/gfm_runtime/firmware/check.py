@@ -1,4 +1,4 @@
-"""Builds a firmware folder for a target, runs it, and compares every bit with the kernel's.
+"""Builds a firmware folder for a target, runs it, compares every bit with the kernel's; proves it.
 
 A target is a compiler and, for a bare processor, a machine of QEMU (system emulation, semihosting).
 Under ``-icount`` QEMU's clock counts instructions, so their number is the same in every run.
@@ -12,14 +12,16 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.golden import CHECKED, golden
+from gfm_runtime.firmware.module import Module
 from gfm_runtime.firmware.report import read_report
 
 HARNESS = files("gfm_runtime.firmware").joinpath("harness")
@@ -38,31 +40,19 @@ _TIMEOUT_S = 300
 
 @dataclass(frozen=True)
 class Target:
-    """A compiler and where its programs run.
+    """A compiler and where its programs run."""
 
-    Attributes:
-        what: in words.
-        prefix: of the compiler and its tools.
-        compiler: the compiler's name after the prefix.
-        packages: from apt, for the compiler and the machine.
-        flags: for the processor.
-        link: for the linker.
-        machine: QEMU's command, or () for this machine.
-        order: of bytes, as numpy has it.
-        tick_ns: of the clock that counts instructions; 0 for QEMU in user mode, which has none.
-        real: float32 if that is all that its floating-point unit has.
-    """
-
-    what: str
-    prefix: str
-    compiler: str
-    packages: str
-    flags: tuple[str, ...] = ()
-    link: tuple[str, ...] = ()
-    machine: tuple[str, ...] = ()
+    what: str  #: in words
+    prefix: str = ""  #: of the compiler and its tools
+    compiler: str = "gcc"  #: the compiler's name after the prefix
+    packages: str = ""  #: from apt, for the compiler and the machine
+    flags: tuple[str, ...] = ()  #: for the processor
+    link: tuple[str, ...] = ("-lm",)  #: for the linker
+    machine: tuple[str, ...] = ()  #: QEMU's command, or () for this machine
+    #: of the clock that counts instructions; 0 for QEMU in user mode, which has none
     tick_ns: int = 0
-    real: str = "float64"
-    order: Literal["<", ">"] = "<"
+    real: str = "float64"  #: float32 if that is all that its floating-point unit has
+    order: Literal["<", ">"] = "<"  #: of bytes, as numpy has it
 
     @property
     def run(self) -> list[str]:
@@ -75,99 +65,71 @@ class Target:
         return round(ticks * self.tick_ns / 2**_SHIFT)
 
 
-def _cortex(cpu: str, floats: tuple[str, ...], machine: str, what: str, real: str) -> Target:
-    return Target(
-        what,
-        "arm-none-eabi-",
-        "gcc",
-        "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm",
-        (f"-mcpu={cpu}", "-mthumb", *floats),
-        ("-nostartfiles", "-T", str(HARNESS.joinpath("arm.ld")), "-lm"),
-        ("qemu-system-arm", "-machine", machine),
-        40,
-        real,
-    )
-
-
-def _linux(
-    cpu: str, packages: str, what: str, flags: tuple[str, ...] = (), order: Literal["<", ">"] = "<"
-) -> Target:
-    """A program for Linux on another processor, which QEMU's user mode runs."""
-    return Target(
-        what,
-        f"{'i686' if cpu == 'i386' else cpu}-linux-gnu-",
-        "gcc",
-        f"{packages} qemu-user",
-        flags,
-        ("-static", "-lm"),
-        (f"qemu-{cpu}",),
-        order=order,
-    )
-
-
+_ARM: dict[str, Any] = {
+    "prefix": "arm-none-eabi-",
+    "packages": "gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm",
+    "link": ("-nostartfiles", "-T", str(HARNESS.joinpath("arm.ld")), "-lm"),
+    "tick_ns": 40,
+}
+#: of a program for Linux on another processor, which QEMU's user mode runs
+_LINUX: dict[str, Any] = {"link": ("-static", "-lm")}
 TARGETS = {
-    "host": Target("this machine, gcc", "", "gcc", "gcc libc6-dev", link=("-lm",)),
-    "clang": Target("this machine, clang", "", "clang", "clang libc6-dev", link=("-lm",)),
-    "m4f": _cortex(
-        "cortex-m4", ("-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"), "mps2-an386", "Cortex-M4F in QEMU",
-        "float32",
+    "host": Target("this machine, gcc", packages="gcc libc6-dev"),
+    "clang": Target("this machine, clang", compiler="clang", packages="clang libc6-dev"),
+    "m4f": Target(
+        "Cortex-M4F in QEMU", **_ARM, real="float32",
+        flags=("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
+        machine=("qemu-system-arm", "-machine", "mps2-an386"),
     ),
-    "m7": _cortex(
-        "cortex-m7", ("-mfpu=fpv5-d16", "-mfloat-abi=hard"), "mps2-an500", "Cortex-M7 in QEMU",
-        "float64",
+    "m7": Target(
+        "Cortex-M7 in QEMU", **_ARM,
+        flags=("-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard"),
+        machine=("qemu-system-arm", "-machine", "mps2-an500"),
     ),
-    "m3": _cortex(
-        "cortex-m3", ("-mfloat-abi=soft",), "mps2-an385", "Cortex-M3, floats in software, in QEMU",
-        "float32",
+    "m3": Target(
+        "Cortex-M3, floats in software, in QEMU", **_ARM, real="float32",
+        flags=("-mcpu=cortex-m3", "-mthumb", "-mfloat-abi=soft"),
+        machine=("qemu-system-arm", "-machine", "mps2-an385"),
     ),
     "rv64": Target(
-        "RISC-V rv64gc in QEMU",
-        "riscv64-unknown-elf-",
-        "gcc",
-        "gcc-riscv64-unknown-elf picolibc-riscv64-unknown-elf qemu-system-misc",
-        ("-march=rv64gc", "-mabi=lp64d", "-mcmodel=medany", "--specs=picolibc.specs"),
-        ("-nostartfiles", "-T", str(HARNESS.joinpath("riscv.ld")), "-lm"),
-        ("qemu-system-riscv64", "-machine", "virt", "-bios", "none"),
-        1,
+        "RISC-V rv64gc in QEMU", "riscv64-unknown-elf-", tick_ns=1,
+        packages="gcc-riscv64-unknown-elf picolibc-riscv64-unknown-elf qemu-system-misc",
+        flags=("-march=rv64gc", "-mabi=lp64d", "-mcmodel=medany", "--specs=picolibc.specs"),
+        link=("-nostartfiles", "-T", str(HARNESS.joinpath("riscv.ld")), "-lm"),
+        machine=("qemu-system-riscv64", "-machine", "virt", "-bios", "none"),
     ),
-    "s390x": _linux(
-        "s390x", "gcc-s390x-linux-gnu libc6-dev-s390x-cross", "s390x, big-endian, in QEMU",
-        ("-fexcess-precision=fast",), ">",
+    "s390x": Target(
+        "s390x, big-endian, in QEMU", "s390x-linux-gnu-", **_LINUX, machine=("qemu-s390x",),
+        packages="gcc-s390x-linux-gnu libc6-dev-s390x-cross qemu-user",
+        flags=("-fexcess-precision=fast",), order=">",
     ),
-    "aarch64": _linux(
-        "aarch64", "gcc-aarch64-linux-gnu libc6-dev-arm64-cross", "aarch64 in QEMU"
+    "aarch64": Target(
+        "aarch64 in QEMU", "aarch64-linux-gnu-", **_LINUX, machine=("qemu-aarch64",),
+        packages="gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user",
     ),
-    "i386": _linux(
-        "i386", "gcc-i686-linux-gnu libc6-dev-i386-cross", "i386 with SSE2 in QEMU",
-        ("-msse2", "-mfpmath=sse"),
+    "i386": Target(
+        "i386 with SSE2 in QEMU", "i686-linux-gnu-", **_LINUX, machine=("qemu-i386",),
+        packages="gcc-i686-linux-gnu libc6-dev-i386-cross qemu-user",
+        flags=("-msse2", "-mfpmath=sse"),
     ),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a law gave on a target.
+    """What a law gave on a target."""
 
-    Attributes:
-        name: the law.
-        rows: golden rows that it was stepped through.
-        differ: words of outputs and state, over all rows, that are not the kernel's.
-        instructions: fewest and most of a step, or None where they are not counted.
-        checks: instructions of these that check whether y and ref are in range, or None.
-        code, constants: bytes of the law's object file.
-        state: bytes of one instance.
-        stack: bytes that a step needs at most, or None where the compiler does not say.
-    """
-
-    name: str
-    rows: int
-    differ: int
+    name: str  #: the law
+    rows: int  #: golden rows that it was stepped through
+    differ: int  #: words of outputs and state, over all rows, that are not the kernel's
+    #: fewest and most of a step, or None where they are not counted
     instructions: tuple[int, int] | None
-    checks: int | None
+    checks: int | None  #: instructions of these that check whether y and ref are in range, or None
+    #: code, constants: bytes of the law's object file
     code: int
     constants: int
-    state: int
-    stack: int | None
+    state: int  #: bytes of one instance
+    stack: int | None  #: bytes that a step needs at most, or None where the compiler does not say
 
     @property
     def law_and_limits(self) -> tuple[int, int]:
@@ -327,3 +289,68 @@ def _stack(usage: Path, step: str) -> int | None:
         if function == step or not function.startswith(prefix):
             total += int(size)
     return total
+
+
+# --- the proof by EVA of Frama-C that a folder in fixed point has no overflow or stray access ---
+
+EVA = "eva"
+FRAMA_C, PACKAGE = "frama-c", "frama-c-base"
+#: int and pointers of 32 bits, as on a Cortex-M; an alarm also where a conversion loses bits
+OPTIONS = ("-eva", "-eva-slevel", "20", "-eva-auto-loop-unroll", "32", "-eva-split-return", "auto",
+           "-warn-signed-downcast", "-machdep", "gcc_x86_32", "-cpp-extra-args=-I.")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Proved:
+    """What EVA says of a law."""
+
+    name: str  #: the law
+    alarms: int  #: what it could not prove
+    functions: int  #: how many it went through: all of the law and of the harness
+    seconds: float  #: what it took
+
+
+def _files_of(module: Module) -> tuple[str, str]:
+    """The harness and the source of a law, in its folder."""
+    return f"proof/{module.prefix}.c", f"{module.prefix}.c"
+
+
+def script(modules: Sequence[Module]) -> str:
+    """proof/prove.sh: the same without gfmhil."""
+    command = " ".join((FRAMA_C, *OPTIONS))
+    lines = (f"{command} {' '.join(_files_of(m))} || exit\n" for m in modules)
+    return (
+        f"#!/bin/sh\n# apt-get install {PACKAGE}; each summary must end with 0 alarms.\n"
+        f'cd "$(dirname "$0")/.." || exit\n{"".join(lines)}'
+    )
+
+
+def prove(folder: Path) -> list[Proved]:
+    """Run EVA on each law of a folder that ``export`` wrote in fixed point.
+
+    It follows all values that variables can have, through an endless loop of calls in any order
+    with any int32 as inputs: with 0 alarms no run of the code has undefined behaviour, and no
+    conversion loses bits.
+
+    Raises:
+        LawError: no such folder, a folder in a floating-point precision, no Frama-C (the apt
+            package is named), or an analysis that does not go through all of the code.
+    """
+    found = read_report(folder)
+    if not all(m.fixed for m in found.modules):
+        raise LawError(f"target {EVA}", f"{folder} has {found.real}; it proves --real fixed only")
+    if shutil.which(FRAMA_C) is None:
+        raise LawError(f"target {EVA}", f"{FRAMA_C} is not there; apt-get install {PACKAGE}")
+    out = []
+    for m in found.modules:
+        start = time.monotonic()
+        # by whole paths: Frama-C takes its own folder from PWD, which may be another one
+        sources = [str(folder.resolve() / name) for name in _files_of(m)]
+        said = called([FRAMA_C, *OPTIONS, *sources], folder)
+        alarms = re.search(r"(\d+) alarms? generated by the analysis", said)
+        reached = re.search(r"(\d+) functions analyzed \(out of (\d+)\)", said)
+        if alarms is None or reached is None or reached[1] != reached[2]:
+            raise LawError(f"target {EVA}", f"Frama-C did not go through all of {m.name}")
+        took = time.monotonic() - start
+        out.append(Proved(m.name, int(alarms[1]), int(reached[1]), round(took, 1)))
+    return out

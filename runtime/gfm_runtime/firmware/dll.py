@@ -17,7 +17,7 @@ from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, identifier, plain, template
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
-from gfm_runtime.firmware.module import MADE, RESULTS, keys_of
+from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
 
@@ -42,8 +42,6 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
     u = command_rows(m.stages)
     single = m.real == np.float32
     keys = keys_of(m) | {
-        "MADE": MADE,
-        "LAW_NAME": plain(m.name),
         "NAME": _string(m.name),
         "VERSION": _string(f"signal table {TABLE_VERSION} ({table_hash()})"),
         "TITLE": _string(m.law.title),
@@ -53,15 +51,10 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
         "REAL64": "IEEE_Cigre_DLLInterface_DataType_real64_T",
         "INPUTS": _ports((*group("ref"), *carried_rows("y", m.stages))),
         "OUTPUTS": _ports(u),
-        "REASON": _string(
-            "0, or why the bridge must be blocked: "
-            + "; ".join(f"{code} {text}" for code, text in RESULTS.values() if code)
-        ),
+        "REASON": _string(RESULT_TEXT),
         "STATES": "FloatStates" if single else "DoubleStates",
         "FLOATS": "REALS" if single and not schedule else "0",
         "DOUBLES": "0" if single or schedule else "REALS",
-        "U_LOW": ", ".join(repr(s.low) for s in u),
-        "U_HIGH": ", ".join(repr(s.high) for s in u),
         "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
         "E_IN_USE": ", &u[2]" * m.stages,
     }
@@ -76,21 +69,28 @@ def build_dll(folder: Path, name: str, files: Iterable[str]) -> Path:
     """Compile by gcc the files of ``dll_sources`` in a folder; the shared library's path.
 
     Raises:
-        LawError: there is no gcc (the apt package is named), or it fails.
+        LawError: as ``build_library``.
+    """
+    library = folder / f"gfm_{identifier(name)}.so"
+    build_library(folder, name, files, library.name, ["-fPIC"])
+    return library
+
+
+def build_library(
+    folder: Path, law: str, files: Iterable[str], out: str, flags: Iterable[str], compiler: str = ""
+) -> None:
+    """Compile the C files in a folder to a shared library, by gcc if no compiler is named.
+
+    Raises:
+        LawError: there is no gcc (the apt package is named), or the compiler fails.
     """
     host = TARGETS["host"]
     if shutil.which(host.compiler) is None:
-        raise LawError(
-            f"law {name!r}", f"{host.compiler} is not there; apt-get install {host.packages}"
-        )
-    library = folder / f"gfm_{identifier(name)}.so"
+        why = f"{host.compiler} is not there; apt-get install {host.packages}"
+        raise LawError(f"law {law!r}", why)
     own = [file for file in files if file.endswith(".c")]
-    called(
-        [host.compiler, *FLAGS, OPTIMISED, "-fPIC", "-shared", "-fvisibility=hidden",
-         *own, "-o", library.name, *host.link],
-        folder,
-    )  # fmt: skip
-    return library
+    command = [compiler or host.compiler, *FLAGS, OPTIMISED, *flags, "-shared"]
+    called([*command, "-fvisibility=hidden", *own, "-o", out, *host.link], folder)
 
 
 def _string(text: str) -> str:

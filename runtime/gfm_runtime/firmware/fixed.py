@@ -1,4 +1,4 @@
-"""A law in fixed point: its word lengths and scalings, and an exact reference of its arithmetic.
+"""A law in fixed point: its word lengths and scalings, its tick, and its distance from float64.
 
 Every number is an int32, a value in p.u. times 2^q. Sums of products are int64 at one exponent e a
 row: the largest e at which no sum, whatever its inputs are within their ranges, reaches 2^62, and
@@ -12,8 +12,10 @@ every coefficient is an int32. Ranges come from the signal table, and for the st
 
 A state takes the upper bits of each increment, and keeps the others for the next tick ("fraction
 saving": error feedback of the first order), so that no dead band holds it away from its rest.
-``FixedLaw`` has the numbers; ``fixed_tick`` has the tick, for Python and for C; ``deviation`` has
-the bounds.
+``FixedLaw`` has the numbers. The tick is functions of integers: ``Instance`` runs them on Python's
+own, which have no limit, and is the exact reference; the translator writes C from them. There ``v``
+is the list of a tick's numbers by place (``REF``, ...); in C each is a member of the instance or of
+the tick. ``deviations`` has proven bounds of how far u gets from the law in float64.
 """
 
 from __future__ import annotations
@@ -22,14 +24,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.error_maps import DC_ENERGY, DVOC, HYBRID_ANGLE, LINEAR, V_MIN
 from gfm_runtime.errors import LawError
-from gfm_runtime.signals import NU, NY, U_NAMES, Signal, group
+from gfm_runtime.signals import NU, NY, U_NAMES, group
+from gfm_runtime.states import BAD_Y, OK
 
 FIXED = "fixed"
 WORD = 2**31 - 1  # the largest int32
@@ -46,16 +50,11 @@ OMEGA = 2  # column of y that is the law's own omega_u
 
 
 class Number(NamedTuple):
-    """An int32 of the C code.
+    """An int32 of the C code."""
 
-    Attributes:
-        text: in C.
-        q: its value is the integer times 2^-q, in p.u.
-        low, high: the integers between which it stays.
-    """
-
-    text: str
-    q: int
+    text: str  #: in C
+    q: int  #: its value is the integer times 2^-q, in p.u.
+    #: low, high: the integers between which it stays
     low: int
     high: int
 
@@ -66,52 +65,35 @@ class Number(NamedTuple):
 
 
 class Sum(NamedTuple):
-    """A sum of products at one exponent.
+    """A sum of products at one exponent."""
 
-    Attributes:
-        e: its value is the integer times 2^-e.
-        start: the constant.
-        terms: coefficient and place of each number; none is 0.
-        meant: the coefficients in real numbers by place, those that round to 0 too.
-        meant_start: the constant in real numbers.
-    """
-
-    e: int
-    start: int
-    terms: tuple[tuple[int, int], ...]
+    e: int  #: its value is the integer times 2^-e
+    start: int  #: the constant
+    terms: tuple[tuple[int, int], ...]  #: coefficient and place of each number; none is 0
+    #: the coefficients in real numbers by place, those that round to 0 too
     meant: Mapping[int, float]
-    meant_start: float
+    meant_start: float  #: the constant in real numbers
 
 
 @dataclass(frozen=True)
 class FixedLaw:
-    """A law's numbers and sums.
+    """A law's numbers and sums."""
 
-    Attributes:
-        n: states.
-        numbers: of a tick, by place (REF, Y, ...); a place without a number has None.
-        low, high: limits of u, as integers of u.
-        output: u before its limits, at each row's exponent.
-        state: increments of x.
-        decay, follow: increments of the offset and of the trend.
-        settle: x at a bumpless change.
-        last: u of the tick before a bumpless change.
-        error_map: its code.
-        across: of hybrid-angle, for the references and for the measurements.
-    """
-
-    n: int
+    n: int  #: states
+    #: of a tick, by place (REF, Y, ...); a place without a number has None
     numbers: tuple[Number, ...]
+    #: low, high: limits of u, as integers of u
     low: tuple[int, ...]
     high: tuple[int, ...]
-    output: tuple[Sum, ...]
-    state: tuple[Sum, ...]
+    output: tuple[Sum, ...]  #: u before its limits, at each row's exponent
+    state: tuple[Sum, ...]  #: increments of x
+    #: decay, follow: increments of the offset and of the trend
     decay: tuple[Sum, ...]
     follow: tuple[Sum, ...]
-    settle: tuple[Sum, ...]
-    last: tuple[Sum, ...]
-    error_map: int
-    across: tuple[Across, ...] = ()
+    settle: tuple[Sum, ...]  #: x at a bumpless change
+    last: tuple[Sum, ...]  #: u of the tick before a bumpless change
+    error_map: int  #: its code
+    across: tuple[Across, ...] = ()  #: of hybrid-angle, for the references and for the measurements
 
     def shift(self, total: Sum, place: int) -> int:
         """Bits from a sum to the number at a place."""
@@ -128,7 +110,10 @@ class FixedLaw:
 
     def ratio(self, of: int, out: int, j: int) -> Ratio:
         """What p/V^2 is computed with, from the numbers at ``of`` to that at ``out + j``."""
-        return ratio_of(self.numbers[of + j], self.numbers[of + 4], self.numbers[out + j])
+        p, V, ratio = self.numbers[of + j], self.numbers[of + 4], self.numbers[out + j]
+        most = math.ceil(math.ldexp(V.span[1] * G_MOST, QUOTIENT))
+        first, second = 1 << (QUOTIENT + V.q - p.q), 1 << (V.q + ratio.q - QUOTIENT)
+        return Ratio(round(math.ldexp(V_MIN, V.q)), first, most, second)
 
 
 def number(text: str, low: float, high: float) -> Number:
@@ -137,11 +122,6 @@ def number(text: str, low: float, high: float) -> Number:
     q = 30 - math.frexp(most)[1]
     q += int(math.ldexp(most, q + 1) <= WORD)
     return Number(text, q, math.ceil(math.ldexp(low, q)), math.floor(math.ldexp(high, q)))
-
-
-def of_signal(text: str, signal: Signal) -> Number:
-    """The number of a row of the signal table."""
-    return number(text, signal.low, signal.high)
 
 
 def trends(follow: float) -> tuple[Number, ...]:
@@ -158,9 +138,9 @@ def trends(follow: float) -> tuple[Number, ...]:
 
 
 #: of what goes over the interface, the same for all laws
-REFS = tuple(of_signal(f"t->ref[{j}]", s) for j, s in enumerate(group("ref")))
-YS = tuple(of_signal(f"t->y[{j}]", s) for j, s in enumerate(group("y")))
-US = tuple(of_signal(f"t->u[{i}]", s) for i, s in enumerate(group("u")))
+REFS = tuple(number(f"t->ref[{j}]", s.low, s.high) for j, s in enumerate(group("ref")))
+YS = tuple(number(f"t->y[{j}]", s.low, s.high) for j, s in enumerate(group("y")))
+US = tuple(number(f"t->u[{i}]", s.low, s.high) for i, s in enumerate(group("u")))
 U_DEFAULT = tuple(
     round(math.ldexp(s.default, one.q)) for s, one in zip(group("u"), US, strict=True)
 )
@@ -325,25 +305,23 @@ G_MOST = 60.0  # p.u.; where p/V^2 and q/V^2 of dvoc saturate
 QUOTIENT = 31  # exponent of p/V on the way to p/V^2
 
 
-def _mapped(code: int) -> dict[int, Number] | None:
-    """The numbers of the columns that an error map changes; None if it is not covered."""
-    if code == LINEAR:
-        return {}
-    if code == DC_ENERGY:
-        (low, high), most_y = REFS[0].span, YS[0].span[1]
-        return {
-            R: number("t->r[0]", low * low / 2, high * high / 2),
-            M: number("t->m[0]", 0.0, most_y * most_y / 2),
-        }
-    if code == DVOC:
-        return {
-            place + j: number(f"t->{name}[{j}]", -G_MOST, G_MOST)
-            for place, name in ((R, "r"), (M, "m"))
-            for j in (1, 3)
-        }
-    if code == HYBRID_ANGLE:
-        return {R + 1: number("t->r[1]", -1.0, 1.0)}
-    return None
+def _mapped() -> dict[int, dict[int, Number]]:
+    """By error map, the numbers of the columns that it changes."""
+    (low, high), most_y = REFS[0].span, YS[0].span[1]
+    energies = {
+        R: number("t->r[0]", low * low / 2, high * high / 2),
+        M: number("t->m[0]", 0.0, most_y * most_y / 2),
+    }
+    ratios = {
+        place + j: number(f"t->{name}[{j}]", -G_MOST, G_MOST)
+        for place, name in ((R, "r"), (M, "m"))
+        for j in (1, 3)
+    }
+    sine = {R + 1: number("t->r[1]", -1.0, 1.0)}
+    return {LINEAR: {}, DC_ENERGY: energies, DVOC: ratios, HYBRID_ANGLE: sine}
+
+
+_MAPPED = _mapped()
 
 
 class Ratio(NamedTuple):
@@ -356,23 +334,11 @@ class Ratio(NamedTuple):
     second: int
 
 
-def ratio_of(p: Number, V: Number, out: Number) -> Ratio:
-    """Of the numbers p and V, for the number p/V^2."""
-    most = math.ceil(math.ldexp(V.span[1] * G_MOST, QUOTIENT))
-    first, second = 1 << (QUOTIENT + V.q - p.q), 1 << (V.q + out.q - QUOTIENT)
-    return Ratio(round(math.ldexp(V_MIN, V.q)), first, most, second)
-
-
 class Across(NamedTuple):
     """The integers R and X (p.u.) that p and q are multiplied with, at the exponent of V^2."""
 
     R: int
     X: int
-
-
-def across(parameters: Matrix, p: Number, V: Number) -> Across:
-    """For the numbers p (and q) and V."""
-    return Across(*(round(math.ldexp(float(one), 2 * V.q - p.q)) for one in parameters))
 
 
 ONE = 1 << 30  # of sines and cosines
@@ -403,8 +369,15 @@ def make_fixed(name: str, record: np.void) -> FixedLaw:
     Raises:
         LawError: what fixed point does not cover, or ranges that it cannot hold.
     """
-    law = _Builder(f"law {name!r} in fixed point", record).law()
-    _check(f"law {name!r} in fixed point", law)
+    where = f"law {name!r} in fixed point"
+    law = _Builder(where, record).law()
+    groups = ((law.output, U), (law.output, EXCESS), (law.output, OFFSET), (law.state, X),
+              (law.decay, OFFSET), (law.follow, TREND), (law.settle, X), (law.last, U))  # fmt: skip
+    for sums, place in groups:
+        for k, total in enumerate(sums):
+            if not 1 <= law.shift(total, place + k) <= MOST_SHIFT:
+                text = law.numbers[place + k].text
+                raise LawError(where, f"{text} has a range that no exponent fits")
     return law
 
 
@@ -469,8 +442,7 @@ class _Builder:
 
     def _map_inputs(self, impedance: Matrix) -> None:
         """The numbers of the inputs after the error map; ``r`` and ``m`` are their places."""
-        mapped = _mapped(self.error_map)
-        if mapped is None:
+        if (mapped := _MAPPED.get(self.error_map)) is None:
             raise LawError(self.where, "its error map is not covered")
         self.r, self.m = (R, M) if mapped else (REF, Y)
         if mapped:
@@ -479,7 +451,10 @@ class _Builder:
         self.across: tuple[Across, ...] = ()
         if self.error_map != HYBRID_ANGLE:
             return
-        self.across = tuple(across(impedance, many[1], many[4]) for many in (REFS, YS))
+        self.across = tuple(
+            Across(*(round(math.ldexp(float(one), 2 * V.q - p.q)) for one in impedance))
+            for _, p, _, _, V in (REFS, YS)
+        )
         for line, many in zip(self.across, (REFS, YS), strict=True):
             size = abs(line.R) + abs(line.X)
             if size > WORD or many[4].high ** 2 + size * many[1].high >= SUM:
@@ -593,14 +568,538 @@ def _ranges(
     return [None] * len(forced) if sizes is None else [(-float(x), float(x)) for x in sizes]
 
 
-def _check(where: str, law: FixedLaw) -> None:
-    """Refuse what no exponent fits."""
-    groups = ((law.output, U), (law.output, EXCESS), (law.output, OFFSET), (law.state, X),
-              (law.decay, OFFSET), (law.follow, TREND), (law.settle, X), (law.last, U))  # fmt: skip
-    for sums, place in groups:
-        for k, total in enumerate(sums):
-            shift = law.shift(total, place + k)
-            if not 1 <= shift <= MOST_SHIFT:
-                raise LawError(
-                    where, f"{law.numbers[place + k].text} has a range that no exponent fits"
+# --- what a processor does with integers; the template has these in C ---
+
+
+def rounded(value, shift):
+    """value 2^-shift, rounded to the nearest, halves up."""
+    return (value + (1 << shift >> 1)) >> shift
+
+
+def between(value, low, high):
+    """The value, or the end of its range that it passes."""
+    return min(max(value, low), high)
+
+
+def divided(a, b):
+    """a/b towards 0, as C divides; b > 0."""
+    return a // b if a >= 0 else -(-a // b)
+
+
+def root(square):
+    """The integer below the square root of a number below 2^62."""
+    return math.isqrt(square)
+
+
+def wide(value):
+    """A number of 64 bits in C."""
+    return value
+
+
+# --- error maps ---
+
+
+def half_square(value, shift):
+    """Half the square: column 1 of the error map."""
+    return rounded(value * value, shift)
+
+
+def over_square(p, V, least, first, most, second, high):
+    """p/V^2, saturated: columns 2 and 4 of the error map. A dead bus must not divide by zero."""
+    v, low = max(V, least), -most
+    quotient = divided(p * first, v)
+    quotient = max(quotient, low)
+    quotient = min(quotient, most)
+    return between(divided(quotient * second, v), -high, high)
+
+
+def direction(x, y, out):
+    """The direction of a vector: up to 2^30, the larger at least 2^29; or 0, 0."""
+    p, q = x, y
+    for bits in (32, 16, 8, 4, 2, 1):
+        most = 1 << (62 - bits)
+        if p > -most and p < most and q > -most and q < most:
+            p *= 1 << bits
+            q *= 1 << bits
+    out[0] = p >> 32
+    out[1] = q >> 32
+
+
+def sine_of_half(x_a, y_a, x_b, y_b, a, b, turn):
+    """sin((a - b)/2) 2^30 for the angles a and b of two vectors; 0 if one has no length."""
+    direction(x_a, y_a, a)
+    direction(x_b, y_b, b)
+    if (a[0] == 0 and a[1] == 0) or (b[0] == 0 and b[1] == 0):
+        return 0
+    dot = a[0] * b[0] + a[1] * b[1]
+    cross = a[1] * b[0] - a[0] * b[1]
+    direction(dot, cross, turn)
+    d = -turn[0] if turn[0] < 0 else turn[0]
+    c = -turn[1] if turn[1] < 0 else turn[1]
+    length = root(d * d + c * c)
+    if length < ONE // 2:
+        length = wide(ONE // 2)
+    cosine = divided(d * ONE, length)
+    if cosine > ONE:
+        cosine = wide(ONE)
+    larger = root((ONE + cosine) * (ONE // 2))
+    if larger < ONE // 2:
+        larger = wide(ONE // 2)
+    sine = larger
+    if dot >= 0:
+        sine = divided(c * ONE, length)
+        if sine > ONE:
+            sine = wide(ONE)
+        sine = divided(sine * (ONE // 2), larger)
+    a_below, b_below = y_a < 0, y_b < 0
+    if cross < 0 if a_below == b_below else a_below:
+        sine = -sine
+    return between(sine, -ONE, ONE)
+
+
+def set_inputs(law, v, w):
+    """What the error map makes of the references and measurements."""
+    if law.error_map == DC_ENERGY:
+        for out, of in ((R, REF), (M, Y)):
+            v[out] = half_square(v[of], 2 * law.numbers[of].q + 1 - law.numbers[out].q)
+    elif law.error_map == DVOC:
+        for out, of in ((R, REF), (M, Y)):
+            for j in (1, 3):
+                ratio, high = law.ratio(of, out, j), law.numbers[out + j].high
+                v[out + j] = over_square(
+                    v[of + j], v[of + 4], ratio.least, wide(ratio.first), wide(ratio.most),
+                    wide(ratio.second), high,
+                )  # fmt: skip
+    elif law.error_map == HYBRID_ANGLE:
+        line = law.across[0]
+        x_a = v[REF + 4] * v[REF + 4] - (line.R * v[REF + 1] + line.X * v[REF + 3])
+        y_a = line.X * v[REF + 1] - line.R * v[REF + 3]
+        line = law.across[1]
+        x_b = v[Y + 4] * v[Y + 4] - (line.R * v[Y + 1] + line.X * v[Y + 3])
+        y_b = line.X * v[Y + 1] - line.R * v[Y + 3]
+        v[R + 1] = sine_of_half(x_a, y_a, x_b, y_b, w.a, w.b, w.turn)
+
+
+# --- the tick ---
+
+
+def sum_of(total, v):
+    """A sum of products."""
+    a = total.start
+    for coefficient, place in total.terms:
+        a += coefficient * v[place]
+    return a
+
+
+def output(law, v, w):
+    """u before and after its limits, and what the limits add to it, for the anti-windup; omega_u
+    comes first, since column 3 feeds it back."""
+    for i in (1, 0, 2):
+        total, shift = law.output[i], law.shift(law.output[i], U + i)
+        low, high = law.low[i] << shift, law.high[i] << shift
+        w.raw[i] = sum_of(total, v)
+        if w.raw[i] > high:
+            v[U + i] = law.high[i]
+            v[EXCESS + i] = rounded(high - w.raw[i], law.shift(total, EXCESS + i))
+        elif w.raw[i] < low:
+            v[U + i] = law.low[i]
+            v[EXCESS + i] = rounded(low - w.raw[i], law.shift(total, EXCESS + i))
+        else:
+            v[U + i] = rounded(w.raw[i], shift)
+            v[EXCESS + i] = 0
+
+
+def advance(law, v, w):
+    """The offset, the trend and x of the next tick: the upper bits of each increment now, the
+    others in later ticks."""
+    for k in range(len(law.moving)):
+        total, place = law.moving[k]
+        one, shift = law.numbers[place], law.shift(total, place)
+        if place < OFFSET or place >= X or v[place] != 0:  # an offset of 0 does not move
+            now = w.rest[k] + sum_of(total, v)
+            w.rest[k] = now & ((1 << shift) - 1)
+            if place < X:
+                v[place] = between(v[place] + (now >> shift), one.low, one.high)
+            else:
+                w.x_next[place - X] = between(v[place] + (now >> shift), one.low, one.high)
+    for k in range(law.n):
+        v[X + k] = w.x_next[k]
+    for i in range(NU):
+        v[LAST + i] = v[U + i]
+
+
+def look(law, v, w, u):
+    """u without a step."""
+    set_inputs(law, v, w)
+    output(law, v, w)
+    for i in range(NU):
+        u[i] = v[U + i]
+
+
+def begin_rests(law, w):
+    """A rest begins in the middle of what it can be."""
+    for k in range(len(law.moving)):
+        total, place = law.moving[k]
+        w.rest[k] = 1 << (law.shift(total, place) - 1)
+
+
+def settle(law, v, w, u, trend):
+    """The state with which u comes out and goes on with the trend; on return what comes out."""
+    for i in range(NU):
+        of_u, of_trend, total = law.numbers[LAST + i], law.numbers[TREND + i], law.last[i]
+        v[OFFSET + i] = 0
+        v[U + i] = between(u[i], of_u.low, of_u.high)
+        v[TREND + i] = between(trend[i], of_trend.low, of_trend.high)
+        before = rounded(sum_of(total, v), law.shift(total, U + i))
+        v[LAST + i] = between(before, of_u.low, of_u.high)
+    begin_rests(law, w)
+    set_inputs(law, v, w)
+    for k in range(law.n):
+        of_x, total = law.numbers[X + k], law.settle[k]
+        x = rounded(sum_of(total, v), law.shift(total, X + k))
+        v[X + k] = between(x, of_x.low, of_x.high)
+    # the offset takes the rest: all of it in a row without states, rounding in the others
+    for rows in ((1,), (0, 2), ()):
+        output(law, v, w)
+        for i in rows:
+            of_u, of_offset, e = law.numbers[LAST + i], law.numbers[OFFSET + i], law.output[i].e
+            wanted = between(u[i], of_u.low, of_u.high)
+            missing = rounded(wanted * (1 << (e - of_u.q)) - w.raw[i], e - of_offset.q)
+            v[OFFSET + i] = between(missing, of_offset.low, of_offset.high)
+    for i in range(NU):
+        u[i] = v[U + i]
+
+
+def bump_of(before, after):
+    """The largest change of u, times 2^BUMP_Q."""
+    most = wide(0)
+    for i in range(NU):
+        change = wide(after[i]) - before[i]
+        if change < 0:
+            change = -change
+        change = change >> (US[i].q - BUMP_Q)
+        if change > most:
+            most = change
+    return between(most, 0, WORD)
+
+
+# --- in Python ---
+
+
+class Instance:
+    """An instance of a law in Python's integers, as the C code has it."""
+
+    def __init__(self, law: FixedLaw) -> None:
+        self.law, self._v = law, [0] * (X + law.n)
+        self._v[LAST : LAST + NU] = U_DEFAULT
+        pairs = {name: [0, 0] for name in ("a", "b", "turn")}
+        self._w = SimpleNamespace(
+            raw=[0] * NU, rest=[0] * len(law.moving), x_next=[0] * law.n, **pairs
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """States 0; the last u stays."""
+        self._v[TREND:] = [0] * (len(self._v) - TREND)
+        begin_rests(self.law, self._w)
+
+    def __getattr__(self, name: str) -> list[int]:
+        """x, offset, u of the last tick and trend; and rest, what the increments left below the
+        offset, the trend and x."""
+        if name == "rest":
+            return list(self._w.rest)
+        start = {"x": X, "offset": OFFSET, "u": LAST, "trend": TREND}[name]
+        return self._v[start : None if name == "x" else start + NU]
+
+    def _set(self, ref: Sequence[int], y: Sequence[int]) -> None:
+        self._v[:U] = [*ref, *y, *ref, *y]
+
+    def look(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
+        """u without a step."""
+        u = [0] * NU
+        self._set(ref, y)
+        look(self.law, self._v, self._w, u)
+        return u
+
+    def step(self, ref: Sequence[int], y: Sequence[int]) -> list[int]:
+        """One tick; u."""
+        u = self.look(ref, y)
+        advance(self.law, self._v, self._w)
+        return u
+
+    def settle(
+        self, ref: Sequence[int], y: Sequence[int], u: Sequence[int], trend: Sequence[int]
+    ) -> list[int]:
+        """Set the state so that u comes out and goes on with the trend; what comes out."""
+        out = list(u)
+        self._set(ref, y)
+        settle(self.law, self._v, self._w, out, trend)
+        return out
+
+
+def refusal(ref: Sequence[int], y: Sequence[int], bad_ref: int) -> int:
+    """OK, or why a step refuses references and measurements."""
+    if any(not one.low <= value <= one.high for value, one in zip(y, YS, strict=True)):
+        return BAD_Y
+    if any(not one.low <= value <= one.high for value, one in zip(ref, REFS, strict=True)):
+        return bad_ref
+    return OK
+
+
+def to_integers(values: Any, numbers: Sequence[Number]) -> NDArray[np.int64]:
+    """Values (ticks, k) in p.u. as integers; NaN and what an int32 does not hold saturates."""
+    scaled = np.asarray(values, np.float64) * np.exp2([one.q for one in numbers])
+    return np.rint(np.clip(np.nan_to_num(scaled, nan=-np.inf), -WORD - 1, WORD)).astype(np.int64)
+
+
+# --- how far a law in fixed point, or in float32, gets from the same law in float64 ---
+#
+# Both get the same inputs, and after a bumpless change both start from the same u and trend. Let d
+# be the difference of the states of one row, r how far a rest is from its middle (half a unit of
+# the state at most), and e what the rounding of coefficients and signals adds in one tick at most:
+#
+#     d' = A d + (I - A) r + A W (difference of the excess) + e,
+#     difference of raw = c (d - r) + e_raw,
+#
+# and the clamp passes a difference of raw on to u with a factor 1 - theta, and to the excess with
+# -theta, 0 <= theta <= 1, whatever the inputs do. ``sector`` turns that into a loop whose l1 norm
+# bounds d for ever. The state of an integrator has no such bound in open loop, in any precision:
+# its difference grows by no more than e a tick, and shrinks only while its row is limited. That is
+# the ``drift``. In float32, e follows from the standard model of rounding with m = n + 12,
+# gamma = m u/(1 - m u), u = 2^-24 (N. J. Higham, "Accuracy and Stability of Numerical Algorithms",
+# section 3.1).
+
+NEAR = 0.05  # p.u. from the default inputs: what is called small
+_ON_CIRCLE = 1e-9
+
+
+class Deviation(NamedTuple):
+    """Of one output from its value in float64."""
+
+    bound: float  #: p.u., for ever if the drift is 0
+    #: p.u. a tick at most, to be added for each tick since the start or the last settle.
+    drift: float
+
+    def after(self, ticks: float) -> float:
+        """The bound after that many ticks."""
+        return self.bound + self.drift * ticks
+
+
+class Local(NamedTuple):
+    """What one row adds in a tick, or at a settle, at most: errors of raw and of u, p.u.; of the
+    increments of its states; of its states at a settle; half a unit of its states; and of the
+    offset's size and course."""
+
+    raw: float
+    u: float
+    excess: float
+    offset: float
+    x: Matrix
+    first: Matrix
+    q: Matrix
+
+
+def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) -> list[Deviation]:
+    """Of (i_u, omega_u, E_u).
+
+    Args:
+        law: in fixed point; its ranges are used for float32 too.
+        record: the law in float64.
+        real: ``fixed``, or float32 or float64, whose own distance from exact arithmetic is given.
+        near: for inputs within ``NEAR`` of the defaults and u within its limits.
+    """
+    spans, maps = _spans(law, near), _of_map(law, real, near)
+    rows, A = record["row"][: law.n], np.asarray(record["A"][: law.n, : law.n], np.float64)
+    out: dict[int, Deviation] = {}
+    for i in (OMEGA - 1, 0, 2):
+        own = [int(k) for k in np.flatnonzero(rows == i)]
+        gain = float(record["loop"]) if i == OMEGA - 1 else 1.0
+        c, W = gain * record["C"][i, own].astype(float), record["W"][own, i].astype(float)
+        row = ClampedRow(A[np.ix_(own, own)], c, W)
+        b = record["B_y"][own, OMEGA].astype(float)
+        local = (
+            _in_fixed_point(law, i, own, spans, maps)
+            if real == FIXED
+            else _in_floating_point(law, i, own, spans, maps, _unit(real))
+        )
+        feedback = b
+        if i != OMEGA - 1:  # omega_u, which has its own deviation, is an input of this row
+            omega, feedback = out[OMEGA - 1], np.zeros(len(own))
+            at_once = abs(float(record["D_y"][i, OMEGA]))
+            if at_once or b.any():
+                if omega.drift or math.isinf(omega.bound):
+                    out[i] = Deviation(math.inf, math.inf)
+                    continue
+                local = local._replace(
+                    raw=local.raw + at_once * omega.bound, x=local.x + np.abs(b) * omega.bound
                 )
+        out[i] = _row(row, feedback, local, clamped=not near)
+    return [out[i] for i in range(NU)]
+
+
+def _unit(real: str) -> float:
+    """The unit roundoff of a floating-point precision."""
+    return 2.0 ** (-24 if real == "float32" else -53)
+
+
+def _row(row: ClampedRow, feedback: Matrix, local: Local, clamped: bool) -> Deviation:
+    """From what a tick adds to what it makes of the row's u; ``clamped`` if the limits may act."""
+    c = np.abs(row.c)
+    at_once = local.raw + float(c @ local.q)
+    at_once += local.offset + float(c @ local.first) + at_once  # the offset takes that of a settle
+    if not len(c):
+        return Deviation(at_once + local.u, 0.0)
+    pull = row.A @ row.W * clamped
+    to_excess = at_once + local.excess * clamped
+    each = local.x + np.abs(np.eye(len(c)) - row.A) @ local.q + np.abs(feedback) * local.u
+    try:
+        if clamped:
+            _, total, peak, gain = sector(row, feedback)
+            each += np.abs(pull - feedback) / 2 * to_excess
+        else:
+            total, peak = powers(row.A + np.outer(feedback, row.c))
+            each += np.abs(feedback) * at_once
+            gain = 0.0
+    except ValueError:
+        gain = 1.0
+    if gain < 1 - 1e-6:
+        raw = float(c @ (peak @ local.first + total @ each)) + to_excess
+        return Deviation(raw / (1 - gain) + local.u, 0.0)
+    if len(c) > 1 or abs(row.A[0, 0] - 1) > _ON_CIRCLE or feedback.any():
+        return Deviation(math.inf, math.inf)
+    # at a limit the state of an integrator takes over what raw has; else it keeps what it had
+    state = max(float(local.first[0]), to_excess / float(c[0]) * clamped)
+    return Deviation(float(c[0]) * state + at_once + local.u, float(c[0] * local.x[0]))
+
+
+def _spans(law: FixedLaw, near: bool) -> dict[int, Span]:
+    """The ranges of a tick's numbers, p.u."""
+    spans = {place: one.span for place, one in enumerate(law.numbers) if one.text}
+    for i in range(NU):
+        q = law.numbers[U + i].q
+        spans[U + i] = math.ldexp(law.low[i], -q), math.ldexp(law.high[i], -q)
+    if near:
+        for place, mapped, signals in ((REF, R, group("ref")), (Y, M, group("y"))):
+            for j, s in enumerate(signals):
+                spans[place + j] = s.default - NEAR, s.default + NEAR
+                if law.numbers[mapped + j].text == law.numbers[place + j].text:
+                    spans[mapped + j] = spans[place + j]
+                elif law.error_map == DC_ENERGY:
+                    spans[mapped + j] = (1 - NEAR) ** 2 / 2, (1 + NEAR) ** 2 / 2
+                elif law.error_map == DVOC:
+                    ratio = (abs(s.default) + NEAR) / (1 - NEAR) ** 2
+                    spans[mapped + j] = -ratio, ratio
+        spans |= {EXCESS + i: (0.0, 0.0) for i in range(NU)}
+    return spans
+
+
+def _of_angle(law: FixedLaw) -> float:
+    """Of sin((delta_ref - delta)/2) near the default inputs: half of what turns the two vectors and
+    their product, and four roundings."""
+    turned = 3 * math.sqrt(2) * 2.0**-29
+    for of, many in zip(law.across, (REFS, YS), strict=True):
+        exponent = 2 * many[4].q - many[1].q
+        power = max(abs(s.default) for s in group("ref")[1:4:2]) + NEAR
+        length = (1 - NEAR) ** 2 - math.ldexp(abs(of.R) + abs(of.X), -exponent) * power
+        turned += 2 * power * 2.0 ** (-1 - exponent) * math.sqrt(2) / length
+    return turned / 2 + 4 * 2.0**-30
+
+
+def _error(
+    total: Sum,
+    numbers: Sequence[Number],
+    spans: Mapping[int, Span],
+    maps: Mapping[int, float],
+) -> float:
+    """What the rounding of a sum's coefficients and of the error map adds to it at most, p.u."""
+    has = {place: coefficient for coefficient, place in total.terms}
+    low = high = math.ldexp(total.start, -total.e) - total.meant_start
+    for place, meant in total.meant.items():
+        error = math.ldexp(has.get(place, 0), numbers[place].q - total.e) - meant
+        ends = [error * end for end in spans[place]]
+        low, high = low + min(ends), high + max(ends)
+    return most((low, high)) + _through(total, maps)
+
+
+def _through(total: Sum, maps: Mapping[int, float]) -> float:
+    """What the errors of an error map become in a sum."""
+    return sum(abs(c) * maps.get(place, 0.0) for place, c in total.meant.items())
+
+
+def _of_map(law: FixedLaw, real: str, near: bool) -> dict[int, float]:
+    """By place, the error of what an error map gives: in fixed point of its roundings; in floating
+    point 8 roundings at most."""
+    if law.error_map == LINEAR:
+        return {}
+    places = [p for p in range(R, M + 5) if law.numbers[p].text.startswith(("t->r[", "t->m["))]
+    units = {p: math.ldexp(1.0, -law.numbers[p].q) for p in places}
+    if law.error_map == HYBRID_ANGLE and not near:  # at a vector without length the map jumps
+        return {R + 1: math.inf}
+    if real != FIXED:
+        return {p: 8 * _unit(real) * most(law.numbers[p].span) for p in places}
+    if law.error_map == DC_ENERGY:
+        return {p: unit / 2 for p, unit in units.items()}
+    if law.error_map == HYBRID_ANGLE:
+        return {R + 1: _of_angle(law)}
+    V = 1 - NEAR if near else V_MIN
+    first = math.ldexp(1.0, -QUOTIENT) / V
+    # the least V is an integer, and p/V^2 has twice its relative error
+    least = 0.0 if near else G_MOST * 2 * math.ldexp(1.0, -1 - min(YS[4].q, REFS[4].q)) / V_MIN
+    return {p: unit + first + 1.01 * least for p, unit in units.items()}
+
+
+def _in_fixed_point(
+    law: FixedLaw, i: int, own: Sequence[int], spans: Mapping[int, Span], maps: Mapping[int, float]
+) -> Local:
+    numbers = law.numbers
+
+    def unit(place: int) -> float:
+        return math.ldexp(1.0, -numbers[place].q)
+
+    fade = -law.decay[i].meant[OFFSET + i]
+    faded = _error(law.decay[i], numbers, spans, {}) / fade
+    settled = {**spans, **{U + j: numbers[U + j].span for j in range(NU)}}
+    return Local(
+        raw=_error(law.output[i], numbers, spans, maps) + math.ldexp(1.0, -law.output[i].e),
+        u=unit(U + i),
+        excess=unit(EXCESS + i),
+        offset=faded + 1.5 * unit(OFFSET + i),
+        x=np.array([_error(law.state[k], numbers, spans, maps) for k in own]),
+        first=np.array(
+            [_error(law.settle[k], numbers, settled, maps) + unit(X + k) / 2 for k in own]
+        ),
+        q=np.array([unit(X + k) / 2 for k in own]),
+    )
+
+
+def _in_floating_point(
+    law: FixedLaw,
+    i: int,
+    own: Sequence[int],
+    spans: Mapping[int, Span],
+    maps: Mapping[int, float],
+    u: float,
+) -> Local:
+    m = law.n + 12
+    gamma = m * u / (1 - m * u)
+
+    def size(total: Sum, more: float = 0.0) -> float:
+        return gamma * (
+            sum(abs(c) * most(spans[place]) for place, c in total.meant.items())
+            + abs(total.meant_start)
+            + more
+        ) + _through(total, maps)
+
+    limit = most(spans[U + i])
+    raw = size(law.output[i])
+    offset = most(spans[OFFSET + i])
+    fade = -law.decay[i].meant[OFFSET + i]
+    return Local(
+        raw=raw,
+        u=u * limit,
+        excess=raw + u * limit,
+        offset=gamma * offset / fade + raw,
+        x=np.array([size(law.state[k], 2 * most(spans[X + k])) for k in own]),
+        first=np.array([size(law.settle[k]) for k in own]),
+        q=np.zeros(len(own)),
+    )

@@ -14,17 +14,17 @@ import tempfile
 import uuid
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.sax.saxutils import escape
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, plain, template
-from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
-from gfm_runtime.firmware.module import MADE, RESULTS, Module, keys_of
+from gfm_runtime.firmware.check import FLAGS, OPTIMISED
+from gfm_runtime.firmware.dll import build_library
+from gfm_runtime.firmware.module import RESULT_TEXT, Module, keys_of
 from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
 
@@ -45,36 +45,12 @@ _MINGW = "x86_64-w64-mingw32-gcc"
 _HERE = {"2": {"x86_64": "linux64"}, "3": {}}
 _WINDOWS = {"2": "win64", "3": "x86_64-windows"}
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all files, so that the same law gives the same bytes
-_LOGS = ("logStatusWarning", "logStatusError")
-
-
-@dataclass(frozen=True)
-class _Variable:
-    """A variable of the FMU; its value reference is its place among all, from 1."""
-
-    name: str
-    causality: str
-    description: str
-    signal: Signal | None  # None for the result of a tick, an integer
-
-    @property
-    def attributes(self) -> dict[str, str]:
-        """What FMI 2.0 and 3.0 have in common."""
-        kept = {
-            "input": {"variability": "continuous"},
-            "output": {"variability": "discrete", "initial": "calculated"},
-            "parameter": {"variability": "fixed", "initial": "exact"},
-        }
-        text = {"description": plain(self.description)}
-        return {"causality": self.causality, **kept[self.causality], **text}
-
-    @property
-    def number(self) -> dict[str, str]:
-        """Unit and range, and where it starts."""
-        if (s := self.signal) is None:
-            return {}
-        start = {} if self.causality == "output" else {"start": repr(s.default)}
-        return {"unit": s.unit, "min": repr(s.low), "max": repr(s.high), **start}
+_CAUSALITIES = {
+    "input": {"variability": "continuous"},
+    "output": {"variability": "discrete", "initial": "calculated"},
+    "parameter": {"variability": "fixed", "initial": "exact"},
+}
+_OF_FMI_3 = ("<Output valueReference", "<InitialUnknown valueReference")
 
 
 def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
@@ -96,7 +72,11 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
     held: dict[str, bytes] = {"modelDescription.xml": description}
     held |= {f"sources/{file}": text.encode() for file, text in code.items()}
     if fmi == "3":
-        held["sources/buildDescription.xml"] = _build_description(m, code)
+        options = " ".join([*FLAGS, OPTIMISED])
+        keys = {"P": m.prefix, "OPTIONS": options, "FILES": _files("SourceFile", code)}
+        held["sources/buildDescription.xml"] = filled(
+            template("buildDescription.xml"), keys
+        ).encode()
     held |= _binaries(m, code, fmi)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -110,17 +90,13 @@ def _sources(
 ) -> tuple[dict[str, str], bytes]:
     """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
     follows from both."""
-    u = command_rows(m.stages)
+    u, two = command_rows(m.stages), fmi == "2"
     inside = (*group("ref"), *carried_rows("y", m.stages))
     keys = (
         keys_of(m)
         | _NAMES[fmi]
         | {
-            "MADE": MADE,
-            "LAW_NAME": plain(m.name),
             "T_S": repr(float(T_s)),
-            "U_LOW": ", ".join(repr(s.low) for s in u),
-            "U_HIGH": ", ".join(repr(s.high) for s in u),
             "U_START": ", ".join(repr(s.default) for s in u),
             "IN_START": ", ".join(repr(s.default) for s in inside),
             "E_IN_USE": ", &s->u[2]" * m.stages,
@@ -128,16 +104,76 @@ def _sources(
             "TOKEN": "@TOKEN@",
         }
     )
-    interface = filled(chosen(template("fmi.c"), {"fmi2": fmi == "2"}), keys)
+    interface = filled(chosen(template("fmi.c"), {"fmi2": two}), keys)
     code = {
         **own,
         f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
     }
-    description = _description(m, T_s, fmi, code)
-    said = "\n".join([*code.values(), description.decode()])
-    token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, said)}}}"
+    assert m.law is not None
+    keys |= _variables(m, two) | {
+        "TOKEN_NAME": "guid" if two else "instantiationToken",
+        "MODEL": _quoted(m.name),
+        "ABOUT": _quoted(f"{plain(m.law.title)}, {m.real}. Source: {plain(m.law.source)}"),
+        "VERSION": _quoted(f"signal table {TABLE_VERSION} ({table_hash()})"),
+        "FILES": _files("File", code),
+    }
+    description = filled(chosen(template("modelDescription.xml"), {"fmi2": two}), keys)
+    token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, chr(10).join([*code.values(), description]))}}}"
     code[f"fmi{fmi}.c"] = code[f"fmi{fmi}.c"].replace("@TOKEN@", token)
-    return code, description.replace(b"@TOKEN@", token.encode())
+    return code, description.replace("@TOKEN@", token).encode()
+
+
+def _variables(m: Module, two: bool) -> dict[str, str]:
+    """What modelDescription.xml says of the variables; the value reference of each is its place
+    among all, from 1. No output follows an input within a tick; where one begins is a parameter."""
+    inside = [("ref", s) for s in group("ref")]
+    inside += [("y", s) for s in carried_rows("y", m.stages)]
+    u = command_rows(m.stages)
+    rows: list[tuple[str, str, str, Signal | None]] = [
+        *((f"{v}.{s.name}", "input", f"{s.description}, of {s.base}", s) for v, s in inside),
+        *((f"u.{s.name}", "output", f"{s.description}, of {s.base}", s) for s in u),
+        ("reason", "output", RESULT_TEXT, None),  # of a tick, an integer
+        *((f"start.{s.name}", "parameter", f"where u.{s.name} begins, of {s.base}", s) for s in u),
+    ]
+    lines, units = list[str](), {s.unit for *_, s in rows if s}
+    for reference, (name, causality, about, s) in enumerate(rows, 1):
+        base = {"name": name, "valueReference": str(reference), "causality": causality}
+        base |= _CAUSALITIES[causality] | {"description": plain(about)}
+        number = {"unit": s.unit, "min": repr(s.low), "max": repr(s.high)} if s else {}
+        number |= {"start": repr(s.default)} if s and causality != "output" else {}
+        kind = ("Real" if two else "Float64") if s else ("Integer" if two else "Int32")
+        lines += (
+            [f"    <ScalarVariable{_attributes(base)}>", f"      <{kind}{_attributes(number)} />",
+             "    </ScalarVariable>"]
+            if two
+            else [f"    <{kind}{_attributes(base | number)} />"]
+        )  # fmt: skip
+    first = len(inside) + 1
+    last = first + len(u)
+    tags = ("  <Unknown index", "  <Unknown index") if two else _OF_FMI_3
+    begins = [str(k + len(u) + 1) if k < last else "" for k in range(first, last + 1)]
+    return {
+        "UNITS": "\n".join(f"    <Unit name={_quoted(x)} />" for x in sorted(units)),
+        "VARIABLES": "\n".join(lines),
+        "OUTPUTS": "\n".join(
+            f'    {tags[0]}="{k}" dependencies="" />' for k in range(first, last + 1)
+        ),
+        "INITIAL": "\n".join(
+            f'    {tags[1]}="{k}" dependencies="{at}" />' for k, at in enumerate(begins, first)
+        ),
+    }
+
+
+def _quoted(text: str) -> str:
+    return '"' + escape(text, {'"': "&quot;"}) + '"'
+
+
+def _attributes(named: Mapping[str, str]) -> str:
+    return "".join(f" {name}={_quoted(value)}" for name, value in named.items())
+
+
+def _files(tag: str, code: Mapping[str, str]) -> str:
+    return "\n".join(f'      <{tag} name="{file}" />' for file in code if file.endswith(".c"))
 
 
 def _headers() -> Path:
@@ -173,149 +209,24 @@ def _refusals(fmi: Fmi, interface: str) -> str:
     return "\n".join(out)
 
 
-def _variables(m: Module) -> list[_Variable]:
-    """All variables but the time, in the order of their value references."""
-    inside = [("ref", s) for s in group("ref")]
-    inside += [("y", s) for s in carried_rows("y", m.stages)]
-    u = command_rows(m.stages)
-    result = "0, or why the bridge must be blocked: "
-    result += "; ".join(f"{code} {text}" for code, text in RESULTS.values() if code)
-    return [
-        *(
-            _Variable(f"{vector}.{s.name}", "input", f"{s.description}, of {s.base}", s)
-            for vector, s in inside
-        ),
-        *(_Variable(f"u.{s.name}", "output", f"{s.description}, of {s.base}", s) for s in u),
-        _Variable("reason", "output", result, None),
-        *(
-            _Variable(f"start.{s.name}", "parameter", f"where u.{s.name} begins, of {s.base}", s)
-            for s in u
-        ),
-    ]
-
-
-def _description(m: Module, T_s: float, fmi: Fmi, code: Mapping[str, str]) -> bytes:
-    """modelDescription.xml."""
-    assert m.law is not None
-    two, step = fmi == "2", repr(float(T_s))
-    root = Element(
-        "fmiModelDescription",
-        {
-            "fmiVersion": f"{fmi}.0",
-            "modelName": m.name,
-            "guid" if two else "instantiationToken": "@TOKEN@",
-            "description": f"{plain(m.law.title)}, {m.real}. Source: {plain(m.law.source)}",
-            "version": f"signal table {TABLE_VERSION} ({table_hash()})",
-            "generationTool": "gfmhil firmware fmu",
-            "variableNamingConvention": "structured",
-        },
-    )
-    state = "FMUstate" if two else "FMUState"
-    does = SubElement(
-        root,
-        "CoSimulation",
-        {
-            "modelIdentifier": m.prefix,
-            "canHandleVariableCommunicationStepSize": "true",
-            f"canGetAndSet{state}": "true",
-            f"canSerialize{state}": "true",
-        },
-    )
-    if two:
-        does.set("canNotUseMemoryManagementFunctions", "true")
-        listed = SubElement(does, "SourceFiles")
-        for file in code:
-            if file.endswith(".c"):
-                SubElement(listed, "File", name=file)
-    else:
-        does.set("fixedInternalStepSize", step)
-    variables, number = _variables(m), "Real" if two else "Float64"
-    units = {v.signal.unit for v in variables if v.signal is not None}
-    units_of = SubElement(root, "UnitDefinitions")
-    for unit in sorted(units | (set() if two else {"s"})):
-        defined = SubElement(units_of, "Unit", name=unit)
-        if unit == "s":
-            SubElement(defined, "BaseUnit", s="1")
-    logs = SubElement(root, "LogCategories")
-    for log in _LOGS:
-        SubElement(logs, "Category", name=log)
-    SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="1.0", stepSize=step)
-    held = SubElement(root, "ModelVariables")
-    if not two:
-        time = {"causality": "independent", "variability": "continuous", "unit": "s"}
-        SubElement(held, number, {"name": "time", "valueReference": "0", **time})
-    for reference, v in enumerate(variables, 1):
-        base = {"name": v.name, "valueReference": str(reference), **v.attributes}
-        kind = number if v.signal is not None else "Integer" if two else "Int32"
-        if two:
-            SubElement(SubElement(held, "ScalarVariable", base), kind, v.number)
-        else:
-            SubElement(held, kind, {**base, **v.number})
-    _structure(root, variables, two)
-    indent(root)
-    return bytes(tostring(root, "utf-8", xml_declaration=True)) + b"\n"
-
-
-def _structure(root: Element, variables: list[_Variable], two: bool) -> None:
-    """No output follows an input within a tick; where an output begins is a parameter."""
-    structure = SubElement(root, "ModelStructure")
-    places = {v.name: str(k) for k, v in enumerate(variables, 1)}
-    key = "index" if two else "valueReference"
-    outputs = [v for v in variables if v.causality == "output"]
-    listed = SubElement(structure, "Outputs") if two else structure
-    for v in outputs:
-        at = {key: places[v.name], "dependencies": ""}
-        SubElement(listed, "Unknown" if two else "Output", at)
-    listed = SubElement(structure, "InitialUnknowns") if two else structure
-    for v in outputs:
-        begins = places.get(v.name.replace("u.", "start.", 1), "") if v.signal else ""
-        at = {key: places[v.name], "dependencies": begins}
-        SubElement(listed, "Unknown" if two else "InitialUnknown", at)
-
-
-def _build_description(m: Module, code: Mapping[str, str]) -> bytes:
-    root = Element("fmiBuildDescription", fmiVersion="3.0")
-    how = SubElement(root, "BuildConfiguration", modelIdentifier=m.prefix)
-    options = " ".join([*FLAGS, OPTIMISED])
-    listed = SubElement(
-        how, "SourceFileSet", language="C99", compiler="gcc", compilerOptions=options
-    )
-    for file in code:
-        if file.endswith(".c"):
-            SubElement(listed, "SourceFile", name=file)
-    SubElement(how, "Library", name="m", external="true")
-    indent(root)
-    return bytes(tostring(root, "utf-8", xml_declaration=True)) + b"\n"
-
-
 def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi) -> dict[str, bytes]:
     """The libraries by their place in the FMU.
 
     Raises:
         LawError: there is no gcc, or a compiler fails.
     """
-    host, machine = TARGETS["host"], platform.machine()
-    if shutil.which(host.compiler) is None:
-        raise LawError(
-            f"law {m.name!r}", f"{host.compiler} is not there; apt-get install {host.packages}"
-        )
+    machine, flags = platform.machine(), [f"-I{_headers()}"]
     here = _HERE[fmi].get(machine, f"{machine}-linux")
-    made = {f"{here}/{m.prefix}.so": [host.compiler, "-fPIC"]}
+    made: dict[str, tuple[str, ...]] = {f"{here}/{m.prefix}.so": ("", "-fPIC")}
     if shutil.which(_MINGW) is not None:
-        made[f"{_WINDOWS[fmi]}/{m.prefix}.dll"] = [
-            _MINGW, "-static-libgcc", "-Wl,--no-insert-timestamp",
-        ]  # fmt: skip
+        place = f"{_WINDOWS[fmi]}/{m.prefix}.dll"
+        made[place] = (_MINGW, "-static-libgcc", "-Wl,--no-insert-timestamp")
     out = {}
     with tempfile.TemporaryDirectory(prefix="gfmhil-fmu-") as work:
         for file, text in code.items():
             Path(work, file).write_text(text, encoding="utf-8")
-        own = [file for file in code if file.endswith(".c")]
-        for place, (compiler, *flags) in made.items():
-            called(
-                [compiler, *FLAGS, OPTIMISED, *flags, "-shared", "-fvisibility=hidden",
-                 f"-I{_headers()}", *own, "-o", "made", *host.link],
-                Path(work),
-            )  # fmt: skip
+        for place, (compiler, *own) in made.items():
+            build_library(Path(work), m.name, code, "made", [*own, *flags], compiler)
             library = next(Path(work).glob("made*"))
             out[f"binaries/{place}"] = library.read_bytes()
             library.unlink()

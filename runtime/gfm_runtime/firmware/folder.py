@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import chosen, filled, template
+from gfm_runtime.firmware.check import script
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
 from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
-from gfm_runtime.firmware.proof import script
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.tick import SIZE
@@ -76,14 +75,13 @@ def export(
 
 def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
-    adapters, table, names, sizes = [], [], [], []
+    adapters, table, own = [], [], style == "unrolled"
     parts = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     choices = {"stages": stages, "fixed": fixed}
     e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
-        own = style == "unrolled"
         keys = {
             "P": m.prefix,
             "T": m.prefix if own else "gfm",
@@ -94,8 +92,6 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         }
         adapters.append(filled(chosen(template("adapter.c"), choices), keys))
         table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
-        names.append(f'    "{m.prefix}",')
-        sizes.append(f"    sizeof({keys['T']}_t),")
     states = max([1, *(m.n for m in modules)])
     keys = {
         "MADE": MADE,
@@ -112,8 +108,8 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
         "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",
         "TABLE": "\n".join(table),
-        "NAMES": "\n".join(names),
-        "SIZES": "\n".join(sizes),
+        "NAMES": "\n".join(f'    "{m.prefix}",' for m in modules),
+        "SIZES": "\n".join(f"    sizeof({m.prefix if own else 'gfm'}_t)," for m in modules),
     }
     return {
         name: filled(chosen(template(name), choices), keys) for name in ("selftest.h", "selftest.c")
@@ -123,37 +119,29 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
 def _golden_header(rows: Golden) -> str:
     bits = 8 * rows.words.itemsize
     suffix = "U" if bits == 32 else "ULL"
-    lines = [
-        "    {" + ",".join(f"0x{w:x}{suffix}" for w in row) + "}," for row in rows.words.tolist()
-    ]
-    return "\n".join(
-        [
-            f"/* {MADE} Words of a row: {', '.join(rows.columns)}. */",
-            "#ifndef GFM_GOLDEN_H",
-            "#define GFM_GOLDEN_H",
-            "",
-            "#include <stdint.h>",
-            "",
-            f"enum {{ GOLDEN_ROWS = {len(rows.words)} }};",
-            "",
-            f"static const uint{bits}_t golden[][{len(rows.columns)}] = {{",
-            *lines,
-            "};",
-            "",
-            "#endif",
-            "",
-        ]
+    lines = (
+        "    {" + ",".join(f"0x{w:x}{suffix}" for w in row) + "},\n" for row in rows.words.tolist()
     )
+    return f"""\
+/* {MADE} Words of a row: {", ".join(rows.columns)}. */
+#ifndef GFM_GOLDEN_H
+#define GFM_GOLDEN_H
+
+#include <stdint.h>
+
+enum {{ GOLDEN_ROWS = {len(rows.words)} }};
+
+static const uint{bits}_t golden[][{len(rows.columns)}] = {{
+{"".join(lines)}}};
+
+#endif
+"""
 
 
 def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -> str:
     names = [f"{m.prefix}.c" for m in modules] + ["gfm.c"] * (style == "records")
     names += [file for file in choosing if file.endswith(".c")]
-    root = bool(choosing) or style == "records" or any(needs_sqrt(m) for m in modules)
+    root = bool(choosing) or style == "records"  # whether a step takes a square root
+    root = root or any(not m.fixed and (m.stages or m.tick.operations()["sqrt"]) for m in modules)
     keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
-    return re.sub(r"@(MADE|SOURCES|LIBM)@", lambda f: keys[f[1]], template("CMakeLists.txt"))
-
-
-def needs_sqrt(m: Module) -> bool:
-    """Whether a law's unrolled step takes a square root."""
-    return not m.fixed and (m.stages or m.tick.operations()["sqrt"] > 0)
+    return filled(template("CMakeLists.txt"), keys)

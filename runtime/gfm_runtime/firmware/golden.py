@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.firmware.fixed import REFS, YS
-from gfm_runtime.firmware.fixed_tick import Instance, bump_of, refusal, to_integers
+from gfm_runtime.firmware.fixed import REFS, YS, Instance, bump_of, refusal, to_integers
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
 from gfm_runtime.kernel import (
@@ -60,16 +59,12 @@ Inputs = tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]
 
 @dataclass(frozen=True)
 class Golden:
-    """Golden rows of a set of laws.
+    """Golden rows of a set of laws."""
 
-    Attributes:
-        words: shape (rows, columns), uint32 or uint64.
-        columns: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the
-            law's u of the last tick), trend_*; with an inner stage its variables, and limited; in
-            fixed point the rests, 31 lower bits and what is above.
-    """
-
-    words: NDArray[Any]
+    words: NDArray[Any]  #: shape (rows, columns), uint32 or uint64
+    #: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the law's u of
+    #: the last tick), trend_*; with an inner stage its variables, and limited; in fixed point the
+    #: rests, 31 lower bits and what is above
     columns: tuple[str, ...]
 
     def csv(self) -> str:

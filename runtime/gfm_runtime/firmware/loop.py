@@ -30,17 +30,12 @@ TO, FROM = "to", "from"
 
 @dataclass(frozen=True)
 class LoopProgram:
-    """A program, built.
+    """A program, built."""
 
-    Attributes:
-        target: where it runs.
-        folder: where it lies, and in which its pipes have to be.
-        request, state, answer: of what goes over the pipes; a state follows each START, a golden
-            row each CHECK.
-    """
-
-    target: Target
-    folder: Path
+    target: Target  #: where it runs
+    folder: Path  #: where it lies, and in which its pipes have to be
+    #: request, state, answer: of what goes over the pipes; a state follows each START, a golden row
+    #: each CHECK
     request: np.dtype[Any]
     state: np.dtype[Any]
     answer: np.dtype[Any]
@@ -71,24 +66,16 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
     )
     y, u = len(carried("y", stages)), len(carried("u", stages))
-    request = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
-    answer = [("result", word), ("channel", word), ("limited", word), ("count", word)]
-    state = [("x", real, (N_MAX,)), *((name, real, (NU,)) for name in ("offset", "u", "trend"))]
-    return LoopProgram(
-        where,
-        folder,
-        np.dtype([*request, ("y", real, (y,))]),
-        np.dtype([*state, *((name, real, (size,)) for name, size, _ in INNER_STATE if stages)]),
-        np.dtype(
-            [
-                *answer,
-                ("u", real, (u,)),
-                ("own", real, (NU,)),
-                ("bump", real),
-                ("i_ref", real, (2,)),
-            ]
-        ),
-    )
+    request: list[Any] = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
+    answer: list[Any] = [("result", word), ("channel", word), ("limited", word), ("count", word)]
+    state: list[Any] = [
+        ("x", real, (N_MAX,)),
+        *((name, real, (NU,)) for name in ("offset", "u", "trend")),
+    ]
+    answer += [("u", real, (u,)), ("own", real, (NU,)), ("bump", real), ("i_ref", real, (2,))]
+    state += [(name, real, (size,)) for name, size, _ in INNER_STATE if stages]
+    dtypes = [np.dtype(fields) for fields in ([*request, ("y", real, (y,))], state, answer)]
+    return LoopProgram(where, folder, *dtypes)
 
 
 def _states(modules: Sequence[Module]) -> str:
@@ -104,30 +91,23 @@ def _states(modules: Sequence[Module]) -> str:
         f"#define NOW_E {', now.e' * stages}",
     ]
     for m in modules:
-        lines += [
-            f"static void {m.prefix}_load(int k, const golden_real *from, int limited)",
-            "{",
-            f"    {m.prefix}_t *s = &{m.prefix}_of[k];",
-            *(
-                f"    memcpy(&s->{part}, from + {at}, sizeof s->{part});"
-                for part, at in parts.items()
-            ),
-            "    s->limited = limited;" if stages else "    (void)limited;",
-            "}",
-            f"static int {m.prefix}_channel(int k)",
-            "{",
-            f"    return {m.prefix}_of[k].channel;",
-            "}",
-        ]
-    return "\n".join(
-        [
-            *lines,
-            "static const struct {",
-            "    void (*load)(int k, const golden_real *from, int limited);",
-            "    int (*channel)(int k);",
-            "} states[] = {",
-            *(f"    {{{m.prefix}_load, {m.prefix}_channel}}," for m in modules),
-            "};",
-            "",
-        ]
-    )
+        copies = "".join(
+            f"    memcpy(&s->{part}, from + {at}, sizeof s->{part});\n"
+            for part, at in parts.items()
+        )
+        lines.append(f"""\
+static void {m.prefix}_load(int k, const golden_real *from, int limited)
+{{
+    {m.prefix}_t *s = &{m.prefix}_of[k];
+{copies}    {"s->limited = limited" if stages else "(void)limited"};
+}}
+static int {m.prefix}_channel(int k)
+{{
+    return {m.prefix}_of[k].channel;
+}}""")
+    lines += ["static const struct {",
+              "    void (*load)(int k, const golden_real *from, int limited);",
+              "    int (*channel)(int k);",
+              "} states[] = {"]  # fmt: skip
+    lines += [f"    {{{m.prefix}_load, {m.prefix}_channel}}," for m in modules]
+    return "\n".join([*lines, "};", ""])

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_runtime.error_maps import ERROR_MAPS
+from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE, LINEAR
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import (
     Choices,
@@ -30,8 +30,7 @@ from gfm_runtime.firmware.c_text import (
     template,
 )
 from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
-from gfm_runtime.firmware.fixed_c import FixedTick
-from gfm_runtime.firmware.tick import SHARED, Tick
+from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
 from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
@@ -63,6 +62,9 @@ RESULTS = {
     "BAD_U": (BAD_U, REASONS[BAD_U]),
     "BAD_REF": (BAD_REF, "a reference is not finite or out of range"),
 }
+RESULT_TEXT = "0, or why the bridge must be blocked: " + "; ".join(
+    f"{code} {text}" for code, text in RESULTS.values() if code
+)
 #: by precision, what the templates say of the C type
 C_TYPES = {
     "float32": {"C_REAL": "float", "BITS": "32", "DIG": "FLT_MANT_DIG", "MANTISSA": "24"},
@@ -90,21 +92,14 @@ def fields(stages: bool, fixed: bool = False) -> tuple[tuple[str, ...], tuple[st
 
 @dataclass(frozen=True)
 class Module:
-    """A law on its way to C.
+    """A law on its way to C."""
 
-    Attributes:
-        name: the law's name, with its stage if it has several.
-        law: the law itself; None for one that was read back from a report.
-        record: the law as ``pack_law`` gives it.
-        stages: whether a law of its folder has an inner stage: y has 11 signals then, and u 4.
-        fixed: the law in fixed point; None in a floating-point precision.
-    """
-
-    name: str
-    law: Law | None
-    record: np.void
+    name: str  #: the law's name, with its stage if it has several
+    law: Law | None  #: the law itself; None for one that was read back from a report
+    record: np.void  #: the law as ``pack_law`` gives it
+    #: whether a law of its folder has an inner stage: y has 11 signals then, and u 4
     stages: bool = False
-    fixed: FixedLaw | None = None
+    fixed: FixedLaw | None = None  #: the law in fixed point; None in a floating-point precision
 
     @property
     def prefix(self) -> str:
@@ -119,7 +114,15 @@ class Module:
     @property
     def choices(self) -> Choices:
         """The choices of the templates for its unrolled step."""
-        return {"stages": self.stages, "fixed": self.fixed is not None}
+        code, fixed = int(self.record["error_map"]), self.fixed is not None
+        return {
+            "stages": self.stages,
+            "fixed": fixed,
+            "own": not fixed,
+            "mapped": code != LINEAR,
+            "angle": code == HYBRID_ANGLE,
+            "states": self.n > 0,
+        }
 
     @cached_property
     def tick(self) -> Tick:
@@ -208,21 +211,20 @@ def check_modules(modules: Sequence[Module]) -> None:
 def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
     """The headers and sources by file name."""
     if style == "unrolled":
-        return {
-            f"{m.prefix}{end}": text
-            for m in modules
-            for end, text in ((".h", _header(m, T_s)), (".c", _unrolled(m)))
-        } | {
-            f"proof/{m.prefix}.c": filled(
-                template("proof.c"),
-                keys_of(m) | {"MADE": MADE, "HINTS": m.fixed_tick.hints()},
-            )
-            for m in modules
-            if m.fixed
-        }
+        out, proofs = dict[str, str](), dict[str, str]()
+        for m in modules:
+            tick = m.fixed_tick if m.fixed else m.tick
+            keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
+            text = filled(chosen(template("interface.h"), m.choices), keys)
+            out[f"{m.prefix}.h"] = about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
+            out[f"{m.prefix}.c"] = _source(m.choices, keys | tick.keys(m.prefix))
+            if m.fixed:
+                keys["HINTS"] = m.fixed_tick.hints()
+                proofs[f"proof/{m.prefix}.c"] = filled(template("proof.c"), keys)
+        return out | proofs
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
-    choices = modules[0].choices
+    choices = {**modules[0].choices, "own": False}
     common = _keys("gfm", real, states, stages) | {"LAW": "const gfm_law_t *law, ", "law": "law, "}
     names = [name for name in INNER_CONSTANTS if name not in SHARED]
     types = common | {
@@ -240,35 +242,14 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
-        out[f"{m.prefix}.h"] = "\n".join(
-            [
-                about(m, T_s),
-                f"#ifndef {guard}",
-                f"#define {guard}",
-                "",
-                '#include "gfm.h"',
-                "",
-                f"extern const gfm_law_t {m.prefix}_law;",
-                "",
-                "#endif",
-                "",
-            ]
+        out[f"{m.prefix}.h"] = (
+            f"{about(m, T_s)}\n#ifndef {guard}\n#define {guard}\n\n"
+            f'#include "gfm.h"\n\nextern const gfm_law_t {m.prefix}_law;\n\n#endif\n'
         )
         out[f"{m.prefix}.c"] = (
             f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
         )
     return out
-
-
-def _header(m: Module, T_s: float) -> str:
-    keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
-    text = filled(chosen(template("interface.h"), m.choices), keys)
-    return about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
-
-
-def _unrolled(m: Module) -> str:
-    tick = m.fixed_tick if m.fixed else m.tick
-    return _source(m.choices, keys_of(m) | {"LAW": "", "law": ""} | tick.keys(m.prefix))
 
 
 def _source(choices: Choices, keys: Mapping[str, str]) -> str:
@@ -305,17 +286,12 @@ def about(m: Module, T_s: float) -> str:
             "Constants are hexadecimal, exact to the bit: 0x1.8p+1 is 1.5 * 2^1, which is 3.",
             "Compile with -ffp-contract=off: a fused multiply-add gives other bits.",
         ]
-    return "/* " + "\n".join(f" * {line}".rstrip() for line in _wrapped(lines))[3:] + "\n */"
-
-
-def _wrapped(lines: Sequence[str], width: int = 96) -> list[str]:
     out: list[str] = []
     for line in lines:
         indent = line[: len(line) - len(line.lstrip())]
-        out += textwrap.wrap(
-            plain(line), width, initial_indent=indent, subsequent_indent=indent + "    "
-        ) or [""]
-    return [line.rstrip() for line in out]
+        out += textwrap.wrap(plain(line), 96, initial_indent=indent,
+                             subsequent_indent=indent + "    ") or [""]  # fmt: skip
+    return "/* " + "\n".join(f" * {line}".rstrip() for line in out)[3:] + "\n */"
 
 
 def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, str]:
@@ -340,13 +316,19 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         **C_TYPES[str(real)],
         "GUARDS": filled(template("guards.c"), {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
-        "REASONS": _enumerators(guard),
+        "REASONS": "\n".join(
+            f"    {guard}_{name} = {code}{',' * (name != 'BAD_REF')} /* {text} */"
+            for name, (code, text) in RESULTS.items()
+        ),
         "Y_CHECKS": _checks("y", y, [(literal(s.low, real), literal(s.high, real)) for s in y]),
         "REF_CHECKS": _checks(
             "ref", ref, [(literal(s.low, real), literal(s.high, real)) for s in ref]
         ),
         "U_DEFAULT": literals([s.default for s in group("u")], real),
+        "U_LOW": ", ".join(repr(s.low) for s in u),
+        "U_HIGH": ", ".join(repr(s.high) for s in u),
         "OMEGA_DEFAULT": literal(u[1].default, real),
+        "N": str(n),
         "N_ROWS": phi[0],
         "N_COLUMNS": phi[1],
         "STAGE": "\n".join(
@@ -364,7 +346,7 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
 
 def keys_of(m: Module) -> dict[str, str]:
     """What the templates of an unrolled law ask for."""
-    keys = _keys(m.prefix, m.real, m.n, m.stages)
+    keys = _keys(m.prefix, m.real, m.n, m.stages) | {"MADE": MADE, "LAW_NAME": plain(m.name)}
     if m.fixed:
         formats = "\n".join(m.fixed_tick.formats(m.prefix.upper()))
         keys |= {
@@ -376,15 +358,6 @@ def keys_of(m: Module) -> dict[str, str]:
             "0": "0",
         }
     return keys
-
-
-def _enumerators(guard: str) -> str:
-    rows = [f"    {guard}_{name} = {code}" for name, (code, _) in RESULTS.items()]
-    ends = [","] * (len(rows) - 1) + [""]
-    texts = [text for _, text in RESULTS.values()]
-    return "\n".join(
-        f"{row}{end} /* {text} */" for row, end, text in zip(rows, ends, texts, strict=True)
-    )
 
 
 def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, Any]]) -> str:
@@ -401,28 +374,21 @@ def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, An
 
 def _record(m: Module, states: int) -> str:
     """A law's record as an initialiser, for a generic step with room for ``states``."""
-    lines = ["{"]
     integers, numbers = fields(m.stages)
+    room: dict[str, tuple[int, ...]] = {"A": (states, states), "C": (NU, states)}
+    room |= dict.fromkeys(("B_r", "B_y", "W", "E_r", "E_y", "F", "G", "row"), (states,))
+    lines = ["{"]
     for field in (*integers, *numbers):
-        value = m.record[field]
         if field in SHARED:
             continue
-        if field == "row":
-            text = "{" + ", ".join(map(str, value[:states])) + "}"
-        elif field in integers:
-            text = str(int(value))
-        else:
-            text = _braced(_cut(field, value, states), m.real)
+        value = (
+            m.record[field][tuple(map(slice, room[field]))] if field in room else m.record[field]
+        )
+        text = _braced(value, m.real)
+        if field in integers:
+            text = "{" + ", ".join(map(str, value)) + "}" if field == "row" else str(int(value))
         lines.append(f"    .{field} = {text},")
     return "\n".join([*lines, "}"])
-
-
-def _cut(field: str, value: NDArray[Any], states: int) -> NDArray[Any]:
-    if field == "A":
-        return value[:states, :states]
-    if field == "C":
-        return value[:, :states]
-    return value[:states] if field in ("B_r", "B_y", "W", "E_r", "E_y", "F", "G") else value
 
 
 def _braced(value: NDArray[Any], real: np.dtype[Any]) -> str:

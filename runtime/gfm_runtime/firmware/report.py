@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,16 +18,8 @@ import numpy as np
 from gfm_runtime.error_maps import DVOC
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal
-from gfm_runtime.firmware.deviation import NEAR, deviations
-from gfm_runtime.firmware.fixed import FIXED, G_MOST, FixedLaw, make_fixed
-from gfm_runtime.firmware.module import (
-    REALS,
-    STYLES,
-    Module,
-    Style,
-    check_modules,
-    fields,
-)
+from gfm_runtime.firmware.fixed import FIXED, G_MOST, NEAR, FixedLaw, deviations, make_fixed
+from gfm_runtime.firmware.module import REALS, STYLES, Module, Style, check_modules, fields
 from gfm_runtime.firmware.tick import SHARED, SIZE, Tick
 from gfm_runtime.inner import INNER_CONSTANTS
 from gfm_runtime.kernel import law_dtype
@@ -36,14 +28,18 @@ from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
 
 FORMAT = 1  # of report.json
 _MOST_BYTES = 64 << 20
-
-
 _MOST_S = max(abs(s.low) for s in group("y") if s.name in ("p", "q"))
 #: what stands beside a bound for dvoc
 DEAD_BUS = (
     f"dvoc: p/V^2 and q/V^2 saturate at {G_MOST:g} p.u. in fixed point, so with |p| or |q| of "
     f"{_MOST_S:g} p.u. below V = {math.sqrt(_MOST_S / G_MOST):.2f} p.u.; float64 goes on. "
     "Its bound is to the law with that saturation."
+)
+_FAR = (
+    "How far u gets from float64 at most, for all inputs in range, p.u.; t is the time in s since "
+    "the start or the last settle. The state of an integrator drifts in open loop, in any "
+    "precision; a loop that is closed holds it. Small signals are within "
+    f"{NEAR:g} p.u. of the default inputs."
 )
 
 
@@ -57,6 +53,7 @@ class Exported(NamedTuple):
 
 def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
     """report.json and report.md."""
+    fixed = modules[0].fixed is not None
     laws = [
         {
             "name": m.name,
@@ -66,27 +63,14 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {
-                name: _hex(m.record[name])
-                for part in fields(m.stages, m.fixed is not None)
-                for name in part
-            },
+            "record": {n: _hex(m.record[n]) for part in fields(m.stages, fixed) for n in part},
+            **({"deviation": _deviations(m.fixed, m.record, T_s)} if m.fixed else {}),
         }
         for m in modules
     ]
-    for law, m in zip(laws, modules, strict=True):
-        if m.fixed:
-            law["deviation"] = _deviations(m.fixed, m.record, T_s)
     real, stages = modules[0].precision, modules[0].stages
-    whole = {
-        "format": FORMAT,
-        "signal_table": table_hash(),
-        "stages": stages,
-        "T_s": T_s,
-        "real": real,
-        "style": style,
-        "laws": laws,
-    }
+    whole = {"format": FORMAT, "signal_table": table_hash(), "stages": stages, "T_s": T_s,
+             "real": real, "style": style, "laws": laws}  # fmt: skip
     return {
         "report.json": json.dumps(whole, indent=1, ensure_ascii=False) + "\n",
         "report.md": _page(laws, T_s, real, style),
@@ -185,10 +169,7 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
         constants += (len(INNER_CONSTANTS) - len(SHARED)) * m.stages
     else:
         constants = m.tick.constants()
-    return {
-        "state": state * m.real.itemsize,
-        "constants": constants * m.real.itemsize,
-    }
+    return {"state": state * m.real.itemsize, "constants": constants * m.real.itemsize}
 
 
 def operations(m: Module, style: Style) -> dict[str, int]:
@@ -215,11 +196,8 @@ def _deviations(law: FixedLaw, record: np.void, T_s: float) -> dict[str, list[di
                              ("float32", "float32", False)):  # fmt: skip
         found, exact = (deviations(law, record, which, near) for which in (real, "float64"))
         out[name] = [
-            {
-                "bound": _finite(d.bound + own.bound),
-                "drift": _finite((d.drift + own.drift) / T_s),
-            }
-            for d, own in zip(found, exact, strict=True)
+            {"bound": _finite(d.bound + e.bound), "drift": _finite((d.drift + e.drift) / T_s)}
+            for d, e in zip(found, exact, strict=True)
         ]
     return out
 
@@ -239,58 +217,45 @@ def deviation_text(found: Mapping[str, float | None]) -> str:
     return f"{found['bound']:.1e}" + (f" + {found['drift']:.0e} t" if found["drift"] else "")
 
 
-def _deviation_table(laws: Sequence[Mapping[str, Any]]) -> list[str]:
-    kinds = list(laws[0]["deviation"])
-    rows = [
-        (law["name"], kind, *map(deviation_text, law["deviation"][kind]))
-        for law in laws
-        for kind in kinds
-    ]
-    return [
-        "How far u gets from float64 at most, for all inputs in range, p.u.; t is the time in s "
-        "since the start or the last settle. The state of an integrator drifts in open loop, in "
-        f"any precision; a loop that is closed holds it. Small signals are within {NEAR:g} p.u. of "
-        "the default inputs.",
-        "",
-        _line(("law", "precision", *U_NAMES)),
-        "|---" * 5 + "|",
-        *map(_line, rows),
-        "",
-        *([DEAD_BUS, ""] if any(law["record"]["error_map"] == DVOC for law in laws) else []),
-    ]
+def _table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = ["| " + " | ".join(map(str, cells)) + " |" for cells in (heads, *rows)]
+    return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
 
 
 def _page(laws: Sequence[Mapping[str, Any]], T_s: float, real: str, style: str) -> str:
-    rows = [
-        (law["name"], law["states"], *law["bytes"].values(), *law["operations"].values())
-        for law in laws
-    ]
     heads = ("law", "states", "bytes of state", "bytes of constants", "×", "+ −", "÷", "√",
              "comparisons")  # fmt: skip
-    return "\n".join(
-        [
-            "# Firmware of gfmhil",
-            "",
-            f"{len(laws)} law{'s' * (len(laws) > 1)} as C99, {real}, style {style}, "
-            f"T_s = {T_s:g} s, signal table {table_hash()}.",
-            "",
-            _line(heads),
-            "|---" * len(heads) + "|",
-            *map(_line, rows),
-            "",
-            "The operations are those of one step in which every limit clamps. "
-            "`gfmhil firmware check` counts instructions, code and stack on a target.",
-            "",
-            *(_deviation_table(laws) if real == FIXED else ()),
+    costs = _table(heads, (
+        (law["name"], law["states"], *law["bytes"].values(), *law["operations"].values())
+        for law in laws
+    ))  # fmt: skip
+    deviation = ""
+    bits = (
+        "Bits: compile without `-ffast-math` and with `-ffp-contract=off`; `selftest.c` compares "
+        "every output and state with `golden.h`, bit by bit."
+    )
+    if real == FIXED:
+        bounds = _table(("law", "precision", *U_NAMES), (
+            (law["name"], kind, *map(deviation_text, law["deviation"][kind]))
+            for law in laws
+            for kind in laws[0]["deviation"]
+        ))  # fmt: skip
+        dead = any(law["record"]["error_map"] == DVOC for law in laws)
+        deviation = f"{_FAR}\n\n{bounds}\n\n" + f"{DEAD_BUS}\n\n" * dead
+        bits = (
             "Bits: `selftest.c` compares every output and state with `golden.h`, bit by bit. "
             "`proof/prove.sh` proves with Frama-C that nothing overflows."
-            if real == FIXED
-            else "Bits: compile without `-ffast-math` and with `-ffp-contract=off`; `selftest.c` "
-            "compares every output and state with `golden.h`, bit by bit.",
-            "",
-        ]
-    )
+        )
+    return f"""\
+# Firmware of gfmhil
 
+{len(laws)} law{"s" * (len(laws) > 1)} as C99, {real}, style {style}, T_s = {T_s:g} s, \
+signal table {table_hash()}.
 
-def _line(cells: Sequence[Any]) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |"
+{costs}
+
+The operations are those of one step in which every limit clamps. `gfmhil firmware check` counts \
+instructions, code and stack on a target.
+
+{deviation}{bits}
+"""

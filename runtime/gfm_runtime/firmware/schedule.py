@@ -14,7 +14,7 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import choose
 from gfm_runtime.firmware.c_text import chosen, filled, literals, plain, template
-from gfm_runtime.firmware.module import MADE, Module, Style, keys_of, make_modules, sources
+from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources
 from gfm_runtime.firmware.tick import place
 from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
 from gfm_runtime.impedance import estimate
@@ -88,8 +88,6 @@ def schedule_sources(
         copied += "\n(void)memcpy(e, {s}.stage.e, sizeof {s}.stage.e);"
     first = parts[0][1]
     keys = keys_of(m) | {
-        "MADE": MADE,
-        "LAW_NAME": plain(laws.name),
         "SOURCE": plain(m.law.source),
         "COUNT": str(len(stages)),
         "FIRST": first,

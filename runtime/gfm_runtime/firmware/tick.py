@@ -1,4 +1,4 @@
-"""The tick of a law in C: the kernel's functions, translated, and what they work on.
+"""The tick of a law in C: functions of the kernel or of fixed point, and what they work on.
 
 In a law of its own the constants are numbers in the code; in the generic step they are those of the
 law's record. Variables that a tick leaves are members of an instance ``s``, the others of ``t``.
@@ -6,11 +6,14 @@ law's record. Variables that a tick leaves are members of an instance ``s``, the
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from gfm_runtime.firmware import fixed
 from gfm_runtime.firmware.translate import (
     Algebra,
     Array,
@@ -34,7 +37,7 @@ from gfm_runtime.kernel import (
     look_with_inner,
     state_dtype,
 )
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.switchover import settle_into, settle_with_inner
 
 #: numbers of an inner stage in an instance
@@ -65,18 +68,6 @@ _OF_A_TICK = {
 }
 _PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
 assert [getattr(stage, name) for name in _PLACES] == list(range(len(_PLACES)))
-
-
-_IN_PLACE = """\
-/* A step is compiled in one: calls and the way through memory cost more than the sums. */
-#ifdef __GNUC__
-#define IN_PLACE __attribute__((flatten))
-#define APART __attribute__((noinline))
-#else
-#define IN_PLACE
-#define APART
-#endif
-"""
 
 
 def place(name: str, shape: tuple[int, ...], at: str) -> Expr | Array:
@@ -168,12 +159,8 @@ class Tick:
         lines += ["} tick_t;", ""]
         if "t->m" in used:
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
-        if self._own:
-            lines += [_IN_PLACE]
         return {
             "TICK": "\n".join(lines),
-            "IN_PLACE": "IN_PLACE " * self._own,
-            "APART": "APART\n" * self._own,
             "FUNCTIONS": "\n".join(map(printer.function, self._functions)),
             "OUTPUT": call(self.output, u="out"),
             "ADVANCE": call(self.advance),
@@ -188,3 +175,92 @@ class Tick:
     def constants(self) -> int:
         """Different constants of a step."""
         return len(constants(self.output) | constants(self.advance))
+
+
+_PRIMITIVES = {"rounded": "wide", "between": "word", "root": "wide"}
+
+
+def _place(one: fixed.Number) -> Expr:
+    at = re.fullmatch(r"(.*)\[(\d+)\]", one.text)
+    return Expr("var", (at[1], number(int(at[2]))), "word") if at else number(0)
+
+
+class FixedTick:
+    """The functions of the tick of a law in fixed point."""
+
+    def __init__(self, law: fixed.FixedLaw) -> None:
+        self._law = law
+        translate = Translator(True, primitives=_PRIMITIVES)
+        v = tuple(map(_place, law.numbers))
+        pairs = {name: Array(f"t->{name}", (2,), "wide") for name in ("a", "b", "turn")}
+        w = Struct(
+            {
+                "raw": Array("t->raw", (NU,), "wide"),
+                "x_next": Array("t->x_next", (law.n,), "word"),
+                "rest": Array("s->rest", (2 * NU + law.n,), "wide"),
+                **pairs,
+            }
+        )
+        u, old, trend = (Array(name, (NU,), "word") for name in ("u", "old", "trend"))
+        self.set_inputs = translate.function(fixed.set_inputs, [law, v, w])
+        self.output = translate.function(fixed.output, [law, v, w])
+        self.look = translate.function(fixed.look, [law, v, w, u])
+        self.advance = translate.function(fixed.advance, [law, v, w])
+        self.settle = translate.function(fixed.settle, [law, v, w, u, trend])
+        self.reset = translate.function(fixed.begin_rests, [law, w])
+        self.bump = translate.function(fixed.bump_of, [old, u])
+
+    def keys(self, prefix: str) -> dict[str, str]:
+        """What the templates ask for: the variables of a tick, the functions, and their calls."""
+        printer = Printer(np.dtype("f8"), {"s": f"{prefix}_t", "t": "tick_t"})
+
+        def call(one: CFunction, *arguments: str) -> str:
+            return printer.call(one, arguments, {"t": "&t"})
+
+        functions = reached([self.reset, self.look, self.advance, self.settle, self.bump])
+        return {
+            "FUNCTIONS": "\n".join(map(printer.function, functions)),
+            "RESET": call(self.reset),
+            "OUTPUT": "".join(
+                f"{call(one)};\n    " for one in (self.set_inputs, self.output) if one.body
+            ).removesuffix(";\n    "),
+            "ADVANCE": call(self.advance),
+            "LOOK": call(self.look, "u"),
+            "SETTLE": call(self.settle, "u", "trend"),
+            "BUMP": call(self.bump, "old", "u"),
+        }
+
+    def operations(self) -> Mapping[str, int]:
+        """Operations of a step by their signs, see ``translate.operations``."""
+        return sum(map(operations, (self.set_inputs, self.output, self.advance)), Counter())
+
+    def formats(self, guard: str) -> list[str]:
+        """The exponents of the signals, as C."""
+        trends = self._law.numbers[fixed.TREND : fixed.TREND + NU]
+        numbers = {"REF": fixed.REFS, "Y": fixed.YS, "U": fixed.US, "TREND": trends}
+        signals = {"REF": group("ref"), "Y": group("y"), "U": group("u"), "TREND": group("u")}
+        qs = {
+            f"{vector}_{s.name}".upper(): one.q
+            for vector, many in numbers.items()
+            for s, one in zip(signals[vector], many, strict=True)
+        }
+        names = [f"    {guard}_Q_{name} = {q}" for name, q in (qs | {"BUMP": fixed.BUMP_Q}).items()]
+        return [
+            "",
+            "/* All numbers are integers: a value in p.u. is the number / 2^Q; the other way,",
+            " * (int32_t)lrint(ldexp(value, Q)). A trend is in p.u. per tick. */",
+            "enum {",
+            ",\n".join(names),
+            "};",
+            "",
+            f"enum {{ {guard}_NREST = {2 * NU + self._law.n} }};",
+        ]
+
+    def hints(self) -> str:
+        """Where EVA stops widening: the bounds of the state."""
+        bounds = (
+            end
+            for one in (*fixed.US, *self._law.numbers[fixed.TREND :])
+            for end in (one.low, one.high)
+        )
+        return ", ".join(dict.fromkeys(map(str, bounds)))

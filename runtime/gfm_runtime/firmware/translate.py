@@ -134,20 +134,13 @@ class Comment:
 
 @dataclass(eq=False)
 class CFunction:
-    """A function in C.
+    """A function in C."""
 
-    Attributes:
-        name: of Python's, without an underscore in front.
-        about: the first paragraph of its docstring.
-        parameters: the declared variables and arrays, in Python's order.
-        body: statements.
-        kind: of what it returns: void, real, int or bool; or tuple, which only inlining returns.
-    """
-
-    name: str
-    about: str
-    parameters: list[Variable | Array]
-    body: list[Any] = field(default_factory=list)
+    name: str  #: of Python's, without an underscore in front
+    about: str  #: the first paragraph of its docstring
+    parameters: list[Variable | Array]  #: the declared variables and arrays, in Python's order
+    body: list[Any] = field(default_factory=list)  #: statements
+    #: of what it returns: void, real, int or bool; or tuple, which only inlining returns
     kind: str = "void"
 
     def statements(self) -> Iterator[Any]:

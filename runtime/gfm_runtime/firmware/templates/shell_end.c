@@ -1,5 +1,8 @@
 /* 0, or the reason to refuse these inputs: the state, or the ranges of the signal table. */
-@APART@static int refused(const @P@_t *s, const real ref[], const real y[], int *channel)
+/* @if own@ */
+APART
+/* @end@ */
+static int refused(const @P@_t *s, const real ref[], const real y[], int *channel)
 {
     if (s->reason != @GUARD@_OK) {
         *channel = s->channel;
@@ -54,7 +57,11 @@ void @P@_reset(@P@_t *s)
     s->channel = -1;
 }
 
-@IN_PLACE@int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+/* @if own@ */
+IN_PLACE int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+/* @else@ */
+int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+/* @end@ */
 {
     tick_t t;
 /* @if fixed@ */

@@ -1,0 +1,197 @@
+"""``gfmhil bench``: its files and its errors. The tests judge no figure."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gfm_hil.bench.c_code import compile_twin
+from gfm_hil.bench.contenders import FRAME, messages
+from gfm_hil.bench.kernel import compare
+from gfm_hil.cli import main
+from gfm_hil.cli.main import parser
+from gfm_runtime import law_names
+
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
+
+KEYS = {
+    "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",
+    "p50_us", "p90_us", "p99_us", "p99_9_us", "p99_99_us", "max_us",
+}  # fmt: skip
+
+
+def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, Any]:
+    """Run a benchmark with minimal work; returns its result."""
+    line = ["bench", kind, "--rounds", "2", *options, "--out", str(tmp_path / "bench"), "--json"]
+    assert main(line) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "bench" / "bench.json").read_text("utf-8"))
+    return dict(printed)
+
+
+@pytest.mark.apt
+def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
+    found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02")
+    rows = found["results"]
+    assert {r["link"] for r in rows} - {"iceoryx2"} == {"shm", "zmq"}
+    assert {(r["mode"], r["load"]) for r in rows} == {
+        (m, w) for m in ("lockstep", "realtime") for w in ("idle", "busy")
+    }
+    for row in rows:
+        assert row.keys() >= KEYS
+        assert row["n"] > 0
+        assert 0 < row["p50_us"] <= row["p90_us"] <= row["p99_us"] <= row["max_us"]
+        assert row["ratio_to_baseline_p50"] > 0
+        assert sum(n for _, n in row["histogram"]) == row["n"]
+        if row["peer"] == "C":
+            assert row["ratio_to_baseline_p50"] == 1
+    assert found["seconds"] > 0
+    assert found["environment"]["cpus"] == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.apt
+def test_the_message_is_the_frame_unless_told_otherwise():
+    payload = parser("bench").parse_args(["bench", "latency"]).payload
+    there, back = (messages(role, payload) for role in ("plant", "controller"))
+    assert (there.shape[1], back.shape[1]) == (payload, 48) == (FRAME, 48)
+    assert bytes(there[0, :2]) == bytes(back[0, :2]) == b"GF"
+    assert messages("controller", 100).shape[1] == 100
+
+
+def test_kernel_is_its_twin_in_c_bit_for_bit(tmp_path):
+    """All laws, float64 and float32, on inputs that drive each output into its limits."""
+    limited: list[list[int]] = []
+    for real in ("float64", "float32"):
+        twin = compile_twin(tmp_path, law_names(), real)
+        found = {name: compare(name, real, twin, rounds=2) for name in law_names()}
+        assert {name: ulps for name, (ulps, _) in found.items()} == dict.fromkeys(found, 0)
+        limited += [counts for _, counts in found.values()]
+    assert all(any(row) for row in zip(*limited, strict=True))
+
+
+@pytest.mark.apt
+def test_kernel_is_timed_beside_c(tmp_path, capsys):
+    rows = bench(tmp_path, capsys, "kernel", "--laws", "mimo-gfm,droop-1")["kernel"]
+    assert {(r["law"], r["real"]) for r in rows} == {
+        (law, real) for law in ("mimo-gfm", "droop-1") for real in ("float64", "float32")
+    }
+    for row in rows:
+        assert row["ulps"] == 0
+        assert row["numba_ns"]["median"] > 0
+        assert row["ratio"]["median"] > 0
+
+
+def test_kernel_without_a_compiler(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    found = bench(tmp_path, capsys, "kernel", "--laws", "droop-1")
+    assert all(r["numba_ns"]["median"] > 0 and r["ratio"] is None for r in found["kernel"])
+    assert any("no C compiler" in remark for remark in found["remarks"])
+
+
+def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
+    options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
+    rows = bench(tmp_path, capsys, *options)["jitter"]
+    assert {r["wait"] for r in rows} == {"sleep+spin", "spin", "nanosleep"}
+    for row in rows:
+        assert row["n"] == 2 * row["ticks"] == 2 * 2 * 200  # processors, rounds
+        assert row["lost"] == sum(length * count for length, count in row["bursts"])
+        assert row["lost_pct"] == pytest.approx(100 * row["lost"] / row["ticks"], abs=1e-3)
+
+
+def test_loop_runs_the_product_over_a_link(tmp_path, capsys):
+    loop = bench(
+        tmp_path, capsys, "loop", "--links", "shm", "--laws", "mimo-gfm", "--seconds", "0.3",
+        "--load", "idle", "--rounds", "1",
+    )["loop"]  # fmt: skip
+    assert {r["link"] for r in loop["lockstep"]} == {"inproc", "shm"}
+    assert all(r["ticks_per_s"]["median"] > 0 for r in loop["lockstep"])
+    (row,) = loop["realtime"]
+    assert row["ticks"] == 3_000
+    assert row["n"] == row["ticks"] - row["missed"]
+    assert sum(row["causes"].values()) == row["missed"]
+    ours = row["causes"]["own work"] + row["causes"]["link"]
+    assert row["by_work_or_link_pct"] == pytest.approx(100 * ours / row["ticks"], abs=1e-4)
+    assert sum(length * count for length, count in row["bursts"]) == row["missed"]
+    assert {r["law"] for r in loop["laws"]} == {"mimo-gfm", "mimo-gfm, rig"}
+    for row in loop["laws"]:
+        assert row["allocations_per_tick"] == 0
+
+
+def test_loop_that_trips_is_not_timed(tmp_path, capsys):
+    line = ["bench", "loop", "--laws", "dvoc", "--mode", "lockstep", "--rounds", "1"]
+    line += ["--links", "shm", "--seconds", "0.1"]
+    assert main([*line, "--out", str(tmp_path / "bench")]) == 2
+    assert capsys.readouterr().err.startswith("gfmhil: dvoc: tripped or safe at tick ")
+
+
+def test_without_a_compiler_the_links_are_measured_alone(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    found = bench(
+        tmp_path, capsys, "latency", "--links", "shm", "--seconds", "0.02", "--load", "idle"
+    )
+    assert "C" not in {r["peer"] for r in found["results"]}
+    assert all(r["ratio_to_baseline_p50"] is None and r["n"] for r in found["results"])
+    assert any("no C compiler" in remark for remark in found["remarks"])
+
+
+def processes_with(mark: str) -> int:
+    """How many processes have a mark in their environment."""
+    found = 0
+    for place in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):  # it has ended
+            found += mark.encode() in place.read_bytes()
+    return found
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize(
+    ("kind", "everyone"),  # with the parent: two processes, the CPU load; the product's two sides
+    [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
+)
+def test_ctrl_c_leaves_nothing_behind(kind, everyone, tmp_path):
+    mark = f"GFMHIL_TEST={uuid.uuid4()}"
+    line = ["bench", kind, "--links", "shm", "--seconds", "8", "--mode", "realtime"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gfm_hil", *line, "--out", str(tmp_path / "bench")],
+        env={**os.environ, **dict([mark.split("=")])}, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        until = time.monotonic() + 90
+        while processes_with(mark) < everyone and time.monotonic() < until:
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        said = process.communicate(timeout=180)
+    finally:
+        process.kill()
+    assert process.returncode == 130, said
+    assert said == ("", "")
+    assert processes_with(mark) == 0
+
+
+def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path):
+    """The load's processes are stopped when their parent is killed: SIGTERM would not end them."""
+    mark = f"GFMHIL_TEST={uuid.uuid4()}"
+    program = "from gfm_hil.bench.cpu_load import cpu_load\nwith cpu_load():\n    input('ready')"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env={**os.environ, **dict([mark.split("=")])},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            assert process.stdout is not None and process.stdout.read(5) == b"ready"
+            assert processes_with(mark) == 1 + len(os.sched_getaffinity(0))
+        finally:
+            process.kill()
+    until = time.monotonic() + 60
+    while processes_with(mark) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert processes_with(mark) == 0
