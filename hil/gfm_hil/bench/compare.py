@@ -82,15 +82,11 @@ def _row(
     reach = 2 / math.comb(len(x) + len(y), len(x)) * rows
     undecided = "noise" if reach < BELIEVED else "too few rounds to tell"
     return {
-        "row": name,
-        "unit": unit,
-        "a": median(x),
-        "b": median(y),
-        "ratio": median(y) / median(x),
-        "rounds": [len(x), len(y)],
-        "p": p,
+        "row": name, "unit": unit,
+        "a": median(x), "b": median(y), "ratio": median(y) / median(x),
+        "rounds": [len(x), len(y)], "p": p,
         "verdict": "real change" if p < BELIEVED else undecided,
-    }
+    }  # fmt: skip
 
 
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
