@@ -42,6 +42,10 @@ RIG = {"dc_source": {"mode": "regulated"}}
 FAILS_AT = 100  # step of the model
 
 
+def compiles(test: Any) -> Any:
+    return pytest.mark.apt(pytest.mark.timeout(300)(test))
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Our own laws as models, by kind, law and inner stage."""
@@ -82,8 +86,7 @@ def run(tmp_path: Path, model: str, *options: str, **content: Any) -> Run:
     return found
 
 
-@pytest.mark.apt
-@pytest.mark.timeout(300)
+@compiles
 @pytest.mark.parametrize(
     ("kind", "inner"), [("dll", "cascaded"), ("dll", "none"), ("fmu", "cascaded")]
 )
@@ -118,8 +121,7 @@ def test_our_own_model_gives_the_run_of_the_law(exported, kind, inner, tmp_path,
                 np.testing.assert_allclose(column[:], near.columns[name][:], rtol=0, atol=1e-9)
 
 
-@pytest.mark.apt
-@pytest.mark.timeout(300)
+@compiles
 @pytest.mark.parametrize("kind", ["dll", "fmu"])
 def test_a_reset_starts_the_model_anew(exported, kind, tmp_path):
     """A dip to nothing trips; the run after the reset has the bits of the run from its start."""
@@ -134,8 +136,7 @@ def test_a_reset_starts_the_model_anew(exported, kind, tmp_path):
     assert np.ptp(p) > 0.4
 
 
-@pytest.mark.apt
-@pytest.mark.timeout(300)
+@compiles
 def test_a_model_of_others_by_its_map(foreign, tmp_path):
     """Its arithmetic, done again here from what the run recorded, step by step."""
     (tmp_path / "map.toml").write_text(MAP + "parameters.droop = 2e-4\n")
@@ -158,8 +159,7 @@ def test_a_model_of_others_by_its_map(foreign, tmp_path):
     assert p[-1] == pytest.approx(0.6, abs=0.02)
 
 
-@pytest.mark.apt
-@pytest.mark.timeout(300)
+@compiles
 @pytest.mark.parametrize(
     ("what", "reason"),
     [
@@ -182,8 +182,7 @@ def test_a_model_that_fails_is_named_and_the_run_is_kept(foreign, tmp_path, what
     assert np.isfinite(found.columns["u_omega_u"][: 2 * FAILS_AT]).all()
 
 
-@pytest.mark.apt
-@pytest.mark.timeout(300)
+@compiles
 @pytest.mark.parametrize(
     ("event", "map_", "message"),
     [

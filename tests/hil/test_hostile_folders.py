@@ -22,11 +22,12 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.core import temporary as scratch
-from gfm_hil.core.errors import Unfinished
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.recording import parts as recording
 from gfm_hil.run.run_folder import recover
 from gfm_hil.run.runner import run_scenario
+
+from .conftest import unfinished
 
 pytestmark = [
     pytest.mark.processes,
@@ -75,14 +76,8 @@ def cut(whole) -> Path:
     from gfm_hil.scenario import load_scenario
 
     folder = whole.with_name("cut")
-    with pytest.MonkeyPatch.context() as patch:
-
-        def stop(*_: object) -> None:
-            raise Unfinished
-
-        patch.setattr("gfm_hil.run.runner.finish", stop)
-        with pytest.raises(Unfinished):
-            run_scenario(load_scenario(whole / "scenario.toml"), folder)
+    with unfinished():
+        run_scenario(load_scenario(whole / "scenario.toml"), folder)
     (folder / "ended.json").write_text(json.dumps(ENDED))
     for role in ("plant", "controller"):
         (folder / f"link_{role}.json").write_text(json.dumps({**LINK_END, "role": role}))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from gfm_hil.cli import main
-from gfm_hil.core.errors import Unfinished
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.ports.streams.blocks import messages
 from gfm_hil.ports.streams.follow import NewRows
@@ -23,6 +22,7 @@ from gfm_runtime.signals import NU_INNER, NY_INNER
 
 from ..support.links import PATIENT, RIG, assert_same, run_pair
 from ..support.processes import end, signals, write
+from .conftest import unfinished
 
 INNER = {"virtual-stator", "cascaded", "threshold-impedance"}
 LINKS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -138,17 +138,11 @@ def test_an_old_frame_is_refused_by_its_version(make):
         FrameReader("y", True).unpack(message, np.zeros(NY_INNER))
 
 
-def test_the_parts_of_a_cut_run_are_followed_streamed_and_recovered(make, tmp_path, monkeypatch):
+def test_the_parts_of_a_cut_run_are_followed_streamed_and_recovered(make, tmp_path):
     scenario = make(law="vsg-2", inner="virtual-stator", plant=GRID, events=[JUMP], duration=0.03)
     whole = run_scenario(scenario, tmp_path / "a").signals
-
-    def stop(*given: Any) -> None:
-        raise Unfinished
-
-    with monkeypatch.context() as patch:
-        patch.setattr("gfm_hil.run.runner.finish", stop)
-        with pytest.raises(Unfinished):
-            run_scenario(scenario, tmp_path / "b")
+    with unfinished():
+        run_scenario(scenario, tmp_path / "b")
     live = LiveRun(tmp_path / "b")
     for role, name in (("plant", "u_E_q"), ("controller", "i_ref_d")):
         assert live.row(role, 200)[name] == whole[name][200]

@@ -4,6 +4,7 @@ import ctypes
 import math
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from gfm_hil.recording.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
 
-from ..support.firmware import cc
+from ..support.firmware import STRICT, cc
 from ..support.processes import write
 
 HEADERS = Path(gfm_hil.controllers.__file__).parent
 EXAMPLE = Path(__file__).parents[2] / "examples" / "foreign_controller"
 FAILS = Path(__file__).parents[1] / "support" / "foreign_library.c"
-FLAGS = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror", "-O2"]
+FLAGS = [*STRICT, "-O2"]
 SHARED = ["-shared", "-fPIC", f"-I{HEADERS}"]
 
 
@@ -52,6 +53,19 @@ class Fake:
         out._obj.e[:] = self.e(given._obj.t)
         out._obj.i_dc = 4.0
         return 0
+
+
+@pytest.fixture
+def failing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Makes the library that fails in a way."""
+
+    def make(what: str) -> Path:
+        done = cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm")
+        assert (done.returncode, done.stderr) == (0, "")
+        monkeypatch.setenv("FOREIGN_WHAT", what)
+        return tmp_path / "fails.so"
+
+    return make
 
 
 def phases(amplitude: float, angle: float) -> list[float]:
@@ -165,15 +179,10 @@ def test_the_example_holds_the_plant(example, scenario, p_end, tmp_path):
         ("crash", "the controller was ended by SIGSEGV"),
     ],
 )
-def test_a_library_that_fails_is_named_and_the_run_is_kept(what, reason, tmp_path, monkeypatch):
-    done = cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm")
-    assert (done.returncode, done.stderr) == (0, "")
-    monkeypatch.setenv("FOREIGN_WHAT", what)
-    link = {
-        "type": "shm",
-        "peer_timeout_s": 4.0 if what == "hang" else 20.0 - 18.0 * (what == "crash"),
-    }
-    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2", link=link))
+def test_a_library_that_fails_is_named_and_the_run_is_kept(what, reason, failing, tmp_path):
+    timeout_s = {"hang": 4.0, "crash": 2.0}.get(what, 20.0)
+    link = {"type": "shm", "peer_timeout_s": timeout_s}
+    found = run(tmp_path, failing(what), write(tmp_path, law="vsg-2", link=link))
     assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
     if what != "start":
         assert found.summary["ticks"] >= 100
@@ -181,31 +190,25 @@ def test_a_library_that_fails_is_named_and_the_run_is_kept(what, reason, tmp_pat
 
 
 @pytest.mark.apt
-def test_in_lockstep_a_library_may_take_seconds(tmp_path, monkeypatch):
-    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
-    monkeypatch.setenv("FOREIGN_WHAT", "pause")
-    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2"))
+def test_in_lockstep_a_library_may_take_seconds(failing, tmp_path):
+    found = run(tmp_path, failing("pause"), write(tmp_path, law="vsg-2"))
     assert (found.summary["status"], found.summary["ticks"]) == ("completed", 1000)
     assert found.summary["wall_s"] > 2.0
 
 
 @pytest.mark.apt
 @pytest.mark.skipif(processors() < 2, reason="every process has one processor")
-def test_in_lockstep_a_library_and_its_threads_share_a_processor(tmp_path, monkeypatch):
+def test_in_lockstep_a_library_and_its_threads_share_a_processor(failing, tmp_path):
     """A processor that sleeps takes long to wake: no thread waits for another processor."""
-    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
-    monkeypatch.setenv("FOREIGN_WHAT", "where")
-    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2"))
+    found = run(tmp_path, failing("where"), write(tmp_path, law="vsg-2"))
     assert found.summary["reason"].endswith("fault 8, 1 for its thread, 1 for its step, 1 for both")
 
 
 @pytest.mark.apt
-def test_in_real_time_a_library_that_takes_too_long_ends_the_run(tmp_path, monkeypatch):
-    assert cc(tmp_path, *FLAGS, *SHARED, str(FAILS), "-o", "fails.so", "-lm").returncode == 0
-    monkeypatch.setenv("FOREIGN_WHAT", "slow")
+def test_in_real_time_a_library_that_takes_too_long_ends_the_run(failing, tmp_path):
     late = {"mode": "realtime", "T_s": 1e-3, "late_policy": {"hold": 50}, "duration": 5.0}
     link = {"type": "shm", "peer_timeout_s": 20.0}
-    found = run(tmp_path, tmp_path / "fails.so", write(tmp_path, law="vsg-2", link=link, **late))
+    found = run(tmp_path, failing("slow"), write(tmp_path, law="vsg-2", link=link, **late))
     reason = "no fresh u for longer than late_policy.hold allows"
     assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
     assert found.summary["misses"] >= 50

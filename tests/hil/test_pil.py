@@ -27,7 +27,10 @@ from gfm_runtime.firmware import TARGETS
 
 from ..support.processes import write
 
-qemu = pytest.mark.compilers
+
+def qemu(test: Any) -> Any:
+    return pytest.mark.compilers(pytest.mark.timeout(300)(test))
+
 
 SHM, PAUSE_S = {"type": "shm"}, 2.0
 STEP = {"tick": 100, "type": "reference", "P_ref": 0.8, "ramp_s": 0.01}
@@ -67,7 +70,6 @@ def assert_same(found: Run, near: Run) -> None:
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("target", "content"),
     [
@@ -95,7 +97,6 @@ def test_a_run_has_the_bits_of_the_kernel(target, content, tmp_path, monkeypatch
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", ["rig_pref_step", "switchover"])
 def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_path, monkeypatch):
     """The paper's experiments on the rig on a Cortex-M4F, with their event after 20 ms."""
@@ -116,7 +117,6 @@ def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_p
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("number", "link", "reason"),
     [
@@ -143,7 +143,6 @@ def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
 
 
 @qemu
-@pytest.mark.timeout(300)
 def test_a_machine_that_answers_after_seconds_completes_the_run(tmp_path, monkeypatch):
     scratch = Path(tempfile.mkdtemp(prefix="pil-"))
     monkeypatch.setenv("TMPDIR", str(scratch))
@@ -202,7 +201,6 @@ while request := os.read(to, {asks}):
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("does", "reason"),
     [
@@ -234,7 +232,6 @@ def test_a_wrong_answer_is_named(does, reason, tmp_path, monkeypatch):
 
 
 @qemu
-@pytest.mark.timeout(300)
 def test_what_it_cannot_do_is_refused(tmp_path, capsys):
     file = write(tmp_path, law="vsg-2", link={"type": "shm"})
     command = ["controller", file, "--endpoint", "shm://none", "--out", str(tmp_path / "run")]
@@ -244,7 +241,6 @@ def test_what_it_cannot_do_is_refused(tmp_path, capsys):
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("content", [{"events": [STEP, CHANGE]}, {"inner": "cascaded"}])
 def test_a_program_with_other_bits_is_refused_before_tick_0(content, tmp_path, monkeypatch, capsys):
     """A compiler that fuses multiply-add, which the processor can do."""
@@ -262,7 +258,6 @@ def test_a_program_with_other_bits_is_refused_before_tick_0(content, tmp_path, m
 
 
 @qemu
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("does", "reason"),
     [

@@ -36,6 +36,7 @@ from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import scenario_toml
 
 from ..support.processes import has_run, roles_of, signals, summary, wait_for, write
+from .conftest import unfinished
 
 pytestmark = pytest.mark.processes
 
@@ -72,18 +73,10 @@ def same_run(one: Path, other: Path) -> None:
 
 
 @pytest.fixture
-def left(make, tmp_path, monkeypatch):
+def left(make, tmp_path):
     """A run folder before ``finish``, and the arguments of ``finish``."""
-    found = []
-
-    def stop(*arguments):
-        found.append(arguments)
-        raise Unfinished
-
-    with monkeypatch.context() as patch:
-        patch.setattr("gfm_hil.run.runner.finish", stop)
-        with pytest.raises(Unfinished):
-            run_scenario(make(events=EVENTS), tmp_path / "left")
+    with unfinished() as found:
+        run_scenario(make(events=EVENTS), tmp_path / "left")
     return found[0]
 
 

@@ -1,7 +1,5 @@
 """What a synthesis found: its channels as plain data, and the law file with its gains."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

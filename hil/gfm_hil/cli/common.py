@@ -1,7 +1,5 @@
 """What several commands share: options, the progress bar, the closing table."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import shlex
@@ -101,11 +99,8 @@ def window(text: str) -> list[float]:
 
 
 def endpoints(options: argparse.Namespace) -> dict[str, str]:
-    """The endpoints that --endpoint names, by converter, "" for one without a name.
-
-    Raises:
-        UserError: one is given twice.
-    """
+    """The endpoints that --endpoint names, by converter, "" for one without a name. Raises
+    UserError: one is given twice."""
     found: dict[str, str] = {}
     for text in options.endpoint:
         named = re.fullmatch(r"([A-Za-z_][A-Za-z0-9_-]*)=(.+)", text)
@@ -306,11 +301,7 @@ def exit_code(run: Run | NetworkRun) -> int:
 
 
 def split_laws(text: str) -> list[str]:
-    """Names from a comma-separated list.
-
-    Raises:
-        UserError: an empty one.
-    """
+    """Names from a comma-separated list. Raises UserError: an empty one."""
     names = [name.strip() for name in text.split(",")]
     if not all(names):
         raise UserError(f"--laws {text!r}: names separated by commas, none empty")

@@ -1,7 +1,5 @@
 """gfmhil conform: published tests of grid-forming converters, judged clause by clause."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -86,7 +84,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     against = options.against or [ALL]
     if options.list:
         cases = load_cases(against)
