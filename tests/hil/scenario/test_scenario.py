@@ -111,6 +111,22 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
         {"link": {"endpoint": "tcp://127.0.0.1"}}, ["'tcp://127.0.0.1'", "tcp://host:port"],
     ),
     "port out of range": ({"link": {"endpoint": "tcp://127.0.0.1:99999"}}, ["99999"]),
+    "expectation misspelt": (
+        {"expect": "tripped", "expect_reason": "overcurrent"}, ["did you mean 'over-current'?"],
+    ),
+    "expectation of no kind": (
+        {"expect": "tripped", "expect_reason": "x"}, ["expect_reason = 'x'", "'diverged'"],
+    ),
+    "reason of the other status": (
+        {"expect": "safe", "expect_reason": "over-current"}, ["expect = 'safe' takes one of"],
+    ),
+    "reason without a trip": (
+        {"expect_reason": "over-current"}, ["expect_reason", "needs expect = 'tripped' or 'safe'"],
+    ),
+    "time without a trip": ({"expect_after": 0.05}, ["expect_after = 0.05", "needs expect"]),
+    "time after the end": (
+        {"expect": "tripped", "expect_after": 0.1}, ["expect_after = 0.1 s", "below duration"],
+    ),
 }  # fmt: skip
 
 
