@@ -19,7 +19,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.ports.scope.recording import open_recording
-from gfm_hil.ports.streams.follow import Follower
+from gfm_hil.ports.streams.port import Follower
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import (

@@ -51,9 +51,11 @@ def test_is_the_filter_alone_where_the_law_is_slow(measured):
     assert fast.any() and off[fast].max() < 0.02
 
 
-def test_stage_delay_sensors_and_frequency():
+@pytest.mark.parametrize("more", [{}, {"lcl": {"L": 0.15, "R": 0.005, "earthed": True}}])
+def test_stage_delay_sensors_and_frequency(more):
+    scenario = gfmhil.load_scenario({**REAL, "plant": {**REAL["plant"], **more}})
     found = gfmhil.scan(
-        "droop-5", gfmhil.load_scenario(REAL), inner="virtual-stator",
+        "droop-5", scenario, inner="virtual-stator",
         start_hz=100, stop_hz=900, points=6, settle_s=1.0,
     )  # fmt: skip
     assert found.deviation is not None and found.deviation.max() < 0.01
