@@ -63,11 +63,14 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
         help="override a key of link.options, e.g. curve=keys; may be repeated",
     )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
+
+
+def add_inner(command: argparse.ArgumentParser) -> None:
+    """The option that gives every law an inner stage."""
+    said = "inner stage of every law: a shipped name (gfmhil laws), a file, or none"
+    command.add_argument("--inner", metavar="NAME", help=said)
 
 
 def add_map(command: argparse.ArgumentParser, option: str) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 
-from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
@@ -110,10 +110,7 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
     command.add_argument(
         "--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s (1e-4)"
     )
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument(
         "--f_n", type=float, default=50.0, metavar="HZ",
         help="nominal frequency of the converter, for an inner stage (50)",

@@ -47,6 +47,7 @@ from gfm_hil.scenario import INPROC, Scenario, load_scenario
 from gfm_hil.studies.linear_loop import scenario_loop
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, make_plant
+from gfm_plant.build import LINE
 from gfm_plant.wiring import GRID_SOURCE
 from gfm_runtime.signals import carried
 
@@ -553,8 +554,10 @@ class _Path:
         modes, sources = plant.wiring.modes(frozenset(), None)
         drive = modes.drive[:, [sources.index(plant.wiring.units[0].bridge),
                                 sources.index(GRID_SOURCE)]]  # fmt: skip
-        rates = modes.rates - 1j * steady
-        return cls(T_s, w, v_g, delta, stretches, rates, modes.states, modes.modes, drive)
+        rates, by_w = modes.rates - 1j * steady, modes.modes[:, :3].copy()
+        if LINE in plant.wiring.order:  # behind a second inductor, with the same current
+            by_w[:, 2] += modes.modes[:, plant.wiring.order.index(LINE)]
+        return cls(T_s, w, v_g, delta, stretches, rates, modes.states[:3], by_w, drive)
 
     def angle(self, window: slice) -> float:
         """Mean angle of the converter's frame, rad."""

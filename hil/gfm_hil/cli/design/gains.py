@@ -13,9 +13,16 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import WeightedChannel
 from gfm_design.tuning.paper import EVALUATIONS
-from gfm_hil.api.design import NotTuned, Tuning, gamma, tune
+from gfm_hil.api.design import (
+    NotTuned,
+    Tuning,
+    channels_as_json,
+    gamma,
+    problem_name,
+    tune,
+    write_law,
+)  # fmt: skip
 from gfm_hil.api.law import Law
-from gfm_hil.api.tuned_law import channels_as_json, problem_name, write_law
 from gfm_hil.cli.common import EXIT_OTHERWISE, watching
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
 from gfm_hil.core.errors import UserError
