@@ -55,35 +55,24 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "law file that is not there": ({"law": "nowhere.toml"}, ["nowhere.toml", "No such file"]),
     "improper element": ({"law": "law.toml"}, ["phi_22", "proper"]),
     "negative inductance": ({"plant": {"factors": {"L_f": -1.0}}}, ["factors.L_f = -1.0", "> 0"]),
-    "negative inductance of a load": (
-        {"plant": {"grid": {"load_R": 1.0, "load_L": -2.0}}}, ["plant.grid.load_L", "not -2.0"],
-    ),
-    "negative inductance of a line": (
-        event(type="grid-impedance", L_g=-3.0, R_g=1.0), ["events.0", "L_g", "not -3.0"],
-    ),
-    "line too fast to resolve": (
-        event(type="grid-impedance", L_g=1e-9, R_g=0.0), ["events.0", "too fast", "L_g"],
-    ),
-    "unknown converter": (
-        {"plant": {"converter": "mine"}}, ["converter = 'mine'", "paper"],
-    ),
-    "converter file that is not there": (
-        {"plant": {"converter": "nowhere.toml"}}, ["converter", "nowhere.toml", "No such file"],
-    ),
-    "converter file with mistakes": (
-        {"plant": {"converter": "converter.toml"}},
-        ["L_f: must be greater than 0, not -0.001", "C_dc", "not 'big'"],
-    ),
+    "negative inductance of a load": ({"plant": {"grid": {"load_R": 1.0, "load_L": -2.0}}},
+        ["plant.grid.load_L", "not -2.0"]),
+    "negative inductance of a line": (event(type="grid-impedance", L_g=-3.0, R_g=1.0),
+        ["events.0", "L_g", "not -3.0"]),
+    "line too fast to resolve": (event(type="grid-impedance", L_g=1e-9, R_g=0.0),
+        ["events.0", "too fast", "L_g"]),
+    "unknown converter": ({"plant": {"converter": "mine"}}, ["converter = 'mine'", "paper"]),
+    "converter file that is not there": ({"plant": {"converter": "nowhere.toml"}},
+        ["converter", "nowhere.toml", "No such file"]),
+    "converter file with mistakes": ({"plant": {"converter": "converter.toml"}},
+        ["L_f: must be greater than 0, not -0.001", "C_dc", "not 'big'"]),
     "unknown key": ({"durration": 3}, ["durration = 3", "unknown key"]),
     "unknown key inside": ({"link": {"baud": 9600}}, ["link.baud = 9600", "unknown key"]),
     "missing key": ({"title": None}, ["title"]),
-    "event after the end": (
-        {"events": [{"t": 3.0, "type": "reference", "P_ref": 1.0}]},
-        ["events.0", "3 s", "ends at 0.1 s"],
-    ),
-    "event without a time": (
-        {"events": [{"type": "reference", "P_ref": 1.0}]}, ["events.0", "t = None, tick = None"],
-    ),
+    "event after the end": ({"events": [{"t": 3.0, "type": "reference", "P_ref": 1.0}]},
+        ["events.0", "3 s", "ends at 0.1 s"]),
+    "event without a time": ({"events": [{"type": "reference", "P_ref": 1.0}]},
+        ["events.0", "t = None, tick = None"]),
     "event with two times": (event(type="law", law="vsg-2", tick=3), ["t = 0.05, tick = 3"]),
     "event of no type": (event(P_ref=1.0), ["events.0.type", "missing"]),
     "event of unknown type": (event(type="tea"), ["events.0.type = 'tea'", "'grid-frequency'"]),
@@ -92,41 +81,30 @@ WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "not a number": ({"duration": float("nan")}, ["duration", "finite", "nan"]),
     "no tick": ({"duration": 1e-5}, ["duration = 1e-05", "T_s = 0.0001"]),
     "reference out of range": ({"references": {"P_ref": 10.0}}, ["P_ref = 10.0", "[-2, 2]"]),
-    "reference out of range in an event": (
-        event(type="reference", V_ref=9.0), ["events.0", "V_ref = 9.0", "[0, 1.5]"],
-    ),
+    "reference out of range in an event": (event(type="reference", V_ref=9.0),
+        ["events.0", "V_ref = 9.0", "[0, 1.5]"]),
     "no reference": (event(type="reference"), ["events.0", "no reference given"]),
-    "realtime in process": (
-        {"mode": "realtime", "link": {"type": "inproc"}}, ["link.type = 'inproc'", "lockstep"],
-    ),
-    "breaker without load": (
-        event(type="grid-breaker", closed=False), ["events.0", "breaker", "load_R"],
-    ),
-    "ramp and sag": (
-        event(type="grid-voltage", V_g=0.5, rate=1.0, duration=0.1),
-        ["events.0", "rate = 1.0, duration = 0.1"],
-    ),
+    "realtime in process": ({"mode": "realtime", "link": {"type": "inproc"}},
+        ["link.type = 'inproc'", "lockstep"]),
+    "breaker without load": (event(type="grid-breaker", closed=False),
+        ["events.0", "breaker", "load_R"]),
+    "ramp and sag": (event(type="grid-voltage", V_g=0.5, rate=1.0, duration=0.1),
+        ["events.0", "rate = 1.0, duration = 0.1"]),
     "malformed endpoint": ({"link": {"endpoint": "localhost"}}, ["'localhost'", "tcp://host:port"]),
-    "endpoint without port": (
-        {"link": {"endpoint": "tcp://127.0.0.1"}}, ["'tcp://127.0.0.1'", "tcp://host:port"],
-    ),
+    "endpoint without port": ({"link": {"endpoint": "tcp://127.0.0.1"}},
+        ["'tcp://127.0.0.1'", "tcp://host:port"]),
     "port out of range": ({"link": {"endpoint": "tcp://127.0.0.1:99999"}}, ["99999"]),
-    "expectation misspelt": (
-        {"expect": "tripped", "expect_reason": "overcurrent"}, ["did you mean 'over-current'?"],
-    ),
-    "expectation of no kind": (
-        {"expect": "tripped", "expect_reason": "x"}, ["expect_reason = 'x'", "'diverged'"],
-    ),
-    "reason of the other status": (
-        {"expect": "safe", "expect_reason": "over-current"}, ["expect = 'safe' takes one of"],
-    ),
-    "reason without a trip": (
-        {"expect_reason": "over-current"}, ["expect_reason", "needs expect = 'tripped' or 'safe'"],
-    ),
+    "expectation misspelt": ({"expect": "tripped", "expect_reason": "overcurrent"},
+        ["did you mean 'over-current'?"]),
+    "expectation of no kind": ({"expect": "tripped", "expect_reason": "x"},
+        ["expect_reason = 'x'", "'diverged'"]),
+    "reason of the other status": ({"expect": "safe", "expect_reason": "over-current"},
+        ["expect = 'safe' takes one of"]),
+    "reason without a trip": ({"expect_reason": "over-current"},
+        ["expect_reason", "needs expect = 'tripped' or 'safe'"]),
     "time without a trip": ({"expect_after": 0.05}, ["expect_after = 0.05", "needs expect"]),
-    "time after the end": (
-        {"expect": "tripped", "expect_after": 0.1}, ["expect_after = 0.1 s", "below duration"],
-    ),
+    "time after the end": ({"expect": "tripped", "expect_after": 0.1},
+        ["expect_after = 0.1 s", "below duration"]),
 }  # fmt: skip
 
 
