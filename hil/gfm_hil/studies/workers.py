@@ -74,19 +74,10 @@ def run_tasks(
     keep: Callable[[Result], None],
     stopped: Callable[[], bool],
 ) -> None:
-    """Work on all tasks, or until ``stopped``; those under way then are still finished and kept.
-
-    Args:
-        function, tasks: what to do.
-        pool: where; None: here.
-        workers: how many tasks the pool works on at a time.
-        keep: given every result.
-        stopped: asked after each task, or a few times a second.
-
-    Raises:
-        WorkerLost: a worker died, or the function raised an error; the results of all other
-            finished tasks are kept.
-    """
+    """Work on all tasks, here or at so many a time in a pool, until ``stopped``, which is asked
+    after each or a few times a second; those under way then are still finished. ``keep`` gets every
+    result. Raises WorkerLost: a worker died, or the function raised an error; the results of all
+    other finished tasks are kept."""
     waiting = iter(tasks)
     if pool is None:
         for task in waiting:
@@ -134,7 +125,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of processes with one thread each. They are forked, when there is work, from a server
     that at once begins to import what all need. All end with this process, and a KeyboardInterrupt
     in this context ends them at once."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
     # scipy loads its parts when they are first used
@@ -155,11 +146,9 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
             process.kill()
         raise
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _set_up() -> None:
