@@ -106,26 +106,20 @@ def test_what_a_law_has_is_shown(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("inner", "said"),
     [
-        (
-            '"virtual-statr"',
-            "inner stage virtual-statr: unknown; use a .toml file or one of ['none',",
-        ),
+        ('"virtual-statr"',
+         "inner stage virtual-statr: unknown; use a .toml file or one of ['none',"),
         ("3", "inner: must be a table, not 3"),
         ("{X_v = 1.0}", "inner.type: missing"),
-        (
-            '{type = "stator"}',
-            "inner.type = 'stator': must be one of ['virtual-stator', 'cascaded',",
-        ),
+        ('{type = "stator"}',
+         "inner.type = 'stator': must be one of ['virtual-stator', 'cascaded',"),
         ('{type = "virtual-stator", X_v = 0.0}', "inner.X_v: must be > 0, not 0.0"),
         ('{type = "virtual-stator", I_thr = 1.0}', "inner.I_thr = 1.0: unknown key"),
         ('{type = "cascaded", priority = "e"}', "priority: must be 'circular', 'd', 'q' or"),
         ('{type = "cascaded", I_max = "x"}', "inner.I_max: unknown parameter 'x'; known: ['D_p',"),
-        (
-            '{type = "cascaded", power = {P_max = 0.1, P_min = 0.2}}',
-            "inner.power: P_max = 0.1 must be above P_min = 0.2",
-        ),
+        ('{type = "cascaded", power = {P_max = 0.1, P_min = 0.2}}',
+         "inner.power: P_max = 0.1 must be above P_min = 0.2"),
     ],
-)
+)  # fmt: skip
 def test_each_mistake_is_one_line_that_names_it(inner, said, tmp_path, refused):
     law = file(tmp_path, f"inner = {inner}\n{VSG_2}", "law.toml")
     line = refused("run", "pref_step", "--law", law, "--out", str(tmp_path / "run"))

@@ -188,20 +188,14 @@ def test_a_model_that_fails_is_named_and_the_run_is_kept(foreign, tmp_path, what
     [
         (STEP, "", "input dispatch[0]: signal 'dispatch[0]' must be one of V_dcref, P_ref"),
         (STEP, MAP + "parameters.droop = -1.0", "Model_Initialize failed: the droop must be posit"),
-        (
-            STEP,
-            MAP + "parameters.dropo = 1.0",
-            "parameters.dropo in its map: it has droop, at, what",
-        ),
-        (
-            STEP,
-            MAP.replace("2e-4", "1.5e-4"),
-            "FixedStepBaseSampleTime = 0.0002 s; leave step_s out",
-        ),
+        (STEP, MAP + "parameters.dropo = 1.0",
+         "parameters.dropo in its map: it has droop, at, what"),
+        (STEP, MAP.replace("2e-4", "1.5e-4"),
+         "FixedStepBaseSampleTime = 0.0002 s; leave step_s out"),
         (STEP, MAP.replace("2e-4", "2e-4\nscale = 1"), "scale = 1: unknown key"),
         ({"t": 0.02, "type": "law", "law": "vsg-5"}, MAP, "droop of others has a law of its own"),
     ],
-)
+)  # fmt: skip
 def test_what_a_run_with_a_model_refuses(
     foreign, tmp_path, event, map_, message,
     capsys
@@ -242,29 +236,17 @@ def test_ports_are_found_by_name_and_by_map():
     [
         ({}, ["i_u", "E_u"], "omega_u comes from no output; name its port in the map file"),
         ({"fixed": {"E_u": 1.0}}, ["i_u", "omega_u", "E_u"], "E_u comes twice"),
-        (
-            {"fixed": {"E_q": 1.0}},
-            ["i_u", "omega_u", "E_u"],
-            "fixed: only a run with an inner stage",
-        ),
-        (
-            {"outputs": {"x": "E_u"}},
-            ["i_u", "omega_u"],
-            "outputs.x in its map: it has i_u, omega_u",
-        ),
+        ({"fixed": {"E_q": 1.0}}, ["i_u", "omega_u", "E_u"],
+         "fixed: only a run with an inner stage"),
+        ({"outputs": {"x": "E_u"}}, ["i_u", "omega_u"],
+         "outputs.x in its map: it has i_u, omega_u"),
         ({"inputs": {"p": "P"}}, ["i_u", "omega_u", "E_u"], "input p: signal 'P' must be one of"),
-        (
-            {"inputs": {"p": {"signal": "p", "scale": 0.0}}},
-            ["i_u", "omega_u", "E_u"],
-            "input p: scale = 0 must not be 0",
-        ),
-        (
-            {"blocks": "x"},
-            ["i_u", "omega_u", "E_u"],
-            "blocks = 'x' in its map: must be one of i_u, omega_u",
-        ),
+        ({"inputs": {"p": {"signal": "p", "scale": 0.0}}}, ["i_u", "omega_u", "E_u"],
+         "input p: scale = 0 must not be 0"),
+        ({"blocks": "x"}, ["i_u", "omega_u", "E_u"],
+         "blocks = 'x' in its map: must be one of i_u, omega_u"),
     ],
-)
+)  # fmt: skip
 def test_ports_that_do_not_fit_are_refused(ports, outputs, message):
     with pytest.raises(UserError) as refused:
         wire("model", PortMap.model_validate(ports), ["p"], outputs, inner=False)

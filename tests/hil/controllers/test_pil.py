@@ -205,16 +205,12 @@ while request := os.read(to, {asks}):
     ("does", "reason"),
     [
         ("os._exit(3)", "qemu-system-arm has ended with code 3: the machine is on fire"),
-        (
-            "os.write(from_, struct.pack('<ii', 77, 0) + bytes({size} - 8))",
-            "answers 77 for signal 0, which no law does: the machine is on fire",
-        ),
-        (
-            "os.write(from_, struct.pack('<ii', 1, 3) + bytes({size} - 8))",
-            "refuses: a measurement is not finite or out of range: q",
-        ),
+        ("os.write(from_, struct.pack('<ii', 77, 0) + bytes({size} - 8))",
+         "answers 77 for signal 0, which no law does: the machine is on fire"),
+        ("os.write(from_, struct.pack('<ii', 1, 3) + bytes({size} - 8))",
+         "refuses: a measurement is not finite or out of range: q"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_answer_is_named(does, reason, tmp_path, monkeypatch):
     """Another program in the machine's place."""
     machine = tmp_path / "qemu-system-arm"

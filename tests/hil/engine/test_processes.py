@@ -30,6 +30,20 @@ pytestmark = pytest.mark.processes
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
 
 
+@pytest.fixture
+def begun(start, tmp_path):
+    """Starts a long run; returns its process and folder when it has recorded 200 ticks."""
+
+    def begin(**content):
+        folder = tmp_path / "run"
+        scenario = write(tmp_path, **LONG | content)
+        process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
+        wait_for(lambda: has_run(folder, 200), process)
+        return process, folder
+
+    return begin
+
+
 def assert_same(one: Path, other: Path) -> None:
     """Check that two runs recorded the same, bit by bit."""
     a, b = signals(one), signals(other)
@@ -138,10 +152,8 @@ def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
     assert (timing["controller_sent"][seen] >= timing["controller_computed"][seen]).all()
 
 
-def test_ctrl_c_ends_both_and_keeps_the_data(start, tmp_path):
-    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
-    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
-    wait_for(lambda: has_run(folder, 200), process)
+def test_ctrl_c_ends_both_and_keeps_the_data(begun):
+    process, folder = begun()
     assert set(roles_of(folder)) == set(ROLES)
     process.send_signal(signal.SIGINT)
     code, out, _ = end(process)
@@ -157,11 +169,9 @@ def test_ctrl_c_ends_both_and_keeps_the_data(start, tmp_path):
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_in_lockstep_a_role_may_stand_still_for_seconds(role, start, tmp_path):
+def test_in_lockstep_a_role_may_stand_still_for_seconds(role, begun):
     """As on a busy machine."""
-    scenario, folder = write(tmp_path, **LONG | {"duration": 3.0}), tmp_path / "run"
-    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
-    wait_for(lambda: has_run(folder, 200), process)
+    process, folder = begun(duration=3.0)
     stopped = roles_of(folder)[role]
     os.kill(stopped, signal.SIGSTOP)
     time.sleep(2.0)
@@ -173,10 +183,8 @@ def test_in_lockstep_a_role_may_stand_still_for_seconds(role, start, tmp_path):
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, start, tmp_path):
-    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
-    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
-    wait_for(lambda: has_run(folder, 200), process)
+def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, begun):
+    process, folder = begun()
     os.kill(roles_of(folder)[role], signal.SIGKILL)
     code, out, err = end(process)
     found = json.loads(out)
@@ -207,10 +215,8 @@ def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(star
     assert roles_of(folder) == {}
 
 
-def test_without_the_command_that_started_them_both_roles_end_too(start, tmp_path):
-    scenario, folder = write(tmp_path, **LONG), tmp_path / "run"
-    process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
-    wait_for(lambda: has_run(folder, 200), process)
+def test_without_the_command_that_started_them_both_roles_end_too(begun):
+    process, folder = begun()
     process.kill()
     process.communicate()
     wait_for(lambda: roles_of(folder) == {})

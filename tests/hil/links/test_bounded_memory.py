@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from gfm_hil.links.base import LONGEST
-from gfm_hil.ports.streams import blocks
+from gfm_hil.ports.streams import messages as blocks
 from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF
 
 pytestmark = pytest.mark.processes
@@ -135,7 +135,7 @@ def test_the_longest_message_gets_through_encrypted(tmp_path):
 
 PUBLISHER = """
 import sys, time
-from gfm_hil.ports.streams.publish import Publisher
+from gfm_hil.ports.streams.port import Publisher
 with Publisher("127.0.0.1", 0, 0) as publisher:
     print(publisher.samples, publisher.blocks, flush=True)
     while True:
@@ -219,7 +219,7 @@ def test_what_waits_for_a_reader_is_bounded(reader, attack_now):
 def test_the_largest_block_gets_through():
     rows = blocks.NewRows("plant", 0, np.ones((5000, len(SIGNALS_OF["plant"]))),
                        np.zeros((5000, len(TIMES_OF["plant"])), np.int64))  # fmt: skip
-    (message,) = blocks.messages(rows)
+    (message,) = blocks.block_messages(rows)
     with zmq.Context() as context, context.socket(zmq.PUB) as sender:
         port = sender.bind_to_random_port("tcp://127.0.0.1")
         with blocks.BlockReader(f"tcp://127.0.0.1:{port}") as reader:

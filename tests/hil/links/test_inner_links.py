@@ -11,9 +11,8 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
-from gfm_hil.ports.streams.blocks import messages
-from gfm_hil.ports.streams.follow import NewRows
-from gfm_hil.ports.streams.samples import Sampler
+from gfm_hil.ports.streams.messages import Sampler, block_messages
+from gfm_hil.ports.streams.port import NewRows
 from gfm_hil.recording.columns import CONTROLLER_INNER, PLANT_INNER
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.run.run_folder import recover
@@ -148,7 +147,7 @@ def test_the_parts_of_a_cut_run_are_followed_streamed_and_recovered(make, tmp_pa
         assert live.row(role, 200)[name] == whole[name][200]
         part = live.parts[role]
         rows = NewRows(role, 0, part.signals, part.times)
-        got = np.concatenate([np.load(io.BytesIO(body)) for _, body in messages(rows)])
+        got = np.concatenate([np.load(io.BytesIO(body)) for _, body in block_messages(rows)])
         assert got[name].tobytes() == whole[name].tobytes()
         sent = Sampler(scenario.T_s, 1e4, 0).messages(rows, 1.0)
         sample = json.loads(sent[200][1])

@@ -20,9 +20,7 @@ from ...support.links import PATIENT, Tampering, run_pair
 
 def test_a_link_that_falls_silent_ends_the_run(make, tmp_path, endpoint):
     def touch(role: Role, link: Link) -> Any:
-        if role == "plant":
-            return Tampering(link, lambda k, m: None if k >= 20 else m)
-        return link
+        return Tampering(link, lambda k, m: None if k >= 20 else m) if role == "plant" else link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
     signals = run_pair(scenario, tmp_path, "zmq", touch=touch, endpoint=endpoint).signals
@@ -47,9 +45,7 @@ def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint
         return message if tick < 20 else message[:30] + b"\xff\xff" + message[32:]
 
     def touch(role: Role, link: Link) -> Any:
-        if role == "controller":
-            return Tampering(link, damage)
-        return link
+        return Tampering(link, damage) if role == "controller" else link
 
     scenario = make(link={**PATIENT, "peer_timeout_s": 1.0})
     signals = run_pair(scenario, tmp_path, "zmq", touch=touch, endpoint=endpoint).signals

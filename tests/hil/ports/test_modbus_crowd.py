@@ -18,10 +18,9 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.modbus import connection
-from gfm_hil.ports.modbus.connection import CLIENTS, Server
+from gfm_hil.ports.modbus import port as connection
 from gfm_hil.ports.modbus.image import VENDOR
-from gfm_hil.ports.modbus.port import make_server, tick
+from gfm_hil.ports.modbus.port import CLIENTS, Server, make_server, tick
 from gfm_hil.ports.port import BesideRun
 
 from ...support.modbus import SUNS

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from gfm_hil.ports.modbus.connection import Server
 from gfm_hil.ports.modbus.image import BASE, VENDOR
+from gfm_hil.ports.modbus.port import Server
 
 from ...support.laws import every_law
 from ...support.modbus_device import S_N, Bench
@@ -28,7 +28,7 @@ def test_the_image_is_a_sunspec_map():
 
 @pytest.mark.parametrize("law", every_law())
 def test_the_droops_of_every_law_are_those_of_its_file_or_none(law):
-    from gfm_hil.ports.modbus.droops import LawDroops
+    from gfm_hil.ports.modbus.points import LawDroops
 
     gains = LawDroops([law])
     found = gains.droops(law, {})

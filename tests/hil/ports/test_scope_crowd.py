@@ -13,10 +13,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from gfm_hil.ports.scope import server, session
-from gfm_hil.ports.scope.access import Access
 from gfm_hil.ports.scope.picture import ScopePicture
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.scope.server import Scope
+from gfm_hil.ports.scope.session import Access
 
 from ...support.processes import takes_commands, wait_for
 from ...support.scope import Rig, mute, rig, serving, words

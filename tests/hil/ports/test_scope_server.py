@@ -17,10 +17,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from gfm_hil.cli import main
-from gfm_hil.ports.scope.access import Access
 from gfm_hil.ports.scope.picture import HEAD
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.ports.scope.server import Scope, static_files
+from gfm_hil.ports.scope.session import Access
 
 from ...support.scope import addresses, serving, words
 

@@ -6,10 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.ports.scope.channels import make_channels
-from gfm_hil.ports.scope.picture import HEAD, PictureRequest, ScopePicture
+from gfm_hil.ports.scope.picture import (
+    ARMED,
+    AUTO,
+    FILLING,
+    HEAD,
+    HELD,
+    Acquisition,
+    PictureRequest,
+    ScopePicture,
+    Trigger,
+    edges,
+)
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
-from gfm_hil.ports.scope.trigger import ARMED, AUTO, FILLING, HELD, Acquisition, Trigger, edges
 from gfm_hil.scenario import Scenario
 
 T_S = 1e-4

@@ -17,10 +17,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams import BlockReader
-from gfm_hil.ports.streams.blocks import block_dtype, messages
-from gfm_hil.ports.streams.follow import Follower, NewRows
-from gfm_hil.ports.streams.publish import Publisher
-from gfm_hil.ports.streams.samples import Sampler
+from gfm_hil.ports.streams.messages import Sampler, block_dtype, block_messages
+from gfm_hil.ports.streams.port import Follower, NewRows, Publisher
 from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
 from gfm_hil.recording.parts import RolePart
 
@@ -222,7 +220,7 @@ def test_ticks_never_recorded_and_numbers_that_json_has_not_are_left_out():
 
 
 def test_large_blocks_are_cut():
-    found = messages(rows(7, 12_000))
+    found = block_messages(rows(7, 12_000))
     assert [topic for topic, _ in found] == [b"gfmhil/plant"] * 3
     assert max(len(payload) for _, payload in found) < 5010 * block_dtype("plant").itemsize
 

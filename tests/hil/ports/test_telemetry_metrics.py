@@ -13,8 +13,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from gfm_hil.cli import main
 from gfm_hil.ports.commands import Operator
-from gfm_hil.ports.streams.follow import Follower
-from gfm_hil.ports.streams.metrics import METRICS
+from gfm_hil.ports.streams import prometheus
+from gfm_hil.ports.streams.port import METRICS, Follower
 from gfm_hil.ports.streams.prometheus import RunCollector, serve_metrics
 from gfm_hil.recording.parts import RolePart
 
@@ -169,9 +169,9 @@ sys.stdin.read()
     "each scrape is computed anew, 308 threads; another scraper waits 1.2 s for its connection",
 )  # fmt: skip
 def test_one_scraper_s_flood_leaves_room_for_another(recorded, spawn, monkeypatch, attack_now):
-    times, computed = RunCollector._times, []
+    times, computed = prometheus._times, []
     monkeypatch.setattr(
-        RunCollector, "_times", lambda *given: computed.append(time.monotonic()) or times(*given)
+        prometheus, "_times", lambda run: computed.append(time.monotonic()) or times(run)
     )
     with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
         flood = spawn("-c", _FLOOD, str(port), "300")

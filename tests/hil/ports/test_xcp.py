@@ -16,7 +16,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.ports.xcp.memory import Memory
-from gfm_hil.ports.xcp.transports import CanFd, packed
+from gfm_hil.ports.xcp.port import CanFd, packed
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.recording.log import read_log
 from gfm_runtime import law_file
@@ -232,7 +232,7 @@ def test_several_packets_of_a_datagram_and_what_is_no_packet(run):
 
 
 def test_on_a_can_bus_a_frame_is_a_packet(run, tmp_path):
-    line = CanFd("virtual", "xcp", [0x123, 0x124])
+    line = CanFd("virtual", "xcp", "0x123,0x124")
     one = slave(run, most=line.most)
     with can.Bus(interface="virtual", channel="xcp", fd=True) as bus, line:
 

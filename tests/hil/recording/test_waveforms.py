@@ -18,7 +18,7 @@ import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.scope.channels import make_channels
-from gfm_hil.ports.scope.trigger import Trigger, edges
+from gfm_hil.ports.scope.picture import Trigger, edges
 from gfm_hil.recording.columns import DERIVED, PHASES, WAVES, describe, wave
 from gfm_hil.recording.run import Run
 from gfm_hil.recording.waveforms import three_phase

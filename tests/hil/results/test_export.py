@@ -143,7 +143,7 @@ def test_mf4_has_the_events_at_their_ticks_and_what_they_came_from(table, mdf):
 
 
 def test_a_package_that_is_missing_is_named(table, tmp_path, monkeypatch):
-    monkeypatch.setattr("gfm_hil.results.export.formats.find_spec", lambda name: None)
+    monkeypatch.setattr("gfm_hil.results.export.find_spec", lambda name: None)
     for name in sorted(name for name, form in FORMATS.items() if form.needs):
         with pytest.raises(UserError, match=rf"--format {name} needs .*gfmhil\[export\]"):
             export_run(table.folder, name, tmp_path / "file")

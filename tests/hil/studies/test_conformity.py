@@ -690,21 +690,15 @@ def test_a_plot_without_known_limits_is_drawn_and_informative(tmp_path):
 @pytest.mark.parametrize(
     ("event", "answer"),
     [
-        (
-            {"type": "grid-phase-jump", "degrees": -8.0},
-            lambda u, t: math.radians(8.0) / 0.6 * envelopes.jump_response(u, t, 0.6),
-        ),
-        (
-            {"type": "grid-frequency", "f_hz": 49.0, "rate": 1.0},
-            lambda u, t: envelopes.rocof_response(u, t, -0.02, 3.0, lasts=1.0),
-        ),
-        (
-            {"type": "grid-impedance", "scr": 10.0, "x_over_r": 6.0},
-            lambda u, t: envelopes.scr_jump_response(u, t, 3.0, 10.0, 0.5),
-        ),
+        ({"type": "grid-phase-jump", "degrees": -8.0},
+         lambda u, t: math.radians(8.0) / 0.6 * envelopes.jump_response(u, t, 0.6)),
+        ({"type": "grid-frequency", "f_hz": 49.0, "rate": 1.0},
+         lambda u, t: envelopes.rocof_response(u, t, -0.02, 3.0, lasts=1.0)),
+        ({"type": "grid-impedance", "scr": 10.0, "x_over_r": 6.0},
+         lambda u, t: envelopes.scr_jump_response(u, t, 3.0, 10.0, 0.5)),
     ],
     ids=["jump", "ramp", "scr"],
-)
+)  # fmt: skip
 @pytest.mark.parametrize(
     ("factor", "verdict"), [(1.0, PASS), (1.02, PASS), (2.0, FAIL), (0.1, FAIL), (-1.0, FAIL)]
 )
