@@ -16,7 +16,7 @@ from pathlib import Path
 
 from gfm_runtime.errors import LawError, meant
 from gfm_runtime.inner_file import named_inner
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file, shipped_law
 
 
@@ -26,7 +26,7 @@ class LawSet:
 
     name: str  #: what results call it
     #: one law, or one for each stage in ascending order of the stage's reactance
-    laws: tuple[Law, ...]
+    laws: tuple[BuiltLaw, ...]
     schedule: Schedule | None = None  #: None, or the limits of the stages
     #: the inner stage that replaces the law file's own, by name or path; None: its own
     inner: str | None = None
@@ -121,6 +121,6 @@ def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
     return LawSet(file.name, laws, file.schedule, inner, name)
 
 
-def get_law(name: str, **changed: float) -> Law:
+def get_law(name: str, **changed: float) -> BuiltLaw:
     """A single law; of a gain-scheduled one, the first stage."""
     return load_law(name, None, **changed).laws[0]

@@ -13,9 +13,9 @@ from pydantic import ValidationError
 
 from gfm_runtime.errors import LawError, allowed
 from gfm_runtime.mistakes import lines
-from gfm_runtime.toml_file import Table
+from gfm_runtime.toml_file import TomlTable
 
-T = TypeVar("T", bound=Table)
+T = TypeVar("T", bound=TomlTable)
 
 _BINARY: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -57,7 +57,7 @@ def evaluated(where: str, table: T, parameters: Mapping[str, float]) -> T:
     """
     values = {name: getattr(table, name) for name in table.model_fields_set}
     for name, value in values.items():
-        if isinstance(value, Table):
+        if isinstance(value, TomlTable):
             values[name] = evaluated(f"{where}.{name}", value, parameters)
         elif type(table).model_fields[name].annotation == float | str:
             values[name] = evaluate(f"{where}.{name}", value, parameters)

@@ -21,7 +21,7 @@ from gfm_runtime.elements import INTEGRATOR, ZERO, Element
 from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.inner import InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
-from gfm_runtime.toml_file import Table
+from gfm_runtime.toml_file import TomlTable
 
 Cell = tuple[int, int]  # (i, j), zero-based row of u and column of y
 
@@ -41,7 +41,7 @@ Range = Annotated[tuple[float, float], Field(strict=False)]  # [low, high]
 Limit = Annotated[Range, AfterValidator(_ascending), Field(description="[low, high], p.u.")]
 
 
-class Limits(Table):
+class Limits(TomlTable):
     """The clamps of u, p.u., and the anti-windup."""
 
     i_u: Limit = (-5.0, 5.0)
@@ -62,7 +62,7 @@ class Limits(Table):
         return self.i_u[1], self.omega_u[1], self.E_u[1]
 
 
-class Parameter(Table):
+class Parameter(TomlTable):
     """A named number; ``free`` bounds it for synthesis, ``tied`` makes it follow others there."""
 
     # of a file with a base, what the base says of the number may be missing here
@@ -77,7 +77,7 @@ class Parameter(Table):
     )
 
 
-class HomeGrid(Table):
+class HomeGrid(TomlTable):
     """The grid the defaults are meant for, as factors on the converter's L_g and R_g."""
 
     L_g: float = Field(1.0, gt=0, description="factor on the converter's line inductor")
@@ -86,7 +86,7 @@ class HomeGrid(Table):
 
 
 @dataclass(frozen=True)
-class Law:
+class BuiltLaw:
     """One grid-forming law as data."""
 
     name: str  #: e.g. ``"vsg-2"``.

@@ -21,9 +21,9 @@ from gfm_runtime.errors import LawError, Mistakes, allowed, meant
 from gfm_runtime.expressions import evaluate, evaluated
 from gfm_runtime.inner import Inner
 from gfm_runtime.inner_file import named_inner
-from gfm_runtime.law import Cell, HomeGrid, Law, Limits, Parameter, cell_name
+from gfm_runtime.law import BuiltLaw, Cell, HomeGrid, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
-from gfm_runtime.toml_file import Number, NumberOrName, Table, parse_toml, read_text, read_toml
+from gfm_runtime.toml_file import Number, NumberOrName, TomlTable, parse_toml, read_text, read_toml
 
 
 def _listed(value: Any) -> Any:
@@ -37,7 +37,7 @@ def _stage(value: Any) -> Any:
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 
 
-class ElementSpec(Table):
+class ElementSpec(TomlTable):
     """One factor: its type and its numbers (T, T_f in s)."""
 
     type: elements.Kind = Field(description="type of element")
@@ -65,7 +65,7 @@ def _valued(value: Any) -> Any:
 Named = Annotated[Parameter, BeforeValidator(_valued, json_schema_input_type=Parameter | float)]
 
 
-class ErrorMap(Table):
+class ErrorMap(TomlTable):
     """The errors on which Phi(s) acts; R and X (p.u.) of the line where the map needs them."""
 
     type: str = Field("linear", description=", ".join(ERROR_MAPS))
@@ -73,7 +73,7 @@ class ErrorMap(Table):
     X: Number | None = Field(None, description=f"line's, p.u.; {', '.join(WITH_IMPEDANCE)} only")
 
 
-class SetPoints(Table):
+class SetPoints(TomlTable):
     """u_0: numbers (p.u.) or names of references."""
 
     i_u: NumberOrName = Field(0.0, description="p.u., or the name of a reference")
@@ -81,7 +81,7 @@ class SetPoints(Table):
     E_u: NumberOrName = Field("V_ref", description="p.u., or the name of a reference")
 
 
-class SchedulePoint(Table):
+class SchedulePoint(TomlTable):
     """Gains of a schedule, in force up to the reactance X (p.u.)."""
 
     X: float = Field(gt=0, description="up to which reactance, p.u.; the last one has no end")
@@ -90,7 +90,7 @@ class SchedulePoint(Table):
     )
 
 
-class Schedule(Table):
+class Schedule(TomlTable):
     """Gains as a function of the estimated grid reactance."""
 
     stages: Annotated[list[SchedulePoint], Field(min_length=2, max_length=8)] = Field(
@@ -112,7 +112,7 @@ def _base_or_whole(schema: dict[str, Any]) -> None:
     schema |= {"if": {"required": ["base"]}, "then": {"required": ["name"]}, "else": whole}
 
 
-class LawFile(Table):
+class LawFile(TomlTable):
     """The whole file; ``parse_law`` has put the content of its ``base`` into it."""
 
     model_config = ConfigDict(json_schema_extra=_base_or_whole)
@@ -208,7 +208,7 @@ def _error_map(file: LawFile, numbers: Mapping[str, float]) -> tuple[str, tuple[
     return code, values
 
 
-def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
+def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> BuiltLaw:
     """The law of a file, with other values for some of its parameters if given.
 
     Raises:
@@ -237,7 +237,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Law:
         inner = None if file.inner is None else evaluated("inner", file.inner, numbers)
     law = None
     with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
-        law = Law(
+        law = BuiltLaw(
             name=file.name,
             title=file.title,
             source=file.source,

@@ -26,7 +26,7 @@ from gfm_runtime.elements import (
     union,
 )
 from gfm_runtime.errors import LawError
-from gfm_runtime.law import Law, cell_name
+from gfm_runtime.law import BuiltLaw, cell_name
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
 Matrix = NDArray[np.float64]
@@ -76,7 +76,7 @@ class Row(NamedTuple):
     D_y: Matrix
 
 
-def realise(law: Law) -> LawStateSpace:
+def realise(law: BuiltLaw) -> LawStateSpace:
     """State space of a law.
 
     Raises:
@@ -89,7 +89,7 @@ def realise(law: Law) -> LawStateSpace:
 def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
     """The state space of a law, or of several on a leading axis, from its three rows.
 
-    ``rows`` are as ``row_of`` gives them, ``u_0`` as a ``Law`` has it.
+    ``rows`` are as ``row_of`` gives them, ``u_0`` as a ``BuiltLaw`` has it.
     """
     many = np.broadcast_shapes(*(row.A.shape[:-2] for row in rows))
     of_row = [i for i, row in enumerate(rows) for _ in range(row.A.shape[-1])]
@@ -114,7 +114,7 @@ def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
     return LawStateSpace(A, B_r, B_y, C, D_r, D_y, D_u0, constant, tuple(of_row))
 
 
-def _check_series(law: Law) -> None:
+def _check_series(law: BuiltLaw) -> None:
     """Refuse two integrators in series through omega_u; one in column 3 closes its own loop."""
 
     def integrates(matrix: str, i: int, j: int) -> bool:
@@ -131,7 +131,7 @@ def _check_series(law: Law) -> None:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
-def _row(law: Law, i: int) -> Row:
+def _row(law: BuiltLaw, i: int) -> Row:
     """Observer form of row i."""
     phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
     row = row_of(phi, psi)

@@ -20,7 +20,7 @@ MAX_BYTES = 4 * 2**20  # some ten thousand events
 MAX_DEPTH = 32
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """Base of the tables of a law file: unknown keys and wrong types are mistakes."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)

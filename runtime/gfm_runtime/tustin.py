@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.errors import LawError
-from gfm_runtime.law import Law, cell_name
+from gfm_runtime.law import BuiltLaw, cell_name
 from gfm_runtime.realisation import LawStateSpace, realise
 from gfm_runtime.signals import NU, NY
 
@@ -35,7 +35,7 @@ class DiscreteLaw(LawStateSpace):
     x = E_r r + E_y y + F (u - u_0) + G (change of u per tick).
     """
 
-    law: Law
+    law: BuiltLaw
     T_s: float
     W: Matrix
     E_r: Matrix
@@ -85,7 +85,7 @@ def tustin(
     )
 
 
-def discretise(law: Law, T_s: float) -> DiscreteLaw:
+def discretise(law: BuiltLaw, T_s: float) -> DiscreteLaw:
     """Discretise a law by Tustin at T_s [s].
 
     Raises:

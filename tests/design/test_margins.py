@@ -32,7 +32,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.run.loop_delay import loop_delay
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario
 from gfm_plant import load_converter, phase_jump
-from gfm_runtime import Law, load_law
+from gfm_runtime import BuiltLaw, load_law
 
 from ..support.loops import reference_loop
 
@@ -55,7 +55,7 @@ def chain(num: list[float], den: list[float], gain: float, samples: float = 0.0)
     return ClosedLoop(plant, law, T, samples * T)
 
 
-def loop_of(law: str | Law, scenario: str, **plant: Any) -> ClosedLoop:
+def loop_of(law: str | BuiltLaw, scenario: str, **plant: Any) -> ClosedLoop:
     s = load_scenario(scenario)
     changed = type(s.plant).model_validate({**s.plant.model_dump(exclude_unset=True), **plant})
     return ClosedLoop.of(law, changed, s.references.vector())

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from gfm_runtime import Law, LawError, Limits, discretise, get_law, pack_law, realise
+from gfm_runtime import BuiltLaw, LawError, Limits, discretise, get_law, pack_law, realise
 from gfm_runtime.elements import IF, INTEGRATOR, PI, Element, I, O, P
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import NU, NY
@@ -19,7 +19,7 @@ from ..support.laws import LAWS, REF, Running, Vector, blocks, mapped, repeatabl
 T_S = 1e-4
 
 
-def scipy_bilinear(law: Law, refs: Vector, ys: Vector, T_s: float) -> Vector:
+def scipy_bilinear(law: BuiltLaw, refs: Vector, ys: Vector, T_s: float) -> Vector:
     """The law's response by SciPy: loop closed in continuous time, cont2discrete, dlsim."""
     b = blocks(law)
     w = np.array(
@@ -46,7 +46,7 @@ def test_kernel_is_scipys_bilinear(name, T_s):
 def test_omega_u_loop_of_any_kind(phi_23):
     """Column 3 in all rows, with and without direct feed-through."""
     cells = {(0, 0): PI(9.0, 0.2), (0, 2): P(2.0), (1, 1): IF(0.01, 0.1), (1, 2): phi_23}
-    law = Law("loop", "", "", {**cells, (2, 2): O(0.1, 0.02, 0.5), (2, 4): I(0.5)})
+    law = BuiltLaw("loop", "", "", {**cells, (2, 2): O(0.1, 0.02, 0.5), (2, 4): I(0.5)})
     refs, ys = wander(300, seed=3)
     ours = Running.of(discretise(law, T_S)).unlimited().run(refs, ys)
     theirs = scipy_bilinear(law, refs, ys, T_S)
@@ -77,7 +77,7 @@ def smooth(t: float) -> tuple[Vector, Vector]:
     return ref, REF + 0.03 * np.sin(np.array([45.0, 70.0, 0.0, 25.0, 55.0]) * t)
 
 
-def error_at(law: Law, T_s: float, t_end: float) -> Vector:
+def error_at(law: BuiltLaw, T_s: float, t_end: float) -> Vector:
     """Largest distance of the kernel's u from the continuous law's, per element of u."""
     b = blocks(law)
 
@@ -129,13 +129,13 @@ def test_sampling_time(T_s):
         discretise(get_law("vsg-2"), T_s)
 
 
-def law_of(**cells: Element) -> Law:
+def law_of(**cells: Element) -> BuiltLaw:
     """A law from cells by name, e.g. phi_22."""
     grids: dict[str, dict[tuple[int, int], Element]] = {"phi": {}, "psi": {}}
     for name, element in cells.items():
         matrix, cell = name.split("_")
         grids[matrix][int(cell[0]) - 1, int(cell[1]) - 1] = element
-    return Law("a", "", "", grids["phi"], grids["psi"])
+    return BuiltLaw("a", "", "", grids["phi"], grids["psi"])
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_coefficients_that_are_not_finite():
 def test_too_many_states_for_the_kernel():
     cells = {(0, j): IF(1.0, 0.1 + j) * O(1.0, 0.2 + j, 0.5) for j in range(NY)}
     with pytest.raises(LawError, match=r"a: 15 states; the kernel holds 12"):
-        pack_law(discretise(Law("a", "", "", cells), T_S))
+        pack_law(discretise(BuiltLaw("a", "", "", cells), T_S))
 
 
 gains = st.floats(-20.0, 20.0).map(lambda k: round(k, 3))
@@ -200,7 +200,7 @@ where = st.tuples(st.integers(0, NU - 1), st.sampled_from([0, 1, 3, 4]))
 @repeatable
 @given(st.dictionaries(where, proper, max_size=4), st.dictionaries(where, proper, max_size=2))
 def test_any_stable_law_is_scipys_bilinear(phi, psi):
-    law = Law("any", "", "", phi, psi)
+    law = BuiltLaw("any", "", "", phi, psi)
     refs, ys = wander(60, seed=5)
     discrete = discretise(law, 1e-3)
     assume(discrete.order <= N_MAX)
@@ -212,6 +212,6 @@ def test_any_stable_law_is_scipys_bilinear(phi, psi):
 
 def test_anti_windup_is_never_faster_than_a_tick():
     """T_t below T_s: the state follows the limit at once, and does not overshoot."""
-    law = Law("a", "", "", {(0, 0): PI(1.0, 1.0)}, limits=Limits(T_t=1e-6))
+    law = BuiltLaw("a", "", "", {(0, 0): PI(1.0, 1.0)}, limits=Limits(T_t=1e-6))
     discrete = discretise(law, T_S)
     assert discrete.C @ discrete.W[:, [0]] == pytest.approx(np.array([[1.0], [0.0], [0.0]]))

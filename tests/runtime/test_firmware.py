@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.cli import main
-from gfm_runtime import Law, LawError, LawSet, get_law, load_law
+from gfm_runtime import BuiltLaw, LawError, LawSet, get_law, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
@@ -34,7 +34,7 @@ T_S = 1e-4
 SOME_STAGED = ("vsg-2 cascaded", "threshold-impedance d", "virtual-stator q", "no stage")
 
 
-def of(*names: str) -> dict[str, Law]:
+def of(*names: str) -> dict[str, BuiltLaw]:
     return {name: (LAWS | STAGED)[name] for name in names}
 
 

@@ -10,7 +10,7 @@ from numba.core.runtime.nrt import rtsys
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from gfm_runtime import Law, Limits, discretise, get_law, law_dtype, state_dtype, step
+from gfm_runtime import BuiltLaw, Limits, discretise, get_law, law_dtype, state_dtype, step
 from gfm_runtime.elements import IF, INTEGRATOR, PI, I, P
 from gfm_runtime.kernel import N_MAX
 from gfm_runtime.law import cell_name
@@ -148,7 +148,7 @@ def test_a_step_allocates_nothing(real):
 
 def test_what_decays_ends_at_zero():
     """Subnormal numbers are slow; a decaying filter must not pass through them."""
-    law = Law("a", "", "", {(1, 1): IF(1.0, 1e-3)})
+    law = BuiltLaw("a", "", "", {(1, 1): IF(1.0, 1e-3)})
     loop = Running.of(discretise(law, T_S))
     loop.step(REF, REF + 0.01)
     loop.state["offset"] = 1e-3
@@ -177,8 +177,8 @@ def test_limits_are_exact_and_do_nothing_inside():
     np.testing.assert_array_equal(Running.of(discretise(law, T_S)).run(refs, ys), free)
 
 
-def limited(law: Law, **limits: Any) -> Law:
-    return Law(law.name, "", "", law.phi, law.psi, law.u_0, law.error_map, law.error_parameters,
+def limited(law: BuiltLaw, **limits: Any) -> BuiltLaw:
+    return BuiltLaw(law.name, "", "", law.phi, law.psi, law.u_0, law.error_map, law.error_parameters,
                Limits(**limits))  # fmt: skip
 
 
@@ -192,7 +192,7 @@ INTEGRATORS = [
 
 
 def into_the_limit(
-    law: Law, cell: tuple[int, int], upper: bool, anti_windup: bool = True
+    law: BuiltLaw, cell: tuple[int, int], upper: bool, anti_windup: bool = True
 ) -> tuple[int, int]:
     """Ticks that u_i stays at its limit once the error is reversed after 3 s, and T_t in ticks.
 
@@ -247,7 +247,7 @@ def test_there_is_an_integrator_of_each_kind():
 def test_anti_windup_of_omega_u_with_its_loop(T_t, column_3):
     """The tracking time is T_t for any gain of the loop through column 3."""
     cells = {(1, 1): PI(0.01, 0.05)} | ({(1, 2): column_3} if column_3 else {})
-    law = limited(Law("a", "", "", cells), T_t=T_t)
+    law = limited(BuiltLaw("a", "", "", cells), T_t=T_t)
     for upper in (True, False):
         stays, ticks = into_the_limit(law, (1, 1), upper)
         assert stays <= max(ticks, 1)
@@ -255,7 +255,7 @@ def test_anti_windup_of_omega_u_with_its_loop(T_t, column_3):
 
 def test_back_calculation_settles_where_it_should():
     """With an error e that holds it at a limit, an I settles k_i e T_t beyond it in a few T_t."""
-    law = limited(Law("a", "", "", {(2, 4): I(0.5)}, u_0=(0.0, 1.0, 1.0)), T_t=0.02)
+    law = limited(BuiltLaw("a", "", "", {(2, 4): I(0.5)}, u_0=(0.0, 1.0, 1.0)), T_t=0.02)
     loop = Running.of(discretise(law, T_S))
     e = np.array([0.0, 0.0, 0.0, 0.0, 0.4])
     drive(loop.law, loop.state, REF, REF - e, np.zeros(NU), 20_000)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_runtime import (
-    Law,
+    BuiltLaw,
     LawError,
     Limits,
     build_law,
@@ -73,7 +73,7 @@ X_half = { value = 0.05, unit = "p.u.", source = "chosen" }
 """
 
 
-def custom() -> Law:
+def custom() -> BuiltLaw:
     return build_law(parse_law(CUSTOM))
 
 
@@ -253,7 +253,7 @@ def test_files_that_cannot_be_read(tmp_path):
 )
 def test_laws_made_in_python_pass_the_same_checks(phi, says):
     with pytest.raises(LawError) as caught:
-        Law("a", "", "", phi)
+        BuiltLaw("a", "", "", phi)
     assert says in str(caught.value)
 
 

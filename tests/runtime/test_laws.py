@@ -5,7 +5,16 @@ import itertools
 import numpy as np
 import pytest
 
-from gfm_runtime import Law, LawError, discretise, get_law, law_file, law_names, load_law, realise
+from gfm_runtime import (
+    BuiltLaw,
+    LawError,
+    discretise,
+    get_law,
+    law_file,
+    law_names,
+    load_law,
+    realise,
+)
 from gfm_runtime.elements import IF, PD, Element, P, union
 from gfm_runtime.lawfile import ElementSpec
 from gfm_runtime.signals import NU, NY
@@ -158,7 +167,7 @@ def test_number_of_states(name):
     assert realise(law).order == discretise(law, 1e-4).order == ORDERS[law.name]
 
 
-def loewner_rank(law: Law) -> int:
+def loewner_rank(law: BuiltLaw) -> int:
     """McMillan degree from values alone: the rank of the Loewner matrix of samples.
 
     Independent of any realisation: only the elements' values are used.
@@ -201,10 +210,10 @@ def test_realisation_has_the_elements_values(name, s):
     np.testing.assert_allclose(from_y, -phi - psi, rtol=1e-9, atol=1e-12)
 
 
-def cascade(T: float) -> Law:
+def cascade(T: float) -> BuiltLaw:
     """A law whose row 2 has three factors five decades apart."""
     slow, fast = IF(1.0, 1e4 * T), IF(1.0, T / 10)
-    return Law("cascade", "", "", {(1, 1): P(2.0) * slow * IF(1.0, T) * fast})
+    return BuiltLaw("cascade", "", "", {(1, 1): P(2.0) * slow * IF(1.0, T) * fast})
 
 
 @pytest.mark.parametrize("T", [1e-3, 1.0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gfm_runtime import DiscreteLaw, Law, Limits, change_law, discretise, get_law
+from gfm_runtime import BuiltLaw, DiscreteLaw, Limits, change_law, discretise, get_law
 from gfm_runtime.elements import IF, PD, PI, Element, I, P
 from gfm_runtime.signals import NU
 
@@ -171,7 +171,7 @@ def settled(discrete: DiscreteLaw) -> Vector:
 
 
 def custom(element: Element, u_start: float = 1.0) -> DiscreteLaw:
-    return discretise(Law("c", "", "", {(2, 4): element}, u_0=(0.0, 1.0, u_start)), T_S)
+    return discretise(BuiltLaw("c", "", "", {(2, 4): element}, u_0=(0.0, 1.0, u_start)), T_S)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime import Law, LawSet, load_law
+from gfm_runtime import BuiltLaw, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
@@ -25,7 +25,7 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"
 SOME = ("vsg-1", "psc-dc", "dvoc", "hybrid-angle", "matching-2", "vsg-12")
 
 
-def _staged() -> dict[str, Law]:
+def _staged() -> dict[str, BuiltLaw]:
     """Laws with inner stages: the shipped ones behind vsg-2 and laws of each structure, and every
     kind with every priority, PLL and power limiter, with and without freeze and integral; and one
     without."""
@@ -49,7 +49,7 @@ STAGED = _staged()
 
 
 def exported(
-    folder: Path, real: str, style: Any, *names: str, of: Mapping[str, Law] = LAWS
+    folder: Path, real: str, style: Any, *names: str, of: Mapping[str, BuiltLaw] = LAWS
 ) -> Path:
     """A folder with laws, all by default."""
     laws = {name: of[name] for name in names} or of

@@ -12,7 +12,16 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import signal
 
-from gfm_runtime import DiscreteLaw, Law, get_law, law_names, load_law, pack_law, state_dtype, step
+from gfm_runtime import (
+    BuiltLaw,
+    DiscreteLaw,
+    get_law,
+    law_names,
+    load_law,
+    pack_law,
+    state_dtype,
+    step,
+)
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
@@ -62,7 +71,7 @@ class Blocks:
     D: Vector
 
 
-def blocks(law: Law) -> Blocks:
+def blocks(law: BuiltLaw) -> Blocks:
     """A law in its simplest form, with far more states than it needs."""
     parts = []
     for sign_r, cells in ((1.0, law.phi), (0.0, law.psi)):
@@ -94,12 +103,12 @@ def blocks(law: Law) -> Blocks:
     return Blocks(A, B, C + gain * d3 @ C[[1]], D + gain * d3 @ D[[1]])
 
 
-def u_0(law: Law, ref: Vector) -> Vector:
+def u_0(law: BuiltLaw, ref: Vector) -> Vector:
     """Set-points of u, those that follow a reference included."""
     return np.array([ref[REF_NAMES.index(v)] if isinstance(v, str) else v for v in law.u_0])
 
 
-def mapped(law: Law, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
+def mapped(law: BuiltLaw, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
     """Mapped copies of references and measurements."""
     r, y = ref.copy(), y.copy()
     map_errors(ERROR_MAPS[law.error_map], np.array([*law.error_parameters, 0.0, 0.0])[:2], r, y)

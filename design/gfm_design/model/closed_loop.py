@@ -49,7 +49,7 @@ from gfm_plant.parameters import Element
 from gfm_plant.records import Record
 from gfm_runtime.catalogue import get_law
 from gfm_runtime.errors import LawError
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.realisation import realise
 from gfm_runtime.signals import NY, REF_NAMES, Y_NAMES, carried
 from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, discretise
@@ -159,7 +159,7 @@ class ClosedLoop:
     @classmethod
     def of(
         cls,
-        law: str | Law | DiscreteLaw,
+        law: str | BuiltLaw | DiscreteLaw,
         plant: Plant | None = None,
         references: Sequence[float] | Matrix = REFERENCES,
         *,

@@ -24,7 +24,7 @@ from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
 from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.realisation import LawStateSpace
 from gfm_runtime.signals import NU, NY, NY_INNER
 from gfm_runtime.tustin import DiscreteLaw, close_omega_u, tustin
@@ -200,7 +200,11 @@ def _rates(x: Vector, u: Vector, d: Vector, par: Record) -> Vector:
 
 
 def linearise_law(
-    law: Law, ss: DiscreteLaw | LawStateSpace, op: OperatingPoint, ref: Matrix, dc_control: bool
+    law: BuiltLaw,
+    ss: DiscreteLaw | LawStateSpace,
+    op: OperatingPoint,
+    ref: Matrix,
+    dc_control: bool,
 ) -> LinearLaw:
     """A law, discrete or continuous, around ``op``; ``dc_control`` says that row 1 acts."""
     slopes = error_map_slopes(law.error_map, law.error_parameters, op.y, ref)

@@ -41,7 +41,7 @@ from gfm_design.norms.performance import (
 from gfm_design.tuning.gains import Encoding, FreeGain, GainedLaw
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost
 from gfm_plant import NoEquilibrium, Plant
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.lawfile import LawFile, build_law
 
 Vector = NDArray[np.float64]
@@ -155,7 +155,7 @@ class PaperProblem:
     references: tuple[float, ...] = REFERENCES
     weights: tuple[Weight, ...] = PAPER_WEIGHTS
     T_s: float = T_S
-    among: Callable[[Law], ClosedLoop] | None = None
+    among: Callable[[BuiltLaw], ClosedLoop] | None = None
     decay: float = 0.0
 
     def __post_init__(self) -> None:

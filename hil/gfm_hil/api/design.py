@@ -32,8 +32,7 @@ from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant
-from gfm_runtime import Law as BuiltLaw
-from gfm_runtime import law_file
+from gfm_runtime import BuiltLaw, law_file
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile, shipped_law
 

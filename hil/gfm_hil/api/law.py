@@ -17,6 +17,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
+    BuiltLaw,
     DiscreteLaw,
     LawError,
     build_law,
@@ -26,7 +27,6 @@ from gfm_runtime import (
     law_titles,
     parse_law,
 )
-from gfm_runtime import Law as BuiltLaw
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import ElementSpec, LawFile, tied
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES

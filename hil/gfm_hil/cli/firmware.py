@@ -14,7 +14,7 @@ from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
-from gfm_runtime import Law, LawSet, law_names, load_law
+from gfm_runtime import BuiltLaw, LawSet, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
     EVA,
@@ -225,9 +225,9 @@ def _sets(names: Sequence[str], inner: str | None) -> list[LawSet]:
     return [load_law(name, inner) for name in given]
 
 
-def _laws(sets: Sequence[LawSet]) -> dict[str, Law]:
+def _laws(sets: Sequence[LawSet]) -> dict[str, BuiltLaw]:
     """Laws by name; a scheduled law in its stages."""
-    laws: dict[str, Law] = {}
+    laws: dict[str, BuiltLaw] = {}
     for found in sets:
         for label, law in zip(stage_names(found), found.laws, strict=True):
             if label in laws:

@@ -33,7 +33,7 @@ from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
 AWAITED, FRESH, OVERDUE, LEAVING, CUT_OFF = range(5)  # what came of u[k]
-_NOTHING, _OTHER, _OVER = range(3)  # what one read of a link brought
+_NOTHING, _OTHER, _OVER = range(3)  # what one read of a link gives
 _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
 
@@ -140,7 +140,7 @@ def _acts(r, u, k):
     """Whether the u that acts in tick k has come; puts it into u.
 
     In lockstep the newest u must have come as well: only as long as the plant has sent no later y
-    does asking again bring one that was lost.
+    does a second request bring one that was lost.
     """
     asked = k - k % r.every
     acting = max(0, asked - r.every)
@@ -204,7 +204,7 @@ def _await(sides, k, awaited, gap, spins, patience, repeat, hurried):
 
 @inlined
 def _look(side, k, looks):
-    """Read a link once: whether it brought NOTHING, an OTHER message than u[k], or what ends the
+    """Read a link once: whether it gives NOTHING, an OTHER message than u[k], or what ends the
     wait (OVER), with what ``came`` in the loop."""
     end, records = side
     r = records.loop[0]

@@ -149,7 +149,7 @@ class Timeline:
         return event.label_in(self._bench)
 
     def look(self, tick: int) -> None:
-        """Log what the last tick brought: a change of law, a safe state, a trip."""
+        """Log what came with the last tick: a change of law, a safe state, a trip."""
         ctl, st = self._bench.controller.ctl, self._bench.plant.st
         if "controller" in self._roles and int(ctl["changes"][0]) != self._changes:
             self._changes = int(ctl["changes"][0])

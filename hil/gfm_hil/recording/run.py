@@ -212,7 +212,7 @@ class Run:
 
     @property
     def metrics(self) -> dict[str, dict[str, Any]]:
-        """What each event brought, by ``label @ t s`` (overshoot, settling, nadir and more, with
+        """What followed each event, by ``label @ t s`` (overshoot, settling, nadir and more, with
         the units of their names)."""
         return {
             f"{event['label']} @ {event['t']:g} s": {

@@ -164,7 +164,7 @@ def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _events(events: Sequence[dict[str, Any]]) -> Table:
-    """What each event brought: a column each, or a row each if there are many."""
+    """What followed from each event: a column each, or a row each if there are many."""
     columns = event_rows(events)
     rows: list[list[Any]] = [
         [title, *(event.get(name) for event in events)] for name, title in columns
@@ -175,7 +175,7 @@ def _events(events: Sequence[dict[str, Any]]) -> Table:
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:
-    """What each event brought: a quantity a row, an event a column."""
+    """What followed from each event: a quantity a row, an event a column."""
     heads = [f"{event['label']} @ {event['t']:g} s" for event in events]
     rows = [row for row in event_rows(events) if row[0] not in ("label", "t")]
     cells = [[title, *(event.get(name) for event in events)] for name, title in rows]

@@ -14,8 +14,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario, load_scenario, plant_of
 from gfm_plant import NoEquilibrium
-from gfm_runtime import DiscreteLaw, discretise, law_titles, load_law
-from gfm_runtime import Law as BuiltLaw
+from gfm_runtime import BuiltLaw, DiscreteLaw, discretise, law_titles, load_law
 from gfm_runtime.assembly import Controller
 
 _GROWS = 1e-6  # 1/s; rounding may move a mode that rests, as the angle of an island, by less

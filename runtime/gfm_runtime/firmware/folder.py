@@ -15,7 +15,7 @@ from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modul
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.tick import SIZE
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.signals import NU, carried
 from gfm_runtime.states import BAD_U
 
@@ -26,7 +26,7 @@ add_custom_target(proof COMMAND sh ${CMAKE_CURRENT_SOURCE_DIR}/proof/prove.sh)
 
 
 def export(
-    laws: Mapping[str, Law],
+    laws: Mapping[str, BuiltLaw],
     T_s: float,
     real: str,
     style: Style,

@@ -34,7 +34,7 @@ from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
 from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.signals import (
     NU,
     NY,
@@ -95,7 +95,7 @@ class Module:
     """A law on its way to C."""
 
     name: str  #: the law's name, with its stage if it has several
-    law: Law | None  #: the law itself; None for one that was read back from a report
+    law: BuiltLaw | None  #: the law itself; None for one that was read back from a report
     record: np.void  #: the law as ``pack_law`` gives it
     #: whether a law of its folder has an inner stage: y has 11 signals then, and u 4
     stages: bool = False
@@ -147,7 +147,7 @@ class Module:
 
 
 def make_modules(
-    laws: Mapping[str, Law], T_s: float, real: DTypeLike, omega_b: float = 100 * math.pi
+    laws: Mapping[str, BuiltLaw], T_s: float, real: DTypeLike, omega_b: float = 100 * math.pi
 ) -> list[Module]:
     """The laws by name, discretised at T_s [s] and packed in float32 or float64, or in fixed point.
 

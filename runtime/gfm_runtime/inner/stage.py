@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from gfm_runtime.compiled import inlined
 from gfm_runtime.errors import LawError
 from gfm_runtime.signals import SPACE_VECTOR, group
-from gfm_runtime.toml_file import NotNegative, Number, Positive, Table
+from gfm_runtime.toml_file import NotNegative, Number, Positive, TomlTable
 
 PRIORITIES = {"circular": 0, "d": 1, "q": 2, "angle": 3}
 _D, _Q, _ANGLE = 1, 2, 3
@@ -52,7 +52,7 @@ INNER_STATE = (
 )
 
 
-class PowerLimiter(Table):
+class PowerLimiter(TomlTable):
     """Lowers omega_u while p is above P_max, and raises it while p is below P_min."""
 
     P_max: Number = Field(description="p.u.")
@@ -68,7 +68,7 @@ class PowerLimiter(Table):
         return self
 
 
-class InnerStage(Table):
+class InnerStage(TomlTable):
     """Base of the inner stages; in a law file a number may be an expression."""
 
     m: Positive = Field(PAPER_M, description="limit of abs(e) over v_dc, p.u.")

@@ -32,7 +32,7 @@ from gfm_hil.ports.modbus.image import VENDOR, Value
 from gfm_hil.ports.modbus.measures import RunState
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
-from gfm_runtime.law import Law
+from gfm_runtime.law import BuiltLaw
 from gfm_runtime.lawfile import LawFile, build_law, tied
 from gfm_runtime.states import RUNNING
 
@@ -68,7 +68,7 @@ def droops(file: LawFile, changed: Mapping[str, float]) -> Droops:
     )
 
 
-def _reactive_droop(law: Law) -> complex:
+def _reactive_droop(law: BuiltLaw) -> complex:
     below = law.element("phi", (2, 4))(_NEARLY_DC)
     return law.element("phi", (2, 3))(_NEARLY_DC) / below if below else 0.0
 
