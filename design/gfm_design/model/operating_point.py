@@ -53,11 +53,7 @@ class OperatingPoint:
 
 
 def operating_point(
-    par: Record,
-    law: DiscreteLaw,
-    ref: Vector,
-    omega_g: float = 1.0,
-    V_g: float = 1.0,
+    par: Record, law: DiscreteLaw, ref: Vector, omega_g: float = 1.0, V_g: float = 1.0
 ) -> OperatingPoint:
     """Solve for the operating point by Newton's method.
 

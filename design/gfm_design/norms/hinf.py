@@ -89,10 +89,7 @@ def _crossings(A: Matrix, B: Matrix, C: Matrix, D: Matrix, level: float) -> Matr
     F = A + B @ np.linalg.solve(R, D.T @ C)
     # scaled so that both off-diagonal blocks have the size of a gain, not of its square
     H = np.block(
-        [
-            [F, level * B @ np.linalg.solve(R, B.T)],
-            [-level * C.T @ np.linalg.solve(S, C), -F.T],
-        ]
+        [[F, level * B @ np.linalg.solve(R, B.T)], [-level * C.T @ np.linalg.solve(S, C), -F.T]]
     )
     values = np.linalg.eigvals(H)
     near = np.abs(values.real) <= _CROSSES * np.maximum(np.abs(values), 1e-12)

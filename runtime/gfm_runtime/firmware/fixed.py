@@ -1006,10 +1006,7 @@ def _of_angle(law: FixedLaw) -> float:
 
 
 def _error(
-    total: Sum,
-    numbers: Sequence[Number],
-    spans: Mapping[int, Span],
-    maps: Mapping[int, float],
+    total: Sum, numbers: Sequence[Number], spans: Mapping[int, Span], maps: Mapping[int, float]
 ) -> float:
     """What the rounding of a sum's coefficients and of the error map adds to it at most, p.u."""
     has = {place: coefficient for coefficient, place in total.terms}

@@ -13,7 +13,7 @@ import numpy as np
 from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import choose
-from gfm_runtime.firmware.c_text import chosen, filled, literals, plain, template
+from gfm_runtime.firmware.c_text import literals, plain, written
 from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources
 from gfm_runtime.firmware.tick import place
 from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
@@ -107,10 +107,7 @@ def schedule_sources(
         "X_0": repr(float(schedule.X_0)),
         "FUNCTIONS": _functions(m.prefix, bench.est[0], ctl, n),
     }
-    return {
-        f"{m.prefix}{end}": filled(chosen(template(f"schedule{end}"), choices), keys)
-        for end in (".h", ".c")
-    }
+    return {f"{m.prefix}{end}": written(f"schedule{end}", keys, choices) for end in (".h", ".c")}
 
 
 def _functions(prefix: str, est: np.void, ctl: np.void, n: int) -> str:
