@@ -154,15 +154,9 @@ def gain_phase(locus: Locus, omega: Matrix, H: Response, k: int) -> GainPhase:
     H_unit = at(unit)
     phases = np.abs(np.angle((H_unit - 0.5) / (H_unit + 0.5), deg=True))
     phase, phase_at = _nearest(phases, unit, (0.0, np.inf), np.min, np.inf)
-    return GainPhase(
-        low,
-        low_at / (2 * np.pi),
-        high,
-        high_at / (2 * np.pi),
-        phase,
-        phase_at / (2 * np.pi),
-        1.0 / _peak(at, omega, np.abs(h)),
-    )
+    low_at, high_at, phase_at = (w / (2 * np.pi) for w in (low_at, high_at, phase_at))
+    disk = 1.0 / _peak(at, omega, np.abs(h))
+    return GainPhase(low, low_at, high, high_at, phase, phase_at, disk)
 
 
 def _nearest(
