@@ -68,6 +68,7 @@ class Row(NamedTuple):
     D_y: Matrix
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused
 def realise(law: Law) -> LawStateSpace:
     """State space of a law.
 
@@ -75,7 +76,13 @@ def realise(law: Law) -> LawStateSpace:
         LawError: two integrators in series through omega_u, a coefficient that is not finite.
     """
     _check_series(law)
-    return assemble([_row(law, i) for i in range(NU)], law.u_0)
+    rows = []
+    for i in range(NU):
+        phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
+        rows.append(row_of(phi, psi))
+        if not all(np.isfinite(part).all() for part in rows[-1]):
+            raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
+    return assemble(rows, law.u_0)
 
 
 def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
@@ -120,16 +127,6 @@ def _check_series(law: Law) -> None:
             if integrates(matrix, i, 2):
                 why = "integrates omega_u, itself an integral: a double integrator 1/s^2"
                 raise LawError(cell_name(matrix, (i, 2)), why)
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
-def _row(law: Law, i: int) -> Row:
-    """Observer form of row i."""
-    phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
-    row = row_of(phi, psi)
-    if not all(np.isfinite(part).all() for part in row):
-        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
-    return row
 
 
 def row_of(phi: Sequence[Element], psi: Sequence[Element], smooth: bool = False) -> Row:
