@@ -29,15 +29,15 @@ class Bench:
         bench = make_bench(load_scenario("pref_step", in_process=True, law=law), self.model.real)
         bench.controller.ctl["y"][0, :5] = bench.start.y
         self.model.begin(bench.controller)
-        self.model.start()
-        self.u = bench.u.copy()
+        self.model.start(bench.u)
+        self.ref, self.y, self.u = bench.controller.ctl["ref"][0], bench.y, bench.u.copy()
 
     def round(self) -> np.ndarray:
         """What each tick of a round takes, s."""
         at = np.empty(TICKS + 1)
         at[0] = time.perf_counter()
         for k in range(TICKS):
-            self.model.tick(-1, self.u)
+            self.model.tick(self.ref, self.y, self.u)
             at[k + 1] = time.perf_counter()
         return np.diff(at)
 

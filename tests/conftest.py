@@ -14,7 +14,7 @@ The mark ``alone`` is for tests of the last two that fail beside another one on 
 
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -48,6 +48,22 @@ _LONGEST = (
 )  # fmt: skip
 _TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Carries out a command that cannot be done; returns the one line in which it says so."""
+
+    from gfm_hil.cli import main  # not before the variables above are set
+
+    def call(*words: str) -> str:
+        assert main(words) == 2
+        out, error = capsys.readouterr()
+        assert out == "" and error.startswith("gfmhil: ") and error.endswith("\n"), error
+        assert error[:-1].isprintable(), error
+        return error
+
+    return call
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -150,8 +150,7 @@ LOCKED = re.compile(r"^([a-z0-9][a-z0-9._-]*)(==[^ ]+(?:.|\n(?=    --))*)", re.M
 
 
 @pytest.mark.parametrize(
-    ("name", "extras"),
-    [("ci.txt", ("test", "docs")), ("container.txt", ("scope", "metrics"))],
+    ("name", "extras"), [("ci.txt", ("test", "docs")), ("container.txt", ("scope", "metrics"))]
 )
 @pytest.mark.attack(
     "10.8",

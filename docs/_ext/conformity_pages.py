@@ -5,20 +5,19 @@ from __future__ import annotations
 from _ext.scenario_pages import table
 
 from gfm_hil.core.terminal import markdown
-from gfm_hil.studies.conformity import model
+from gfm_hil.studies.conformity import sets
 from gfm_hil.studies.conformity.criteria import BY_KIND
-from gfm_hil.studies.conformity.sets import load_cases
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.criteria.base import UnderTest
 
 
 def tests() -> str:
     """One row a test: what it asks, where that is from, and how the source is known."""
     rows = []
-    for case in load_cases(["all"]):
+    for case in sets.load_cases(["all"]):
         test, runs = case.test, len(case.test.runs())
         asked = [c for part in test.runs() for c in (*test.criteria, *part.criteria)]
         clauses = ", ".join(dict.fromkeys(c.clause for c in asked)) or "cannot be run yet"
-        source = f"{test.source.words()}; {model.KNOWN[test.source.known]}"
+        source = f"{test.source.words()}; {sets.KNOWN[test.source.known]}"
         rows.append((f"`{case.id}`", test.title, str(runs), f"{test.f_n:g}", clauses, source))
     heads = ("test", "what happens", "runs", "Hz", "asked", "source")
     return markdown(heads, [[cell.replace("|", "\\|") for cell in row] for row in rows])
@@ -27,9 +26,9 @@ def tests() -> str:
 def keys() -> str:
     """The tables of a test file and of a converter under test."""
     tables = (
-        ("top level", model.Test),
-        ("[source]", model.Publication),
-        ("[[parts]]", model.TestPart),
+        ("top level", sets.Test),
+        ("[source]", sets.Publication),
+        ("[[parts]]", sets.TestPart),
         ("the file of the converter under test", UnderTest),
     )
     return "\n".join(

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from gfm_hil.testing import Experiment
 
 _FIGURE = "gfmhil_figure"  # user property of a report, which pytest-xdist passes on too
-_LINKS = ("inproc", "shm", "zmq", "can")  # shipped links; others are registered later
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -33,26 +32,19 @@ def pytest_configure(config: pytest.Config) -> None:
         "gfmhil(scenario=None, law=None, link=None, mode=None, controller_command=(), **changed): "
         "what the fixture bench begins with",
     )
-    for link in _LINKS:
-        _register(config, link)
+    config.addinivalue_line("markers", "gfmhil_LINK: uses the bench over a link, e.g. gfmhil_shm")
     wanted = config.getoption("--gfmhil-link")
     if wanted is not None:
         from gfm_hil.links import link_names
 
-        if wanted not in ("inproc", *link_names()):
-            raise pytest.UsageError(
-                f"--gfmhil-link {wanted}: must be one of {['inproc', *link_names()]}"
-            )
-
-
-def _register(config: pytest.Config, link: str) -> None:
-    config.addinivalue_line("markers", f"gfmhil_{link}: uses the bench over {link}")
+        if wanted not in (known := ["inproc", *link_names()]):
+            raise pytest.UsageError(f"--gfmhil-link {wanted}: must be one of {known}")
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m evaluates the markers
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the tests that use the bench with their initial link."""
-    known = set(_LINKS)
+    known = set[str]()
     for item in items:
         if "bench" not in getattr(item, "fixturenames", ()):
             continue
@@ -61,7 +53,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         link = link or ("zmq" if begin.get("controller_command") else "inproc")
         if link not in known:
             known.add(link)
-            _register(config, link)
+            config.addinivalue_line("markers", f"gfmhil_{link}: uses the bench over {link}")
         item.add_marker(f"gfmhil_{link}")
 
 

@@ -23,13 +23,7 @@ from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
 from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import (
-    Cascaded,
-    InnerStage,
-    PowerLimiter,
-    ThresholdImpedance,
-    VirtualStator,
-)
+from gfm_runtime.inner import Cascaded, InnerStage, PowerLimiter, ThresholdImpedance, VirtualStator
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER

@@ -8,15 +8,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import law_file
-from law_comparison.search import (
-    ALPHA,
-    LateProblem,
-    as_it_is,
-    gamma,
-    late_loop,
-    search,
-    stands,
-)
+from law_comparison.search import ALPHA, LateProblem, as_it_is, gamma, late_loop, search, stands
 
 from ..support.loops import reference_loop
 

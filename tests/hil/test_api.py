@@ -144,11 +144,7 @@ def test_figures():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("no-such",), "no such file"),
-        (("pref_step", "no-such"), "unknown"),
-    ],
+    ("arguments", "said"), [(("no-such",), "no such file"), (("pref_step", "no-such"), "unknown")]
 )
 def test_mistakes_are_said_in_words(arguments, said):
     with pytest.raises((gfmhil.UserError, gfmhil.LawError), match=said):

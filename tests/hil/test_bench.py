@@ -195,29 +195,3 @@ def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path):
     while processes_with(mark) and time.monotonic() < until:
         time.sleep(0.02)
     assert processes_with(mark) == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (["latency", "--links", "carrier-pigeon"], "carrier-pigeon"),
-        (["latency", "--links", "shm,"], "--links"),
-        (["latency", "--mode", "fast"], "--mode"),
-        (["latency", "--load", "heavy"], "--load"),
-        (["latency", "--payload", "0"], "--payload"),
-        (["latency", "--seconds", "nan"], "--seconds"),
-        (["latency", "--rounds", "0"], "--rounds"),
-        (["jitter", "--load", "idle,heavy"], "--load"),
-        (["kernel", "--laws", "vsg-99"], "vsg-99"),
-        (["loop", "--seconds", "0.01"], "--seconds"),
-        (["loop", "--laws", "droop-1,"], "--laws"),
-        (["all", "--links", "inproc"], "inproc"),
-    ],
-)
-def test_wrong_input_starts_nothing(options, named, tmp_path, capsys):
-    assert main(["bench", *options, "--out", str(tmp_path / "bench")]) == 2
-    said = capsys.readouterr()
-    assert named in said.err
-    assert len(said.err.splitlines()) == 1
-    assert not said.out
-    assert not (tmp_path / "bench").exists()

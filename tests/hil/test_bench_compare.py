@@ -95,19 +95,18 @@ def test_compare_command_reads_files_and_folders(tmp_path, capsys):
     ("content", "named"),
     [(None, "cannot be read"), ("{", "cannot be read"), ("{}", "not a result"), ("[]", "not a")],
 )
-def test_what_is_no_result_is_refused(content, named, tmp_path, capsys):
+def test_what_is_no_result_is_refused(content, named, tmp_path, refused):
     path = tmp_path / "x.json"
     if content is not None:
         path.write_text(content)
-    assert main(["bench", "compare", str(path), str(path)]) == 2
-    assert named in capsys.readouterr().err
+    assert named in refused("bench", "compare", str(path), str(path))
 
 
-def test_results_of_different_benchmarks_cannot_be_compared(tmp_path, capsys):
+def test_results_of_different_benchmarks_cannot_be_compared(tmp_path, refused):
     for name in "ab":
         (tmp_path / name).write_text(json.dumps(result({name: [1.0, 2.0]})))
-    assert main(["bench", "compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
-    assert "no row in common" in capsys.readouterr().err
+    line = refused("bench", "compare", str(tmp_path / "a"), str(tmp_path / "b"))
+    assert "no row in common" in line
 
 
 FAKE = """
@@ -140,18 +139,3 @@ def test_interleaved_installations_take_turns(tmp_path, capsys):
     assert (tmp_path / "order").read_text() == "ABBA" * 3
     kept = json.loads((out / "B.json").read_text())["results"][0]["rounds_p50_us"]
     assert kept == pytest.approx([3.0, 3.01, 3.02, 3.03, 3.04, 3.05])
-
-
-@pytest.mark.parametrize(
-    ("more", "named"),
-    [
-        (["--interleave", "1"], "--interleave 1"),
-        (["--interleave", "2", "--what", "compare"], "--what"),
-        (["--interleave", "2"], "no such command"),
-    ],
-)
-def test_wrong_interleaving_starts_nothing(more, named, tmp_path, capsys):
-    line = ["bench", "compare", "no-such-gfmhil", "no-such-gfmhil", *more]
-    assert main([*line, "--out", str(tmp_path / "out"), "--quiet"]) == 2
-    assert named in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gfm_hil.studies.campaign.draw import Choice, LogUniform, Normal, Uniform, draw
+from gfm_hil.studies.campaign.spec import Choice, LogUniform, Normal, Uniform, draw
 
 numbers = st.floats(-1e12, 1e12)
 shares = st.floats(0, 1, exclude_max=True)

@@ -36,16 +36,3 @@ def test_an_inner_stage_must_fit_the_bus_too(make):
     with pytest.raises(UserError, match=why):
         make(law="vsg-2", inner="cascaded", link=link)
     make(law="vsg-2", inner="cascaded", link={**link, "options": {"every": 2}})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--out", "nowhere/link.dbc"], "--out nowhere/link.dbc: No such file or directory"),
-        (["--budget", "--T_s", "0"], "--T_s 0: must be more than 0 s"),
-    ],
-)
-def test_wrong_input_is_one_line(arguments, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["dbc", *arguments]) == 2
-    assert capsys.readouterr().err == f"gfmhil: {said}\n"

@@ -86,9 +86,7 @@ def test_the_dbc_survives_its_own_text(fd):
 
 
 @pytest.mark.parametrize(
-    "row",
-    [*carried_rows("y", True), *carried_rows("u", True)],
-    ids=lambda r: f"{r.group}-{r.name}",
+    "row", [*carried_rows("y", True), *carried_rows("u", True)], ids=lambda r: f"{r.group}-{r.name}"
 )
 def test_the_range_of_every_signal_fits(row):
     for end in (row.low, row.high):

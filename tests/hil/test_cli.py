@@ -192,12 +192,11 @@ def test_a_run_without_out_gets_a_folder_of_its_own(call):
     assert len(list(Path("runs").glob("short-*/summary.json"))) == 2
 
 
-def test_an_earlier_run_is_not_written_over(call):
+def test_an_earlier_run_is_not_written_over(call, refused):
     call("run", scenario(), "--out", "run", "--no-figures")
     before = Path("run/summary.json").read_text()
-    code, out, err = call("run", "short.toml", "--out", "run")
-    assert (code, out) == (2, "")
-    assert err == "gfmhil: run: is not empty; choose another --out\n"
+    said = refused("run", "short.toml", "--out", "run")
+    assert said == "gfmhil: run: is not empty; choose another --out\n"
     assert Path("run/summary.json").read_text() == before
 
 
@@ -269,43 +268,10 @@ def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
     assert "tripped" in out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["compare", "short.toml"], "compare list is empty"),
-        (["compare", "short.toml", "--laws", "vsg-2,,vsg-1"], "none empty"),
-        (["compare", "short.toml", "--laws", "vsg-99"], "vsg-99"),
-        (["run", "short.toml", "--law", "bad.toml"], "law file bad.toml: phi.22.typ"),
-        (["run", "short.toml", "--law", "vsg2"], "did you mean 'vsg-2'?"),
-        (["run", "short.toml", "--link", "can", "--option", "every=99"], "--option every 99"),
-        (["command", "run", "Pref=1"], "did you mean 'P_ref'?"),
-        (["run", "nowhere.toml"], "nowhere.toml: no such file"),
-        (["run", "short.toml", "--duration", "-1"], "duration"),
-        (["run", "short.toml", "--duration", "nan"], "duration"),
-        (["run", "short.toml", "--seed", "-1"], "seed"),
-        (["run", "short.toml", "--mode", "realtime"], "lockstep only"),
-        (["run", "short.toml", "--link", "zmq", "--endpoint", "x"], "tcp://host:port"),
-        (["run", "short.toml", "--out", "short.toml/x"], "not a folder"),
-        (["plant", "short.toml"], "a side alone needs a link"),
-        (["plant", "short.toml", "--link", "zmq"], "link.endpoint: not set"),
-        (["laws", "show", "vsg-99"], "vsg-99"),
-    ],
-)
-def test_wrong_use_is_one_line_and_code_2(arguments, part, call):
-    scenario()
-    Path("bad.toml").write_text('name="a"\ntitle=""\nsource=""\nphi.22={type="P", k=0, typ=1}')
-    code, out, err = call(*arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith("gfmhil: ") and part in err
-    assert len(err.splitlines()) == 1
-    assert sorted(path.name for path in Path().iterdir()) == ["bad.toml", "short.toml"]
-
-
 @pytest.mark.parametrize("option", ["--duration", "--seed", "--endpoint"])
-def test_an_option_is_blamed_for_its_value_and_not_the_scenario(option, call):
-    code, _, err = call("run", scenario(link={"type": "zmq"}), option, "-1")
-    assert code == 2
-    assert f"{option} -1" in err.split(": ")[1]
+def test_an_option_is_blamed_for_its_value_and_not_the_scenario(option, refused):
+    line = refused("run", scenario(link={"type": "zmq"}), option, "-1")
+    assert f"{option} -1" in line.split(": ")[1]
 
 
 @pytest.mark.parametrize(
@@ -316,23 +282,14 @@ def test_an_option_is_blamed_for_its_value_and_not_the_scenario(option, call):
         (["run", "--link", "inproc"], "--link inproc, --duration 0.05"),
     ],
 )
-def test_options_that_do_not_fit_the_scenario_are_named_with_it(arguments, blamed, call):
+def test_options_that_do_not_fit_the_scenario_are_named_with_it(arguments, blamed, refused):
     """Only those that the user gave: not the lockstep that --link inproc implies."""
     command, *options = arguments
-    code, _, err = call(command, scenario(**STEP), *options, "--duration", "0.05")
-    assert code == 2
-    assert err.startswith(f"gfmhil: short.toml with {blamed}: events.0: ")
+    line = refused(command, scenario(**STEP), *options, "--duration", "0.05")
+    assert line.startswith(f"gfmhil: short.toml with {blamed}: events.0: ")
 
 
-def test_unknown_options_are_refused_with_the_one_that_was_meant(capsys):
-    assert main(["run", "short.toml", "--zzz", "3"]) == 2
-    assert capsys.readouterr().err == "gfmhil: --zzz 3: gfmhil run does not know it\n"
-    assert main(["firmware", "export", "vsg-1", "--reel", "float32", "-o", "x"]) == 2
-    assert "does not know it; did you mean '--real'?" in capsys.readouterr().err
-    assert main(["design", "poles", "own.toml"]) == 2
-    assert "--law own.toml" in capsys.readouterr().err
-    assert main(["run", "virtual", "P_ref=0.8"]) == 2
-    assert "a scenario's file says such values" in capsys.readouterr().err
+def test_an_unknown_command_of_a_group_is_refused_with_the_one_that_was_meant(capsys):
     with pytest.raises(SystemExit):
         main(["design", "pole"])
     assert "did you mean 'poles'?" in capsys.readouterr().err
@@ -413,13 +370,9 @@ def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     assert "an unstable mode" not in capsys.readouterr().out
 
 
-def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(capsys):
-    assert main([]) == 0
-    assert "run a scenario and leave a run folder" in capsys.readouterr().out
-    assert main(["runn", "pref_step"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("gfmhil: runn: no command; did you mean 'run'? must be one of ['run'")
-    assert error.count("\n") == 1
+def test_no_command_is_the_help(call):
+    code, out, _ = call()
+    assert code == 0 and "run a scenario and leave a run folder" in out
 
 
 @pytest.mark.parametrize(
@@ -430,7 +383,5 @@ def test_no_command_is_the_help_and_a_wrong_one_gets_a_hint(capsys):
         ({"type": "law", "law": 3}, "events.0.law: must be a valid string, not 3"),
     ],
 )
-def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(event, line, capsys):
-    assert main(["run", scenario(events=[{"t": 0.1, **event}])]) == 2
-    error = capsys.readouterr().err
-    assert line in error and error.count("\n") == 1
+def test_a_wrong_word_in_a_scenario_is_one_line_and_the_hint_comes_first(event, line, refused):
+    assert line in refused("run", scenario(events=[{"t": 0.1, **event}]))

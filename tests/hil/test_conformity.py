@@ -24,11 +24,11 @@ from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, toml_text
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
+from gfm_hil.studies.conformity.criteria.base import judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.judge import judge
-from gfm_hil.studies.conformity.model import TestPart
 from gfm_hil.studies.conformity.sets import (
     Case,
+    TestPart,
     load_cases,
     load_under_test,
     scaled,
@@ -551,36 +551,10 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
         ),
     ],
 )  # fmt: skip
-def test_wrong_test_files_are_told_in_one_line(lab, capsys, old, new, says):
+def test_wrong_test_files_are_told_in_one_line(lab, refused, old, new, says):
     (lab / "jump.toml").write_text(LAB.replace(old, new))
-    assert main(["conform", "--law", "droop-3", "--against", str(lab)]) == 2
-    error = capsys.readouterr().err
-    assert "jump.toml" in error and says in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--law", "droop-3", "--against", "misso"], "did you mean"),
-        (["--law", "drop-3"], "drop-3"),
-        (["--law", "droop-3", "--inner", "stator"], "stator"),
-        (["--law", "droop-3", "--workers", "0"], "workers = 0"),
-        (["--law", "droop-3", "--converter", "nowhere.toml"], "nowhere.toml"),
-        ([], "--law"),
-        (["--controller", "vsg-2.so"], "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
-        (["--controller", "dll:nowhere.so"], "nowhere.so: there is no such file"),
-        (["--law", "droop-3", "--map", "map.toml"], "map.toml: is of a controller"),
-        (["--controller", "c:own.so"], "measures currents, which only a run with an inner stage"),
-        (["--controller", "c:own.so", "--inner", "none"], "choose --inner virtual-stator"),
-    ],
-)
-def test_wrong_arguments_are_told_in_one_line(capsys, tmp_path, monkeypatch, arguments, says):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own.so").touch()
-    assert main(["conform", *arguments]) == 2
-    assert not (tmp_path / "runs").exists()
-    error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
+    line = refused("conform", "--law", "droop-3", "--against", str(lab))
+    assert "jump.toml" in line and says in line
 
 
 @pytest.mark.compilers

@@ -328,16 +328,3 @@ def test_an_fmu_is_unpacked_within_limits(kind, tmp_path, monkeypatch, attack_no
         open_controller(f"fmu:{file}", PortMap(), BenchContext())
     assert not [path for path in scratch.rglob("*") if path.is_file()]
     attack_now("refused before it is unpacked")
-
-
-def test_the_command_refuses_what_makes_no_sense(tmp_path, capsys):
-    file = write(tmp_path, law="vsg-2", link={"type": "inproc"})
-    out = ["--out", str(tmp_path / "run")]
-    for options, message in (
-        (["run", file, "--controller", "dll:x"], "which a run in process has not; choose a link"),
-        (["run", file, "--map", "x"], "a port map is for an external controller"),
-        (["run", "three_share_a_load", "--controller", "dll:x"], "controls one converter"),
-        (["plant", file, "--link", "shm", "--endpoint", "shm://x", "--model", "dll:x"], "--model"),
-    ):
-        assert main([*options, *out]) == 2
-        assert message in capsys.readouterr().err

@@ -159,27 +159,6 @@ def test_the_command(table, tmp_path, capsys, monkeypatch):
     assert sorted(p.name for p in Path().iterdir()) == ["other.mat", "run.csv"]
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere", "--format", "csv"], "nowhere: is not a run folder (signals.npz is missing)"),
-        (["{run}"], "--format is not given: must be one of mf4, csv, mat, parquet, blf"),
-        (["{run}", "-o", "x.xls"], "--format is not told by x.xls: must be one of mf4, csv"),
-        (["{run}", "-o", "no/folder/x.csv"], "no/folder/x.csv: No such file or directory"),
-        (["{run}", "-o", "no/folder/x.mf4"], "no/folder/x.mf4: No such file or directory"),
-        (["{run}", "-o", "no/folder/x.mat"], "no/folder/x.mat: No such file or directory"),
-        (["{run}", "-o", "no/folder/x.parquet"], "no/folder/x.parquet: No such file or"),
-    ],
-)
-def test_what_cannot_be_done_is_said_in_a_line(table, tmp_path, capsys, monkeypatch, words, said):
-    monkeypatch.chdir(tmp_path)
-    assert main(["export", *(word.format(run=table.folder) for word in words)]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_run_that_is_not_over_is_to_be_streamed(tmp_path):
     (tmp_path / "scenario.toml").touch()
     with pytest.raises(UserError, match="the run is not over, see gfmhil stream"):

@@ -82,8 +82,7 @@ def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
 
 
 @pytest.mark.skipif(
-    "GFMHIL_FAULTS_REPORT" not in os.environ,
-    reason="minutes; GFMHIL_FAULTS_REPORT asks for it",
+    "GFMHIL_FAULTS_REPORT" not in os.environ, reason="minutes; GFMHIL_FAULTS_REPORT asks for it"
 )
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kind", IMPAIRMENTS)

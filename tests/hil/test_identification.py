@@ -61,8 +61,7 @@ def test_stage_delay_sensors_and_frequency():
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("law", "inner"),
-    [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")],
+    ("law", "inner"), [("vsg-2", "none"), ("droop-5", "cascaded"), ("mimo-gfm", "virtual-stator")]
 )
 def test_one_percent_from_1_hz_to_1_khz(law, inner):
     found = gfmhil.scan(law, inner=inner)
@@ -130,29 +129,6 @@ def test_the_command_writes_a_folder(tmp_path, capsys):
     assert main(["identify", "droop-2", "-o", str(folder)]) == 2  # its name up to version 0.2
     said = capsys.readouterr().err
     assert "is gfmhil scan now" in said and "is not empty" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nothing"], "is neither a law (gfmhil laws) nor a scenario"),
-        (["pref_step", "--scenario", "pref_step"], "goes with a law"),
-        (["vsg-2", "--from", "9", "--to", "5"], "must be 0.01 <= start_hz < stop_hz"),
-        (["vsg-2", "--points", "1"], "points = 1: must lie in [2, 1000]"),
-        (["vsg-2", "--amplitude", "1"], "would move V_g by"),
-        (["vsg-2", "--amplitude", "-1"], "amplitude = -1.0: must be > 0"),
-        (["vsg-2", "--settle", "-1"], "settle_s = -1.0: must be >= 0 s"),
-        (["vsg-2", "--window", "99"], "window_s = 99.0: must lie in [0, 60] s"),
-        (["three_share_a_load"], "a scan measures one converter"),
-        (["small_grid_load_step"], "plant.grid.finite: such a grid sets its own frequency"),
-        (["pref_step", "--inner", "nothing"], "nothing"),
-        (["pref_step", "--controller", "true", "--scenario", "x"], "goes with a law"),
-    ],
-)
-def test_mistakes(arguments, message, capsys):
-    assert main(["scan", *arguments, "--quiet"]) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
 
 
 def test_a_limit_that_acts_is_found():

@@ -12,7 +12,7 @@ from numba import njit, types
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.engine.waiting import send_last
+from gfm_hil.engine.drive import send_last
 from gfm_hil.links import Link, LinkKind, link_kind, link_names, open_link, registry
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameReader, FrameWriter

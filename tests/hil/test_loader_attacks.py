@@ -70,15 +70,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield tmp_path
 
 
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one-line error of a command for wrong input."""
-    assert main(arguments) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and len(said.err.splitlines()) == 1
-    assert said.err.startswith("gfmhil: ") and said.err[:-1].isprintable()
-    return said.err
-
-
 def commands(file: str) -> dict[str, list[str]]:
     """The commands that read a file of each kind; a scenario reads the laws and converters."""
     Path("of_law.toml").write_text(BASE + f'law = "{file}"\n')
@@ -114,11 +105,11 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
     "and weights",
     "a traceback of RecursionError, ValueError or OverflowError",
 )
-def test_contents_that_are_no_usable_toml(kind, capsys, attack_now):
+def test_contents_that_are_no_usable_toml(kind, refused, attack_now):
     assert len(CONTENTS["5 MB"][0]) > MAX_BYTES
     for data, part in CONTENTS.values():
         Path("bad.toml").write_bytes(data)
-        line = refused(commands("bad.toml")[kind], capsys)
+        line = refused(*commands("bad.toml")[kind])
         assert part in line and len(line) < 300
     attack_now(f"{len(CONTENTS)} files of each kind, one line each, exit code 2")
 
@@ -129,9 +120,9 @@ def test_contents_that_are_no_usable_toml(kind, capsys, attack_now):
     "a folder, a named pipe, /dev/zero or a name of 300 characters in place of a file",
     "a traceback, or the command never ended",
 )
-def test_what_is_no_file(kind, capsys, attack_now):
+def test_what_is_no_file(kind, refused, attack_now):
     for name in ("folder.toml", "pipe.toml", "zero.toml", "a" * 300 + ".toml"):
-        line = refused(commands(name)[kind], capsys)
+        line = refused(*commands(name)[kind])
         assert "is not a regular file" in line or "File name too long" in line
     attack_now("4 of each kind, one line each, exit code 2")
 
@@ -173,8 +164,8 @@ NUMBERS = [
     "V_n = 1e300, integers of 30 and 400 digits, NaN and infinities in files",
     "a traceback of OverflowError or ZeroDivisionError",
 )
-def test_numbers_that_no_field_can_have(kind, path, value, capsys, attack_now):
-    line = refused(numbers(kind, path, value), capsys)
+def test_numbers_that_no_field_can_have(kind, path, value, refused, attack_now):
+    line = refused(*numbers(kind, path, value))
     assert path.split(".")[-1] in line
     assert len(line) < 400
     attack_now(f"{len(NUMBERS)} fields, each named in one line, exit code 2")
@@ -196,34 +187,34 @@ WRITERS = {
     "--out=--, a name of 300 characters, a name below a file, for every command that writes",
     "a traceback of TypeError or OSError",
 )
-def test_places_that_cannot_be_written(command, here, run, capsys, attack_now):
+def test_places_that_cannot_be_written(command, here, run, refused, attack_now):
     Path("of_nothing.toml").write_text(BASE)
     Path("campaign.toml").write_text(CAMPAIGN)
     run().folder.rename("a_run")
     before = sorted(here.iterdir())
     for name in ("--", "a" * 300, "of_nothing.toml/x"):
-        refused([*WRITERS[command], f"--out={name}"], capsys)
+        refused(*WRITERS[command], f"--out={name}")
     assert sorted(here.iterdir()) == before
     attack_now(f"{len(WRITERS)} commands, one line each, exit code 2, nothing written")
 
 
-def test_a_folder_named_like_an_option_serves_as_any_other(here, capsys):
+def test_a_folder_named_like_an_option_serves_as_any_other(here):
     Path("two.toml").write_text('title = "x"\nduration = 0.02\n')  # sides as processes
     assert main(["run", "two.toml", "--out=./--", "--quiet", "--no-figures"]) == 0
     assert (here / "--" / "summary.json").is_file()
 
 
 @pytest.mark.parametrize("tick", ["9" * 30, "9" * 400])
-def test_an_event_far_beyond_the_end(tick, capsys):
+def test_an_event_far_beyond_the_end(tick, refused):
     event = f'[[events]]\ntick = {tick}\ntype = "law"\nlaw = "vsg-2"\n'
     Path("late.toml").write_text(BASE + event)
-    assert "events.0" in refused(["run", "late.toml"], capsys)
+    assert "events.0" in refused("run", "late.toml")
 
 
-def test_more_events_than_a_run_takes(capsys):
+def test_more_events_than_a_run_takes(refused):
     event = "{ tick = 1, type = 'reference', P_ref = 0.6 },"
     Path("many.toml").write_text(BASE + f"events = [{event * 10_001}]\n")
-    assert "events" in refused(["run", "many.toml"], capsys)
+    assert "events" in refused("run", "many.toml")
 
 
 @pytest.mark.parametrize(
@@ -245,11 +236,11 @@ def test_thousands_of_mistakes_are_not_thousands_of_lines(capsys):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_key_cannot_write_to_the_terminal(kind, capsys):
+def test_a_key_cannot_write_to_the_terminal(kind, refused):
     texts = {"campaign": CAMPAIGN, "scenario": BASE, "converter": CONVERTER.read_text()}
     text = texts.get(kind, (LAWS / "vsg-2.toml").read_text())
     Path("key.toml").write_text('"a\\nb\\u001b[31m" = 1\n' + text)
-    assert "a\\nb\\x1b" in refused(commands("key.toml")[kind], capsys)
+    assert "a\\nb\\x1b" in refused(*commands("key.toml")[kind])
 
 
 # ------------------------------------------------------------------------- anything, anywhere

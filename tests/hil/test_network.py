@@ -269,23 +269,8 @@ def test_what_a_converters_file_lacks_is_said_with_its_name(tmp_path):
         load_scenario(content(**change))
 
 
-def test_a_law_that_reaches_no_converter_is_refused(tmp_path, capsys):
-    """Also an inner stage; --converter names the one that gets it."""
+def test_converter_names_the_one_that_gets_a_law(tmp_path):
     out = ["--out", str(tmp_path / "run"), "--quiet", "--no-figures"]
-    run = ["run", "three_share_a_load", *out]
-    for more, words in (
-        (["--law", "vsg-2"], "--law vsg-2: does not replace the own law of A, B, C; name the "
-         "converter that gets it with --converter"),
-        (["--converter", "a"], "--converter a: must be one of ['A', 'B', 'C']; did you mean 'A'?"),
-        (["--law", "vsg2", "--converter", "B"], "network.converters.B.law: law 'vsg2'"),
-    ):  # fmt: skip
-        assert main([*run, *more]) == 2
-        error = capsys.readouterr().err
-        assert words in error and error.count("\n") == 1
-    assert main(["run", "pref_step", "--converter", "A", *out]) == 2
-    assert "--converter A: the scenario has no network" in capsys.readouterr().err
-    assert main(["compare", "three_share_a_load", "--laws", "vsg-2,droop-3"]) == 2
-    assert "three_share_a_load: network: this takes one converter" in capsys.readouterr().err
     with pytest.raises(UserError, match=r"law vsg-2: does not .*; set network.converters.NAME.law"):
         gfmhil.run_network("three_share_a_load", law="vsg-2")
     file = tmp_path / "short.toml"

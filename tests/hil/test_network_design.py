@@ -191,41 +191,6 @@ def test_gamma_on_a_scenario_of_one_converter_is_that_of_its_sampled_loop():
     assert gfmhil.design.gamma(law, on="rig_pref_step").value == loop.gamma()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["gamma", "--law", "vsg-2", "--scenario", THREE], "--converter names the one of ['A', "),
-        (["gamma", "--law", "vsg-2", "--converter", "A"], "--converter A: needs --scenario"),
-        (
-            ["tune", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--full-order"],
-            "omit --scenario",
-        ),
-        (
-            ["gamma", "--law", "vsg-2", "--scenario", THREE, "--converter", "A", "--discrete"],
-            "a scenario is sampled in any case",
-        ),
-        (
-            ["tune", "--law", "vsg-2", "--decay", "-1"],
-            "decay = -1.0: must be finite and not negative",
-        ),
-        (["margins", "--scenario", THREE], "--converter names it, one of ['A', 'B', 'C']"),
-        (["bode", "--scenario", THREE, "--converter", "D"], "must be one of ['A', 'B', 'C']"),
-        (["bode", "--converter", "A"], "--converter A: the scenario has no network"),
-        (
-            ["poles", "--scenario", THREE, "--law", "vsg-2"],
-            "--law vsg-2: does not replace the own law of A, B, C; name the converter that gets it",
-        ),
-        (["step", "--scenario", THREE, "--of", "P_ref"], "'P_ref' is no input of the network"),
-        (["margins", "--scenario", THREE, "--converter", "A", "--figures", "x"], "--figures: they"),
-        (["poles", "--scenario", THREE, "--converter", "A", "--law", "no-such"], "no-such"),
-    ],
-)
-def test_refuses_in_one_line(arguments, words, capsys):
-    assert main(["design", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count("\n") == 1
-
-
 def test_python_refuses_in_one_line():
     law = gfmhil.Law.load("vsg-2")
     for call, words in (

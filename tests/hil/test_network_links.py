@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import gfmhil
-from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
@@ -222,28 +221,3 @@ def test_a_controller_of_another_scenario_is_refused(tmp_path):
     end(processes["A"]), end(processes["B"])
     assert "B: the controller runs another scenario" in out
     assert json.loads((tmp_path / "plant" / "summary.json").read_text())["status"] == "safe"
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["controller"], "--converter: which one this controller controls; one of ['A', 'B']"),
-        (["controller", "--converter", "C"], "--converter C: must be one of ['A', 'B']"),
-        (["plant", "--converter", "A"], "--converter A: for the controller of a network"),
-        (["plant", "--endpoint", "C=ipc:///tmp/c"],
-         "--endpoint C=ipc:///tmp/c: must be NAME=ENDPOINT with NAME in ['A', 'B']"),
-        (["plant", "--endpoint", "A=ipc:///tmp/a"], "link.endpoint of B: not set"),
-        (["plant", "--endpoint", "A=ipc:///tmp/a", "--endpoint", "A=ipc:///tmp/b"],
-         "--endpoint A=ipc:///tmp/b: given twice for A"),
-        (["run", "--endpoint", "A=ipc:///tmp/a"], "here a scenario names it, as"),
-        (["run", "--scope"], "--scope: looks at one converter; start gfmhil scope beside"),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_is_said_before_anything_starts(words, message, tmp_path, capsys):
-    file = tmp_path / "two.toml"
-    file.write_text(toml_text(content(link=over("zmq"))), "utf-8")
-    command, *more = words
-    assert main([command, str(file), "--out", str(tmp_path / "x"), *more]) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.count("\n") == 1
-    assert not (tmp_path / "x").exists()

@@ -177,9 +177,7 @@ with scratch.temporary("gfmhil-run-") as place:
 
 @as_root
 @pytest.mark.attack(
-    "2.3",
-    "another user holds a lock on TMPDIR and /dev/shm",
-    "every start hung, without a word",
+    "2.3", "another user holds a lock on TMPDIR and /dev/shm", "every start hung, without a word"
 )
 def test_a_lock_on_a_shared_folder_hinders_nothing(shared, other, attack_now):
     other(LOCK)

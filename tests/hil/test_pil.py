@@ -122,11 +122,7 @@ def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_p
     [
         (signal.SIGKILL, SHM, "gfmhil on m4f: qemu-system-arm has ended by SIGKILL"),
         (signal.SIGSTOP, SHM, "gfmhil on m4f: has not answered for 10 s"),
-        (
-            signal.SIGSTOP,
-            SHM | {"peer_timeout_s": 4.0},
-            "gfmhil on m4f: has not answered for 2 s",
-        ),
+        (signal.SIGSTOP, SHM | {"peer_timeout_s": 4.0}, "gfmhil on m4f: has not answered for 2 s"),
     ],
 )
 def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(

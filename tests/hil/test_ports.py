@@ -11,7 +11,6 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 from websockets.sync.client import connect
 
-from gfm_hil.cli import main
 from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.streams import BlockReader
 
@@ -76,22 +75,22 @@ def test_every_port_serves_one_run(tmp_path, attack_now):
 
 
 @pytest.mark.parametrize("name", PORTS)
-def test_a_port_in_use_is_refused_before_anything_starts(name, tmp_path, capsys):
+def test_a_port_in_use_is_refused_before_anything_starts(name, tmp_path, refused):
     out = tmp_path / "run"
     with socket.socket(type=make_port(name).socket) as taken:
         taken.bind(("127.0.0.1", 0))
         if taken.type == socket.SOCK_STREAM:
             taken.listen()
         number = taken.getsockname()[1]
-        assert main(["run", "pref_step", "--out", str(out), f"--{name}", str(number)]) == 2
-    assert f"--{name} {number}: Address already in use" in capsys.readouterr().err
+        line = refused("run", "pref_step", "--out", str(out), f"--{name}", str(number))
+    assert f"--{name} {number}: Address already in use" in line
     assert not out.exists()
 
 
 @pytest.mark.parametrize("name", [name for name in PORTS if make_port(name).commands])
-def test_a_run_in_process_takes_no_commands(name, capsys):
-    assert main(["run", "pref_step", "--link", "inproc", f"--{name}"]) == 2
-    assert f"--{name}: a run in process takes no commands" in capsys.readouterr().err
+def test_a_run_in_process_takes_no_commands(name, refused):
+    line = refused("run", "pref_step", "--link", "inproc", f"--{name}")
+    assert f"--{name}: a run in process takes no commands" in line
 
 
 @pytest.mark.parametrize("name", PORTS)
@@ -103,8 +102,6 @@ def test_a_run_in_process_takes_no_commands(name, capsys):
         ([], "nowhere: no"),
     ],
 )
-def test_what_cannot_be_served_is_said_in_a_line(name, options, message, capsys, monkeypatch):
+def test_what_cannot_be_served_is_said_in_a_line(name, options, message, refused, monkeypatch):
     monkeypatch.setattr("os.nice", lambda by: by)  # it would last for all of pytest
-    assert main([name, "nowhere", *options]) == 2
-    said = capsys.readouterr()
-    assert message in said.err and said.err.count("\n") == 1 and not said.out
+    assert message in refused(name, "nowhere", *options)

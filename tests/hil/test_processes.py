@@ -14,16 +14,7 @@ import pytest
 from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import RolePart
 
-from ..support.processes import (
-    end,
-    free_port,
-    has_run,
-    roles_of,
-    signals,
-    summary,
-    wait_for,
-    write,
-)
+from ..support.processes import end, free_port, has_run, roles_of, signals, summary, wait_for, write
 
 pytestmark = pytest.mark.processes
 

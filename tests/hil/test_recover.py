@@ -214,15 +214,13 @@ def test_a_summary_that_was_lost_is_made_again(run):
     assert {**again, "wall_s": 0} == {**done.summary, "wall_s": 0}
 
 
-def test_what_cannot_be_recovered_is_said_in_a_line(tmp_path, capsys):
-    assert main(["recover", str(tmp_path)]) == 2
-    assert "is not a run folder (scenario.toml is missing)" in capsys.readouterr().err
+def test_what_cannot_be_recovered_is_said_in_a_line(tmp_path, refused):
+    line = refused("recover", str(tmp_path))
+    assert "is not a run folder (scenario.toml is missing)" in line
     (tmp_path / "scenario.toml").touch()
     (tmp_path / "parts").symlink_to("/dev/shm/gone")
-    assert main(["recover", str(tmp_path)]) == 2
-    assert "nothing is left of what was recorded (it lay in /dev/shm/gone)" in (
-        capsys.readouterr().err
-    )
+    line = refused("recover", str(tmp_path))
+    assert "nothing is left of what was recorded (it lay in /dev/shm/gone)" in line
 
 
 # the disk is full

@@ -19,13 +19,7 @@ from gfm_runtime.states import READY, RUNNING, SAFE
 from ..support.links import PATIENT, Tampering, assert_same, run_pair
 
 TRIP, RESET = 200, 700
-BASE = {
-    "title": "reset",
-    "duration": 0.12,
-    "law": "vsg-2",
-    "after_trip": "wait",
-    "link": PATIENT,
-}
+BASE = {"title": "reset", "duration": 0.12, "law": "vsg-2", "after_trip": "wait", "link": PATIENT}
 #: a voltage dip to nothing and back: over-current; then a step of P_ref, and a reset
 FALLS = [
     {"type": "grid-voltage", "tick": TRIP, "V_g": 0.0},

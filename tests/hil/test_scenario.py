@@ -205,8 +205,7 @@ def test_nothing_but_one_line_from_the_real_command(here):
 
 
 @pytest.mark.parametrize(
-    ("text", "part"),
-    [("title = ", "Invalid value"), ('title = "a"\ntitle = "b"', "overwrite")],
+    ("text", "part"), [("title = ", "Invalid value"), ('title = "a"\ntitle = "b"', "overwrite")]
 )
 def test_a_file_that_is_not_toml(text, part, here):
     Path("bad.toml").write_text(text)

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import shutil
 import ssl
 import subprocess
@@ -198,32 +197,6 @@ def test_pages_beyond_the_limit_are_put_off(served):
         with pytest.raises(InvalidStatus) as refused, connect(address):
             pass
         assert refused.value.response.status_code == 503
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["nowhere"], "nowhere: not a run folder"),
-        (["{run}", "--cert", "a.pem"], "--cert, --key: give both"),
-        (["{run}", "--cert", "a.pem", "--key", "b.pem"], "--cert a.pem"),
-        (["{run}", "--host", "203.0.113.1", "--plain"], "--host 203.0.113.1"),
-    ],
-)
-def test_wrong_options_are_one_line(run, capsys, tmp_path, monkeypatch, options, message):
-    monkeypatch.setattr(os, "nice", lambda by: by)  # it would last for all of pytest
-    monkeypatch.chdir(tmp_path)
-    folder = str(run(duration=0.01).folder) if "{run}" in options else ""
-    assert main(["scope", *(o.replace("{run}", folder) for o in options)]) == 2
-    said = capsys.readouterr()
-    assert message in said.err
-    assert said.err.count("\n") == 1
-    assert not said.out
-
-
-def test_a_folder_of_something_else(tmp_path, capsys):
-    (tmp_path / "scenario.toml").write_text("= 1")
-    assert main(["scope", str(tmp_path)]) == 2
-    assert "not a run folder: scenario.toml" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")

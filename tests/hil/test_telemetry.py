@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import zmq
 
-from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.ports.commands import Operator
@@ -226,27 +225,6 @@ def test_large_blocks_are_cut():
     found = messages(rows(7, 12_000))
     assert [topic for topic, _ in found] == [b"gfmhil/plant"] * 3
     assert max(len(payload) for _, payload in found) < 5010 * block_dtype("plant").itemsize
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nowhere"], "nowhere: no run is going on there; --wait waits for one"),
-        (["over"], "over: the run is over, see gfmhil export"),
-        (["x", "--port", "65535"], "--port 65535: has no next one, give --blocks"),
-        (["x", "--blocks", "-1"], "--blocks -1: must be 0"),
-        (["x", "--rate", "0"], "--rate 0: must lie in [0.1, 1e6] Hz"),
-        (["x", "--rate", "nan"], "--rate nan: must lie in"),
-    ],
-)
-def test_what_cannot_be_done_is_said_in_a_line(tmp_path, capsys, monkeypatch, words, said):
-    monkeypatch.chdir(tmp_path)
-    Path("over").mkdir()
-    Path("over/summary.json").touch()
-    assert main(["stream", *words]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
 
 
 def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):

@@ -266,31 +266,6 @@ def test_on_a_can_bus_a_frame_is_a_packet(run, tmp_path):
     assert "can" in shown and ("0x123" in shown or str(0x123) in shown), shown
 
 
-@pytest.mark.parametrize(
-    ("ids", "why"),
-    [
-        ("7,7", "--ids 0x7,0x7: must be two different ones of 0 to 0x7ff"),
-        ("0x800,1", "--ids 0x800,0x1: must be two different ones"),
-        ("7", "--ids 0x7: must be two different ones"),
-        ("a,b", "--ids a,b: must be two numbers"),
-    ],
-)
-def test_identifiers_that_cannot_be(ids, why, tmp_path, capsys):
-    assert main(["xcp", str(tmp_path), "--can", "can0", "--ids", ids]) == 2
-    error = capsys.readouterr().err
-    assert why in error and error.count("\n") == 1
-
-
-def test_beyond_this_machine_only_if_that_is_meant(tmp_path, capsys):
-    for more, why in (
-        (["--host", "0.0.0.0"], "--plain if it shall"),
-        (["--port", "70000"], "--port 70000: must be 0 (any) to 65535"),
-        (["--host", "0.0.0.0", "--plain"], "no run is going on there"),
-    ):
-        assert main(["xcp", str(tmp_path), *more]) == 2
-        assert why in capsys.readouterr().err
-
-
 SCENARIO = """
 title = "calibrated"
 duration = 600.0

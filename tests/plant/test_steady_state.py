@@ -5,13 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gfm_plant import (
-    NoEquilibrium,
-    Plant,
-    make_plant,
-    plant_advance,
-    plant_equilibrium,
-)
+from gfm_plant import NoEquilibrium, Plant, make_plant, plant_advance, plant_equilibrium
 from gfm_plant.model import f, g
 
 

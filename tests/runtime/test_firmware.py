@@ -399,11 +399,11 @@ def test_a_record_that_the_kernel_cannot_hold_is_refused(key, value, why, tmp_pa
         ("[]", "is not as gfmhil firmware export writes it"),
     ],
 )
-def test_a_folder_that_is_none_is_refused(text, why, tmp_path, capsys):
+def test_a_folder_that_is_none_is_refused(text, why, tmp_path, refused):
     if text is not None:
         (tmp_path / "report.json").write_text(text, encoding="utf-8")
-    assert main(["firmware", "check", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith(f"gfmhil: {tmp_path / 'report.json'}: {why}")
+    line = refused("firmware", "check", str(tmp_path))
+    assert line.startswith(f"gfmhil: {tmp_path / 'report.json'}: {why}")
 
 
 @pytest.mark.parametrize(
@@ -482,17 +482,6 @@ def test_the_third_output_of_a_stage_is_e_d(real):
     assert (of < 0).any()
 
 
-def test_what_the_command_refuses(tmp_path, capsys):
-    for arguments, why in (
-        (["export", "all", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
-        (["golden", "vsg-1", "--ticks", "0"], "--ticks 0: must lie in [1, 1000000]"),
-        (["export", "vsg-1", "vsg-1", "-o", str(tmp_path)], "law 'vsg-1': is named twice"),
-        (["export", "vsg", "-o", str(tmp_path)], "law 'vsg': unknown"),
-        (["export", "vsg-1", "--inner", "cascade", "-o", str(tmp_path)], "did you mean 'cascaded'"),
-        (["export", "vsg-1", "--f_n", "0", "-o", str(tmp_path)], "--f_n 0: must be > 0 Hz"),
-        (["export", "vsg-1", "--T_s", "0", "-o", str(tmp_path)], "T_s: 0.0 s must be > 0"),
-    ):
-        assert main(["firmware", *arguments]) == 2
-        assert why in capsys.readouterr().err
+def test_a_check_of_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(LawError, match="is not there"):
         check(tmp_path, "host")

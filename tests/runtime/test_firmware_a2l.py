@@ -148,19 +148,19 @@ def test_what_has_no_addresses_or_no_law_is_refused(tmp_path):
         elf_entries(tmp_path / "stripped")
 
 
-def test_what_is_no_elf_file_is_refused(tmp_path, capsys):
+def test_what_is_no_elf_file_is_refused(tmp_path, refused):
     file = tmp_path / "law.elf"
     for content in (b"", b"not one", b"\x7fELF" + bytes(100)):
         file.write_bytes(content)
-        assert main(["firmware", "a2l", str(file), "-o", str(tmp_path / "x.a2l")]) == 2
-        assert capsys.readouterr().err.startswith(f"gfmhil: {file}: is no readable ELF file")
-    assert main(["firmware", "a2l", str(tmp_path / "none"), "-o", "x.a2l"]) == 2
+        line = refused("firmware", "a2l", str(file), "-o", str(tmp_path / "x.a2l"))
+        assert line.startswith(f"gfmhil: {file}: is no readable ELF file")
+    refused("firmware", "a2l", str(tmp_path / "none"), "-o", "x.a2l")
 
 
-def test_without_pyelftools_the_command_names_the_extra(tmp_path, monkeypatch, capsys):
+def test_without_pyelftools_the_command_names_the_extra(tmp_path, monkeypatch, refused):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert main(["firmware", "a2l", str(tmp_path / "x.elf"), "-o", str(tmp_path / "x.a2l")]) == 2
-    assert "needs pyelftools: pip install 'gfmhil[calibration]'" in capsys.readouterr().err
+    line = refused("firmware", "a2l", str(tmp_path / "x.elf"), "-o", str(tmp_path / "x.a2l"))
+    assert "needs pyelftools: pip install 'gfmhil[calibration]'" in line
 
 
 def test_text_of_any_entry_is_read_by_a_parser(tmp_path):
@@ -191,8 +191,7 @@ def test_a_damaged_file_that_points_beyond_any_file_is_refused(tmp_path):
         elf_entries(file)
 
 
-def test_a_pipe_is_no_program(tmp_path, capsys):
+def test_a_pipe_is_no_program(tmp_path, refused):
     os.mkfifo(tmp_path / "pipe")
-    words = ["firmware", "a2l", str(tmp_path / "pipe"), "-o", str(tmp_path / "x.a2l")]
-    assert main(words) == 2
-    assert capsys.readouterr().err == f"gfmhil: {tmp_path / 'pipe'}: is not a regular file\n"
+    line = refused("firmware", "a2l", str(tmp_path / "pipe"), "-o", str(tmp_path / "x.a2l"))
+    assert line == f"gfmhil: {tmp_path / 'pipe'}: is not a regular file\n"

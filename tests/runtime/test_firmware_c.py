@@ -11,16 +11,7 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_runtime import LawError, get_law, load_law
-from gfm_runtime.firmware import (
-    CHECKED,
-    FIXED,
-    REALS,
-    STYLES,
-    check,
-    export,
-    golden,
-    make_modules,
-)
+from gfm_runtime.firmware import CHECKED, FIXED, REALS, STYLES, check, export, golden, make_modules
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 

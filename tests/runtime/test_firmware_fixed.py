@@ -293,22 +293,6 @@ def test_the_folder_says_formats_and_bounds(tmp_path):
         assert proven.drift / T_S <= said["drift"] <= 1.2 * proven.drift / T_S + 1e-12
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["vsg-2", "--style", "records"], "--style records: fixed point has its constants in"),
-        (["vsg-2", "--inner", "cascaded"], "law 'vsg-2': has an inner stage, which fixed point"),
-        (["mimo-gfm-scheduled"], "law 'mimo-gfm-scheduled': is scheduled, which fixed point"),
-    ],
-)
-def test_what_fixed_point_does_not_cover_is_refused(tmp_path, capsys, arguments, said):
-    command = ["firmware", "export", *arguments, "--real", "fixed", "-o", str(tmp_path / "out")]
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused():
     record = module("vsg-2").record.copy()
     record["high"][0] = 7.0
@@ -320,17 +304,14 @@ def test_limits_beyond_the_signal_table_and_unbounded_states_are_refused():
         make_fixed("x", record)
 
 
-def test_eva_refuses_a_folder_in_floating_point(tmp_path, capsys):
-    folder = exported(tmp_path, "float32", "unrolled", "droop-1")
-    assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
-    assert "has float32; it proves --real fixed only" in capsys.readouterr().err
-
-
-def test_eva_names_its_package(tmp_path, capsys, monkeypatch):
-    folder = exported(tmp_path, FIXED, "unrolled", "droop-1")
+@pytest.mark.parametrize(
+    ("real", "said"),
+    [("float32", "has float32; it proves --real fixed only"), (FIXED, "install frama-c-base")],
+)
+def test_eva_refuses_floats_and_names_its_package(real, said, tmp_path, refused, monkeypatch):
+    folder = exported(tmp_path, real, "unrolled", "droop-1")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["firmware", "check", str(folder), "--target", "eva"]) == 2
-    assert "apt-get install frama-c-base" in capsys.readouterr().err
+    assert said in refused("firmware", "check", str(folder), "--target", "eva")
 
 
 # --- compiled ---

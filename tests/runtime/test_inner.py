@@ -11,14 +11,7 @@ from scipy.integrate import solve_ivp
 
 from gfm_runtime import LawError, LawSet, get_law, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import (
-    PRIORITIES,
-    STAGES,
-    Cascaded,
-    InnerStage,
-    PowerLimiter,
-    VirtualStator,
-)
+from gfm_runtime.inner import PRIORITIES, STAGES, Cascaded, InnerStage, PowerLimiter, VirtualStator
 from gfm_runtime.inner_file import inner_names
 from gfm_runtime.signals import NU_INNER
 

@@ -179,11 +179,7 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "unknown parameter": ('k = "D_p"', 'k = "D_q"', ("phi_22.k", "'D_q'", "D_p")),
     "bad parameter name": ("k_p = {", '"k p" = {', ("parameters.k p", "pattern")),
-    "parameter without value": (
-        "value = 0.01, ",
-        "",
-        ("parameters.D_p.value", "missing"),
-    ),
+    "parameter without value": ("value = 0.01, ", "", ("parameters.D_p.value", "missing")),
     "parameter as expression": (
         "value = 0.05",
         'value = "0.1 / 2"',

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.engine.drive import Share
+from gfm_hil.engine.drive import Share, run_loop
 from gfm_hil.engine.handshake import shake_hands
-from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline

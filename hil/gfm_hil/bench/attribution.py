@@ -28,15 +28,16 @@ OURS = (CAUSES[_OWN], CAUSES[_LINK])
 _INTERRUPTED = 10.0  # times the 99th percentile of computation: it was interrupted
 _AFTER_EVENT = 2  # ticks that an event may delay: it is carried out between two of them
 
-Timing = Mapping[str, NDArray[np.int64]]
+Times = NDArray[np.int64]
+Timing = Mapping[str, Times]
 
 
-def missed_ticks(timing: Timing) -> NDArray[np.int64]:
+def missed_ticks(timing: Timing) -> Times:
     """Ticks of a run in real time whose u had not arrived by the next deadline."""
     return np.flatnonzero(timing["plant_received"] < 0)
 
 
-def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> NDArray[np.int64]:
+def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> Times:
     """The cause of each missed tick, as an index into ``CAUSES``; shape of ``missed_ticks``.
 
     Args:
@@ -85,7 +86,7 @@ def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
     return {cause: part.clip(min=0).astype(float) for cause, part in parts.items()}
 
 
-def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.int64]:
+def _away(timing: Timing, begin: Times, end: Times) -> Times:
     """How long the controller may not have polled between two times of each tick, ns.
 
     The controller records its longest gap since the last frame with the next frame that it takes.
@@ -107,12 +108,12 @@ def _away(timing: Timing, begin: NDArray[np.int64], end: NDArray[np.int64]) -> N
     return away
 
 
-def counts(causes: NDArray[np.int64]) -> dict[str, int]:
+def counts(causes: Times) -> dict[str, int]:
     """How many ticks each cause has."""
     return {name: int(np.sum(causes == k)) for k, name in enumerate(CAUSES)}
 
 
-def bursts(runs: Iterable[NDArray[np.int64]]) -> list[tuple[int, int]]:
+def bursts(runs: Iterable[Times]) -> list[tuple[int, int]]:
     """(length, number of bursts of it), from the missed ticks of runs, each in ascending order."""
     lengths = Counter[int]()
     for missed in runs:

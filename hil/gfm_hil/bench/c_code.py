@@ -1,11 +1,10 @@
-"""C sources of the benchmark, compiled at run time if there is a compiler."""
+"""C sources of the benchmark, compiled at run time if there is a compiler, and their laws."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import shlex
-import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,10 +17,7 @@ from gfm_runtime import get_law
 from gfm_runtime.firmware import Module, make_modules, sources
 from gfm_runtime.signals import NU
 
-Drive = Callable[..., None]
-
 T_S = 1e-4  # s, of the laws
-_DRIVE = Path(__file__).with_name("kernel_drive.c")
 FLAGS = "-O3"
 # A fused multiply-add rounds once, the kernel twice. Compilers for x86-64 do not fuse with -O3
 # alone; compilers for other processors do.
@@ -35,17 +31,16 @@ class NoCompiler(Exception):
 def compile_c(
     source: Path, folder: Path, name: str, flags: str = FLAGS, more: Sequence[Path] = ()
 ) -> Path:
-    """Compile sources into ``folder``/``name``.so by $CC or cc; headers may be there too.
-
-    Raises:
-        NoCompiler: there is none, or it fails.
-    """
+    """Compile sources into ``folder``/``name``.so by $CC or cc; headers may be there too. Raises
+    NoCompiler: there is none, or it fails."""
     compiler, library = os.environ.get("CC", "cc"), folder / f"{name}.so"
-    if shutil.which(compiler) is None:
-        raise NoCompiler(f"no C compiler: {compiler} is not there; install one or set CC")
     command = [compiler, *shlex.split(flags), *_ALWAYS, f"-I{folder}"]
     command += [str(source), *map(str, more), "-o", str(library), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        words = f"no C compiler: {compiler} is not there; install one or set CC"
+        raise NoCompiler(words) from None
     if done.returncode:
         first = next(iter(done.stderr.splitlines()), "")
         raise NoCompiler(f"the C compiler refused {source.name}: {first}")
@@ -53,12 +48,7 @@ def compile_c(
 
 
 class Twin:
-    """The generic step that ``gfmhil firmware export`` writes, compiled, with its laws.
-
-    Args:
-        library: of ``compile_twin``.
-        modules: the laws.
-    """
+    """The generic step that ``gfmhil firmware export`` writes, compiled, with its laws."""
 
     def __init__(self, library: ctypes.CDLL, modules: Sequence[Module]) -> None:
         self._library, self._prefixes = library, {m.name: m.prefix for m in modules}
@@ -71,11 +61,9 @@ class Twin:
         """A ``gfm_t``, all 0, one element."""
         return np.zeros(1, self._instance)
 
-    def drive(self, name: str) -> Drive:
-        """As ``gfm_hil.bench.kernel.drive`` for that law, which is part of the library.
-
-        Its state is an ``instance``. Arrays are passed by address, without a copy.
-        """
+    def drive(self, name: str) -> Callable[..., None]:
+        """As ``gfm_hil.bench.kernel.drive`` for a law of the library; its state is an
+        ``instance``. Arrays are passed by address, without a copy."""
         law = ctypes.addressof(ctypes.c_char.in_dll(self._library, f"{self._prefixes[name]}_law"))
         function = self._library.drive
         function.argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [self._scalar]
@@ -90,15 +78,13 @@ class Twin:
 
 
 def compile_twin(folder: Path, names: Sequence[str], real: DTypeLike, flags: str = FLAGS) -> Twin:
-    """Export laws of the catalogue for float64 or float32, and compile them.
-
-    Raises:
-        NoCompiler: there is none, or it fails.
-    """
+    """Export laws of the catalogue for float64 or float32, and compile them. Raises NoCompiler:
+    there is none, or it fails."""
     modules = make_modules({name: get_law(name) for name in names}, T_S, real)
     files = sources(modules, T_S, "records")
     for file, text in files.items():
         (folder / file).write_text(text, encoding="utf-8")
     laws = [folder / file for file in files if file.endswith(".c") and file != "gfm.c"]
-    name = f"twin_{np.dtype(real)}"
-    return Twin(ctypes.CDLL(str(compile_c(_DRIVE, folder, name, flags, laws))), modules)
+    drive = Path(__file__).with_name("kernel_drive.c")
+    library = compile_c(drive, folder, f"twin_{np.dtype(real)}", flags, laws)
+    return Twin(ctypes.CDLL(str(library)), modules)

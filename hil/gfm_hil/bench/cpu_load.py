@@ -37,21 +37,19 @@ def cpu_load() -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
         for cpu in sorted(os.sched_getaffinity(0))
     ]
 
-    def send(number: signal.Signals) -> None:
-        for process in started:
-            process.send_signal(number)
-        time.sleep(_SETTLE_S)
+    def send(wanted: Load, number: signal.Signals) -> None:
+        if wanted == "busy":
+            for process in started:
+                process.send_signal(number)
+            time.sleep(_SETTLE_S)
 
     @contextmanager
     def load(wanted: Load) -> Iterator[None]:
-        if wanted == "idle":
-            yield
-            return
-        send(signal.SIGCONT)
+        send(wanted, signal.SIGCONT)
         try:
             yield
         finally:
-            send(signal.SIGSTOP)
+            send(wanted, signal.SIGSTOP)
 
     try:
         for process in started:  # each stops itself

@@ -40,10 +40,8 @@ def lower_ends() -> NDArray[np.float64]:
 
 
 def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
-    """Quantiles in ns for these shares (0 to 1), each the middle of a bucket.
-
-    The smallest time of rank ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``.
-    """
+    """Quantiles in ns for these shares (0 to 1), each the middle of a bucket: the smallest time of
+    rank ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``."""
     total = np.cumsum(counts)
     ranks = np.maximum(np.ceil(np.round(np.asarray(shares) * total[-1], 6)), 1)
     ends = lower_ends()
@@ -61,8 +59,7 @@ def sparse(counts: Counts) -> list[list[int]]:
 def dense(pairs: Sequence[Sequence[int]]) -> Counts:
     """The histogram from the output of ``sparse``."""
     counts = np.zeros(BUCKETS, np.int64)
-    for k, n in pairs:
-        counts[k] = n
+    counts[[k for k, _ in pairs]] = [n for _, n in pairs]
     return counts
 
 

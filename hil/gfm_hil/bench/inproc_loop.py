@@ -21,7 +21,7 @@ from numba.core.runtime.nrt import rtsys
 from gfm_hil.bench.rounds import RUNS, ShowProgress, quickest, seconds, spread, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
-from gfm_hil.engine.setup import Bench, make_bench
+from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario import load_scenario
@@ -87,105 +87,86 @@ class InprocLoop:
     """
 
     def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
-        bench = make_bench(load_scenario(scenario, law=law, in_process=True))
-        bench.controller.set("P_ref", 0.8)
-        self.bench, self.ticks = bench, ticks
-        self.T_s = bench.scenario.T_s
-        self.plant = RolePart.create(folder, "plant", ticks).signals
-        self.controller = RolePart.create(folder, "controller", ticks).signals
-        c = bench.controller
-        self._kept = [*bench.plant.memory, c.ctl, c.laws, c.states, c.est, bench.y, bench.u]
+        b = make_bench(load_scenario(scenario, law=law, in_process=True))
+        b.controller.set("P_ref", 0.8)
+        self.bench, self.ticks, self.T_s = b, ticks, b.scenario.T_s
+        plant, controller = (
+            RolePart.create(folder, role, ticks).signals for role in ("plant", "controller")
+        )
+        self._rows = plant, controller
+        step = b.controller.ctl, b.controller.laws, b.controller.states, b.controller.est
+        self._kept = [*b.plant.memory, *step, b.y, b.u]
         self._start = [a.copy() for a in self._kept]
         self.whole()
-        self._rows = itertools.cycle(
-            np.split(RolePart.create(folder / "long", "plant", RUNS * ticks).signals, RUNS)
-        )
-        self._y, self._u = np.split(self.plant[:, : NY + NU].copy(), [NY], axis=1)
+        y, u = np.split(plant[:, : NY + NU].copy(), [NY], axis=1)
+        records, out = b.plant.records, (b.y, b.u)
+        self._parts: dict[str, tuple[Callable[..., object], tuple[Any, ...]]] = {
+            "plant": (plant_alone, (records, *out, u)),
+            "controller": (controller_alone, (*step, *out, y)),
+            "recording": (
+                recording_alone, (records, step[0], *step[2:], *out, plant, controller)
+            ),
+            "plant's half": (plants_half, (records, *out, u)),
+        }  # fmt: skip
+        # as in a run, rows that were not written lately
+        fresh = RolePart.create(folder / "long", "plant", RUNS * ticks).signals
+        self._fresh = itertools.cycle(np.split(fresh, RUNS))
 
-    def reset(self) -> Bench:
-        """Put every record back to the start."""
+    def _reset(self) -> None:
         for array, start in zip(self._kept, self._start, strict=True):
             array[:] = start
-        return self.bench
 
     def whole(self, ticks: int | None = None) -> float:
-        """The closed loop.
-
-        Raises:
-            UserError: the run ended early, so that there is nothing to time.
-        """
-        b, n = self.reset(), ticks or self.ticks
+        """The closed loop. Raises UserError: the run ended early, so that there is nothing to
+        time."""
+        self._reset()
+        b, n = self.bench, ticks or self.ticks
         done, controllers = 0, stack([b])
+        plant, controller = self._rows
 
         def run() -> None:
             nonlocal done
-            done = run_ticks(
-                b.plant.records, controllers, self.plant[None], self.controller[None], 0, n
-            )
+            done = run_ticks(b.plant.records, controllers, plant[None], controller[None], 0, n)
 
         time = seconds(run) / n * 1e9
         if done != n:
             raise UserError(f"{b.controller.active}: tripped or safe at tick {done - 1} of {n}")
         return time
 
-    def plant_part(self) -> float:
-        """The plant alone."""
-        b = self.reset()
-        return self._per_tick(plant_alone, b.plant.records, b.y, b.u, self._u)
-
-    def plants_half(self) -> float:
-        """The plant and its recording, into rows not written lately, as in a run."""
-        b, rows = self.reset(), next(self._rows)
-        return self._per_tick(plants_half, b.plant.records, b.y, b.u, self._u, rows)
-
-    def controller_part(self) -> float:
-        """The controller alone."""
-        b, c = self.reset(), self.bench.controller
-        return self._per_tick(controller_alone, c.ctl, c.laws, c.states, c.est, b.y, b.u, self._y)
-
-    def recording_part(self) -> float:
-        """The recording alone."""
-        b, c = self.reset(), self.bench.controller
-        rows = self.plant, self.controller
-        return self._per_tick(
-            recording_alone, b.plant.records, c.ctl, c.states, c.est, b.y, b.u, *rows
-        )
+    def part(self, name: str) -> float:
+        """The plant, the controller or the recording alone, or the plant's half: the plant and its
+        recording."""
+        self._reset()
+        work, arguments = self._parts[name]
+        more = [next(self._fresh)] if work is plants_half else []
+        return seconds(lambda: work(*arguments, *more)) / self.ticks * 1e9
 
     def allocations_per_tick(self) -> float:
         """Allocations of numba's runtime per tick; those per call cancel."""
+
+        def allocations(ticks: int) -> int:
+            before = rtsys.get_allocation_stats().alloc
+            self.whole(ticks)
+            return int(rtsys.get_allocation_stats().alloc - before)
+
         _nrt_python.memsys_enable_stats()
-        short, long = self._allocations(self.ticks // 2), self._allocations(self.ticks)
+        short, long = allocations(self.ticks // 2), allocations(self.ticks)
         _nrt_python.memsys_disable_stats()
         return (long - short) / (self.ticks - self.ticks // 2)
-
-    def _allocations(self, ticks: int) -> int:
-        before: int = rtsys.get_allocation_stats().alloc
-        self.whole(ticks)
-        return int(rtsys.get_allocation_stats().alloc) - before
-
-    def _per_tick(self, work: Callable[..., object], *arguments: Any) -> float:
-        return seconds(lambda: work(*arguments)) / self.ticks * 1e9
 
 
 def measure_laws(
     laws: Sequence[str], rounds: int, folder: Path, show: ShowProgress
 ) -> Iterator[dict[str, Any]]:
-    """ns per tick of laws and of the rig, one row each; ``folder`` is for the recordings.
-
-    Raises:
-        UserError: a run ended early, so that there is nothing to time.
-    """
+    """ns per tick of laws and of the rig, one row each; ``folder`` is for the recordings. Raises
+    UserError: a run ended early, so that there is nothing to time."""
     runs = {name: ("pref_step", name) for name in laws or LAWS}
     runs[RIG] = ("rig_pref_step", "mimo-gfm")
     for k, (name, (scenario, law)) in enumerate(runs.items()):
         show(f"loop in process, {name}", k / len(runs))
         loop = InprocLoop(scenario, law, _TICKS, folder / name)
-        parts = {
-            "whole": loop.whole,
-            "plant": loop.plant_part,
-            "controller": loop.controller_part,
-            "recording": loop.recording_part,
-        }
+        parts: dict[str, Callable[[], float]] = {"whole": loop.whole}
+        parts |= {n: partial(loop.part, n) for n in ("plant", "controller", "recording")}
         times = take_turns({n: partial(quickest, part) for n, part in parts.items()}, rounds)
         yield {
             "law": name,

@@ -12,9 +12,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gfm_hil.bench.attribution import bursts
+from gfm_hil.bench.attribution import Times, bursts
 from gfm_hil.bench.contenders import memory_folder
 from gfm_hil.bench.cpu_load import cpu_load
 from gfm_hil.bench.histogram import summary
@@ -44,21 +43,21 @@ def pace(first_ns, period_ns, how, late):
         late[k] = now_ns() - due
 
 
-def pace_here(first_ns: int, period_ns: int, how: int, ticks: int) -> NDArray[np.int64]:
+def pace_here(first_ns: int, period_ns: int, how: int, ticks: int) -> Times:
     """``pace`` in a process of the pair."""
     late = np.full(ticks, -1, np.int64)
     pace(first_ns, period_ns, how, late)
     return late
 
 
-def pace_both(two: Pair, period_ns: int, how: int, seconds: float) -> NDArray[np.int64]:
+def pace_both(two: Pair, period_ns: int, how: int, seconds: float) -> Times:
     """Lateness on both processors at the same time, ns, shape (2, ticks)."""
     ticks = max(1, round(seconds * 1e9 / period_ns))
     first = time.monotonic_ns() + _LEAD_NS
     return np.stack(list(two.both(pace_here, first, period_ns, how, ticks).values()))
 
 
-def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
+def lost(late: Times, allowed_ns: float) -> Times:
     """Ticks at which either of the two, (2, ticks), was later than allowed."""
     return np.flatnonzero((late > allowed_ns).any(axis=0))
 
@@ -66,13 +65,10 @@ def lost(late: NDArray[np.int64], allowed_ns: float) -> NDArray[np.int64]:
 def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
     """Add a row per policy, load and way to wait to ``jitter``."""
     cells = list(product(options.policies, options.loads, WAITS))
-    late: dict[tuple[str, str, str], list[NDArray[np.int64]]] = {cell: [] for cell in cells}
+    late = {cell: list[Times]() for cell in cells}
     with ExitStack() as stack:
         load_is = stack.enter_context(cpu_load())
-        two = {
-            policy: stack.enter_context(pair(policy, memory_folder(stack)))
-            for policy in options.policies
-        }
+        two = {p: stack.enter_context(pair(p, memory_folder(stack))) for p in options.policies}
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compile before timing
         for _, share, cell in in_turn(cells, options.rounds, options.until):
@@ -85,7 +81,7 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     content["jitter"] = [_row(*cell, late[cell]) for cell in cells]
 
 
-def _row(policy: str, load: str, wait: str, rounds: list[NDArray[np.int64]]) -> dict[str, Any]:
+def _row(policy: str, load: str, wait: str, rounds: list[Times]) -> dict[str, Any]:
     ticks = sum(late.shape[1] for late in rounds)
     gone = [lost(late, PERIOD_NS) for late in rounds]
     count = sum(map(len, gone))

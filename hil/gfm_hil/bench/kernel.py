@@ -8,7 +8,7 @@ output into its limits, and their outputs and states are compared bit by bit.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.bench.c_code import T_S, Drive, NoCompiler, Twin, compile_twin
+from gfm_hil.bench.c_code import T_S, NoCompiler, Twin, compile_twin
 from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.rounds import ShowProgress, quickest, ratios, seconds, spread, take_turns
 from gfm_runtime import discretise, get_law, law_names
@@ -30,12 +30,6 @@ FEEDBACK = 1e-6  # p.u. of y per p.u. of u
 REALS = ("float64", "float32")
 _STEPS = 10_000  # in one of the short runs of a turn
 _COMPARED = 40  # times all rows, before the timing
-
-
-def io_dtype(real: DTypeLike) -> np.dtype[Any]:
-    """Record of a step's inputs and outputs."""
-    f = np.dtype(real)
-    return np.dtype([("ref", f, (NY,)), ("y", f, (NY,)), ("u", f, (NU,))], align=True)
 
 
 @compiled
@@ -59,12 +53,10 @@ def drive(law, state, io, inputs, outputs, steps, feedback):
 
 @dataclass
 class Chain:
-    """One law at its reference, with measurements that scatter around it, and its outputs.
+    """One law at its reference, with measurements that scatter around it, and its outputs; ``how``
+    is numba's or C's ``drive``, and ``state`` is the kernel's record or C's."""
 
-    ``how`` is numba's or C's ``drive``, and ``state`` is the kernel's record or C's.
-    """
-
-    how: Drive
+    how: Callable[..., None]
     law: NDArray[Any]
     state: NDArray[Any]
     io: NDArray[Any]
@@ -73,16 +65,15 @@ class Chain:
 
     @staticmethod
     def make(name: str, real: DTypeLike, scatter: float, twin: Twin | None = None) -> Chain:
-        """A new chain in numba, or in C with a twin.
-
-        ``scatter`` is the standard deviation of the measurements, p.u.
-        """
+        """A new chain in numba, or in C with a twin; ``scatter``: the standard deviation of the
+        measurements, p.u."""
         ref = np.array([s.default for s in group("ref")])
         y = ref + scatter * np.random.default_rng(1).standard_normal((ROWS, NY))
         law = pack_law(discretise(get_law(name), T_S), real)
         state = twin.instance() if twin else np.zeros(1, state_dtype(real))
         how = twin.drive(name) if twin else drive
-        io = np.zeros(1, io_dtype(real))
+        fields = [("ref", real, (NY,)), ("y", real, (NY,)), ("u", real, (NU,))]
+        io = np.zeros(1, np.dtype(fields, align=True))
         io["ref"], io["u"] = ref, 1.0
         return Chain(how, law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
 
@@ -93,9 +84,8 @@ class Chain:
 
     def limited(self) -> NDArray[np.bool_]:
         """Which of the outputs (rows, 3) are at a limit."""
-        law = self.law[0]
-        at: NDArray[np.bool_] = (self.outputs <= law["low"]) | (self.outputs >= law["high"])
-        return at
+        low, high = self.law[0]["low"], self.law[0]["high"]
+        return np.asarray((self.outputs <= low) | (self.outputs >= high))
 
 
 def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
@@ -149,14 +139,13 @@ def _rows(
 ) -> Iterator[dict[str, Any]]:
     agreement = {n: compare(n, real, twin, _COMPARED) for n in names} if twin else {}
 
-    def job(name: str, of: Twin | None) -> float:
-        """ns per step."""
+    def ns_per_step(name: str, of: Twin | None) -> float:
         chain = Chain.make(name, real, 1e-3, of)
         chain.run(ROWS)  # warm up
         return quickest(lambda: seconds(lambda: chain.run(_STEPS))) / _STEPS * 1e9
 
     ways: dict[str, Twin | None] = {"numba": None} | ({"C": twin} if twin else {})
-    jobs = {f"{n} {way}": partial(job, n, of) for n in names for way, of in ways.items()}
+    jobs = {f"{n} {way}": partial(ns_per_step, n, of) for n in names for way, of in ways.items()}
     times = take_turns(jobs, rounds)
     for n in names:
         numba, c = times[f"{n} numba"], times.get(f"{n} C")

@@ -24,12 +24,8 @@ _FIRST_S = 0.02  # length of the warm-up round
 
 @dataclass
 class _RoundTrips:
-    """Those of one contender in one mode under one load.
-
-    Attributes:
-        rounds: round trips of each round, ns.
-        silent: rounds in which no answer came.
-    """
+    """Those of one contender in one mode under one load, ns, by round; and how many rounds had no
+    answer."""
 
     contender: Contender
     mode: Mode

@@ -21,9 +21,8 @@ from statistics import fmean, median
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gfm_hil.bench.attribution import OURS, attribute, bursts, counts, missed_ticks
+from gfm_hil.bench.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
 from gfm_hil.bench.contenders import memory_folder
 from gfm_hil.bench.cpu_load import cpu_load
 from gfm_hil.bench.histogram import summary
@@ -45,25 +44,18 @@ _SETTLE = 1_000  # ticks left out after the start of the CPU load
 _PATIENCE_S = 5.0  # peer timeout: a busy machine must not end a run
 _SHORT = 2_000  # ticks of one of the short runs in process
 
-Times = NDArray[np.int64]
 Beside = Callable[[], AbstractContextManager[None]]
 
 
 @dataclass
 class _Run:
-    """A run, and in real time the bare loop before and after it.
+    """A run, and in real time the bare loop before and after it."""
 
-    Attributes:
-        timing: columns of timing.npz, without the ticks before the CPU load has settled.
-        scheduling: of the two sides.
-        early: why it ended early; empty if it did not.
-        late: of the bare loop, (2, ticks), ns.
-    """
-
+    # columns of timing.npz, without the ticks before the CPU load has settled
     timing: dict[str, Times]
-    scheduling: list[str]
-    early: str
-    late: Times | None = None
+    scheduling: list[str]  # of the two sides
+    early: str  # why it ended early; empty if it did not
+    late: Times | None = None  # of the bare loop, (2, ticks), ns
 
 
 def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
@@ -105,13 +97,12 @@ def _lockstep(
     as many stretches, so that neither a stop of the machine nor a change of its speed counts.
     """
     loops = [(INPROC, 0), *product(links, (0, 1))]
-    rates: dict[tuple[str, int], list[float]] = {loop: [] for loop in loops}
-    shares: dict[tuple[str, int], list[float]] = {loop: [] for loop in loops}
+    rates, shares = ({loop: list[float]() for loop in loops} for _ in range(2))
     ticks = round(options.seconds / T_S)
     with ExitStack() as stack:
         place = memory_folder(stack)
         alone = InprocLoop("pref_step", LAW, _SHORT, place / "inproc")
-        half = partial(quickest, alone.plants_half, max(RUNS, ticks // _SHORT))
+        half = partial(quickest, partial(alone.part, "plant's half"), max(RUNS, ticks // _SHORT))
         for _, share, (link, delay) in in_turn(loops, options.rounds, options.until):
             before_ns = half()
             show(f"lockstep, {link}", share)
@@ -152,7 +143,7 @@ def _realtime(
 ) -> list[dict[str, Any]]:
     """Misses at 10 kHz in real time over every link under every load."""
     cells = list(product(links, options.loads))
-    runs: dict[tuple[str, str], list[_Run]] = {cell: [] for cell in cells}
+    runs = {cell: list[_Run]() for cell in cells}
     with ExitStack() as stack:
         place = memory_folder(stack)
         load_is = stack.enter_context(cpu_load())
@@ -176,10 +167,8 @@ def _realtime(
 
 
 def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
-    trips: list[Times] = []
-    missed: list[Times] = []
+    trips, missed, beyond = list[Times](), list[Times](), list[float]()
     ticks = host = host_ticks = 0
-    beyond: list[float] = []
     causes = Counter[str]()
     for run in runs:
         assert run.late is not None
@@ -219,15 +208,11 @@ def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
 
 def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario:
     content = {
-        "title": f"bench, {link}",
-        "duration": duration,
-        "T_s": T_S,
-        "mode": mode,
-        "law": LAW,
+        "title": f"bench, {link}", "duration": duration, "T_s": T_S, "mode": mode, "law": LAW,
         "plant": {"delay": {"samples": delay}},
         "link": {"type": link, "peer_timeout_s": _PATIENCE_S},
         "late_policy": {"hold": 10**9},  # count misses, never end the run
-    }
+    }  # fmt: skip
     return check_scenario(content, "bench")
 
 
@@ -249,12 +234,8 @@ def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
     policies = [f"{e['role']}: {e['policy']}" for e in run.events if e["event"] == "scheduling"]
     early = ""
     if run.status != "completed":
-        lines = dict.fromkeys(filter(None, (_last_line(folder / f"{role}.log") for role in ROLES)))
-        early = f"{run.status} {' / '.join(lines) or run.summary['reason']}".strip()
+        logs = (log for role in ROLES if (log := folder / f"{role}.log").exists())
+        ends = dict.fromkeys(log.read_text("utf-8").strip().splitlines()[-1] for log in logs)
+        early = f"{run.status} {' / '.join(filter(None, ends)) or run.summary['reason']}".strip()
     shutil.rmtree(folder)
     return _Run(timing, policies, early)
-
-
-def _last_line(log: Path) -> str:
-    """The last line of a failed side's log."""
-    return log.read_text("utf-8").strip().splitlines()[-1] if log.exists() else ""

@@ -1,4 +1,4 @@
-"""From the options of ``gfmhil bench`` to its measurements; checks every option first."""
+"""The options of ``gfmhil bench``, checked, and the measurements that they ask for."""
 
 from __future__ import annotations
 
@@ -33,43 +33,29 @@ Measurement = Callable[[dict[str, Any], ShowProgress], None]
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to measure; a benchmark uses those that concern it.
+    """What to measure; a benchmark uses those that concern it."""
 
-    Attributes:
-        links, laws: names; no laws: the benchmark's own choice.
-        modes: lockstep: one round trip after the other; realtime: one every 100 µs.
-        loads: idle, or busy: with a CPU load on each processor.
-        policies: scheduling of the two processes, the best one first.
-        payload: bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back.
-        cflags: for the C compiler.
-        seconds: of one round.
-        rounds: of each; fewer if they would not end by ``until`` (``time.monotonic``).
-    """
-
-    links: Sequence[str]
-    modes: Sequence[Mode]
-    loads: Sequence[Load]
-    policies: Sequence[Policy]
-    payload: int
-    laws: Sequence[str]
-    cflags: str
-    seconds: float
-    rounds: int
+    links: Sequence[str]  # names
+    modes: Sequence[Mode]  # lockstep: one round trip after the other; realtime: one every 100 µs
+    loads: Sequence[Load]  # idle, or busy: with a CPU load on each processor
+    policies: Sequence[Policy]  # scheduling of the two processes, the best one first
+    payload: int  # bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back
+    laws: Sequence[str]  # names; none: the benchmark's own choice
+    cflags: str  # for the C compiler
+    seconds: float  # of one round
+    rounds: int  # of each; fewer if they would not end by ``until`` (``time.monotonic``)
     until: float
 
 
 def measurements(options: Namespace) -> list[Measurement]:
-    """The measurements that the command's options ask for, in order.
+    """The measurements that the command's options ask for, in order. Raises UserError: an option is
+    invalid."""
 
-    Raises:
-        UserError: an option is invalid.
-    """
+    given = {k: v for k, v in vars(options).items() if v is not None}
 
     def part(kind: str, **changes: Any) -> Measurement:
-        checked = _checked(
-            kind, {k: v for k, v in vars(options).items() if v is not None} | changes
-        )
-        return partial(import_module(f"gfm_hil.bench.{kind}").measure, checked)
+        checked = _checked(kind, given | changes)
+        return partial(import_module(f"{__package__}.{kind}").measure, checked)
 
     if options.kind in KINDS:
         return [part(options.kind)]
@@ -86,8 +72,14 @@ def measurements(options: Namespace) -> list[Measurement]:
 
 def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
     of = options.get
+    links = _split("--links", of("links"))
+    try:
+        for name in links:
+            link_kind(name)
+    except ValueError as problem:
+        raise UserError(f"--links: {problem}") from None
     return BenchOptions(
-        links=_links(of("links")),
+        links=links,
         modes=_split("--mode", of("mode"), MODES) or MODES,
         loads=_split("--load", of("load"), LOADS) or LOADS,
         policies=_policies(of("policy", "auto")),
@@ -109,16 +101,6 @@ def _split(option: str, text: str | None, allowed: Sequence[Any] | None = None) 
         if not name or (allowed is not None and name not in allowed):
             wanted = f"from {', '.join(allowed)}" if allowed is not None else "none empty"
             raise UserError(f"{option} {text!r}: names separated by commas, {wanted}")
-    return names
-
-
-def _links(text: str | None) -> list[str]:
-    names = _split("--links", text)
-    for name in names:
-        try:
-            link_kind(name)
-        except ValueError as problem:
-            raise UserError(f"--links: {problem}") from None
     return names
 
 

@@ -28,7 +28,7 @@ Policy = Literal["fifo", "other"]
 
 CAPACITY = 1 << 20  # most round trips in a round
 _PATIENCE_S = 120.0
-WARM_NS = 20_000_000
+_WARM_NS = 20_000_000
 
 # state in each of the two processes
 _role: Role = "plant"
@@ -43,31 +43,25 @@ class Pair:
     def __init__(self, pools: dict[Role, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
         self._pools, self._stop = pools, stop
 
-    def call(self, role: Role, work: Any, *arguments: Any) -> Any:
-        """Call a function in one of them and return its result."""
-        return _wait(self._pools[role].submit(work, *arguments))
-
     def both(self, work: Any, *arguments: Any) -> dict[Role, Any]:
         """Call a function in both at the same time."""
         futures = {s: pool.submit(work, *arguments) for s, pool in self._pools.items()}
         return {s: _wait(future) for s, future in futures.items()}
 
     def open(self, contender: Contender, payload: int) -> bool:
-        """Open a contender's ends; returns whether its loops are compiled.
-
-        Raises:
-            UserError: it cannot be opened.
-        """
+        """Open a contender's ends; returns whether its loops are compiled. Raises UserError: it
+        cannot be opened."""
         for role in ROLES:
-            compiled = self.call(role, _open, contender, payload)
+            compiled = _wait(self._pools[role].submit(_open, contender, payload))
         return bool(compiled)
 
     def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
         """Times of the round trips of one round in ns; none if the peer stopped answering."""
         self._stop[0] = 0
         answers = self._pools["controller"].submit(_pong, contender.name)
+        name, duration_ns = contender.name, int(seconds * 1e9)
         try:
-            return self.call("plant", _ping, contender.name, period_ns, int(seconds * 1e9))
+            return _wait(self._pools["plant"].submit(_ping, name, period_ns, duration_ns))
         finally:
             self._stop[0] = 1
             _wait(answers)
@@ -93,7 +87,6 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
         for role in ROLES
     }
     stop = np.memmap(path, np.int64, "r+")
-    two = Pair(pools, stop)
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:  # both start now and inherit this: only the parent handles Ctrl-C
         started = [pool.submit(_started) for pool in pools.values()]
@@ -102,7 +95,7 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     try:
         for one in started:
             _wait(one)
-        yield two
+        yield Pair(pools, stop)
     finally:
         stop[0] = 1
         for pool in pools.values():
@@ -115,10 +108,7 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
 def _set_up(role: Role, policy: Policy, stop: str) -> None:
     global _role, _took, _stop
     end_with_parent()
-    if policy == "fifo":
-        ask_for_real_time(role)
-    else:
-        own_processor(role)
+    (ask_for_real_time if policy == "fifo" else own_processor)(role)
     _role, _took = role, np.zeros(CAPACITY, np.int64)
     _took += 1  # touch all pages before a round
     _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
@@ -139,10 +129,10 @@ def _pong(name: str) -> None:
 
 
 def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
-    end = _ends[name]
-    if end.ping(_stop, period_ns, WARM_NS, _took) < 0:
-        return _took[:0]
-    return _took[: max(end.ping(_stop, period_ns, duration_ns, _took), 0)]
+    for duration in (_WARM_NS, duration_ns):
+        if (n := _ends[name].ping(_stop, period_ns, duration, _took)) < 0:
+            return _took[:0]
+    return _took[:n]
 
 
 def _close() -> None:

@@ -52,19 +52,13 @@ def plain(size: int) -> Messages:
 
 @dataclass(frozen=True)
 class PingPong:
-    """One end of a contender.
+    """One end of a contender."""
 
-    Attributes:
-        ping: sends requests: (stop, period_ns, duration_ns, took); see the module.
-        pong: answers until stopped: (stop).
-        close: frees all resources.
-        compiled: whether its loops are compiled.
-    """
-
+    # sends requests: (stop, period_ns, duration_ns, took); see the module
     ping: Callable[[Numbers, int, int, Numbers], int]
-    pong: Callable[[Numbers], object]
-    close: Callable[[], None]
-    compiled: bool
+    pong: Callable[[Numbers], object]  # answers until stopped: (stop)
+    close: Callable[[], None]  # frees all resources
+    compiled: bool  # whether its loops are compiled
 
 
 @cached
@@ -144,8 +138,7 @@ def _ping_python(
             if time.monotonic_ns() - begin > SILENCE_NS:
                 return -1
         now = time.monotonic_ns()
-        took[n] = now - begin
-        begin = now
+        took[n], begin = now - begin, now
         n += 1
     return n
 

@@ -20,7 +20,7 @@ _GREY = "#888888"
 _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
 _CAUSE_COLOURS = dict(zip(CAUSES, (_BLUE, _ORANGE, _SKY, "#b8b8b8"), strict=True))
 
-Rows = list[dict[str, Any]]
+Row = dict[str, Any]
 
 
 def _colours(names: list[str]) -> dict[str, str]:
@@ -29,7 +29,7 @@ def _colours(names: list[str]) -> dict[str, str]:
     return {name: COLOURS[k % (len(COLOURS) - 1)] for k, name in enumerate(every)}
 
 
-def _curve(row: dict[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _curve(row: Row) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """1/(1 - q) and the µs that a share q does not exceed, one point per bucket."""
     counts = dense(row["histogram"])
     at = np.flatnonzero(counts)
@@ -52,12 +52,10 @@ def _percentile_axis(axes: Axes, nines: int) -> None:
     axes.set_xlabel("share of all that take no longer", fontsize=9)
 
 
-def _panels(
-    rows: Rows, keys: tuple[str, str], label: str, draw: Callable[[Axes, dict[str, Any]], None]
-) -> Figure:
+def _panels(rows: list[Row], keys: list[str], label: str, draw: Callable[..., None]) -> Figure:
     """One panel for each value of the first key (rows) and of the second (columns)."""
     down, across = ([*dict.fromkeys(r[key] for r in rows)] for key in keys)
-    size = (4.9 * max(len(across), 1) + 2.0, 3.1 * len(down) + 0.4)
+    size = (4.9 * len(across) + 2.0, 3.1 * len(down) + 0.4)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(down), len(across), squeeze=False, sharex=True, sharey=True)
     nines = int(np.log10(max(r["n"] for r in rows)))
@@ -76,19 +74,19 @@ def _panels(
     return figure
 
 
-def latency(content: dict[str, Any]) -> Figure | None:
+def latency(content: Row) -> Figure | None:
     """Percentiles of the round trips: a link's contenders in shades of one colour, limits dashed
     in the colour of the first contender that is compared with them."""
     rows = [r for r in content["results"] if r["n"]]
     contenders = list({r["name"]: r for r in rows if r["peer"] != "C"}.values())
     colours = _colours([r["link"] for r in contenders])
-    look: dict[str, tuple[str, float]] = {}
+    look = dict[str, tuple[str, float]]()
     for k, row in enumerate(contenders):
         same = sum(other["link"] == row["link"] for other in contenders[:k])
         look[row["name"]] = colours[row["link"]], max(1.0 - 0.3 * same, 0.3)
     limits = {r["baseline"]: look[r["name"]] for r in reversed(contenders)}
 
-    def draw(axes: Axes, row: dict[str, Any]) -> None:
+    def draw(axes: Axes, row: Row) -> None:
         limit = row["peer"] == "C"
         colour, alpha = (limits if limit else look).get(row["name"], (_GREY, 1.0))
         axes.plot(
@@ -96,24 +94,24 @@ def latency(content: dict[str, Any]) -> Figure | None:
             lw=1.1 if limit else 1.7, ls=(0, (3, 2)) if limit else "-",
         )  # fmt: skip
 
-    return _panels(rows, ("mode", "load"), "round trip [µs]", draw) if rows else None
+    return _panels(rows, ["mode", "load"], "round trip [µs]", draw) if rows else None
 
 
-def jitter(content: dict[str, Any]) -> Figure | None:
+def jitter(content: Row) -> Figure | None:
     """Percentiles of the lateness, and the period."""
     rows = content.get("jitter")
     if not rows:
         return None
     colours = dict(zip(dict.fromkeys(r["wait"] for r in rows), COLOURS, strict=False))
 
-    def draw(axes: Axes, row: dict[str, Any]) -> None:
+    def draw(axes: Axes, row: Row) -> None:
         axes.plot(*_curve(row), color=colours[row["wait"]], lw=1.5, label=row["wait"])
         axes.axhline(row["period_us"], color=_GREY, lw=0.8, ls=(0, (4, 3)))
 
-    return _panels(rows, ("policy", "load"), "later than its deadline [µs]", draw)
+    return _panels(rows, ["policy", "load"], "later than its deadline [µs]", draw)
 
 
-def misses(content: dict[str, Any]) -> Figure | None:
+def misses(content: Row) -> Figure | None:
     """Missed ticks by cause, with those of the host alone, and their bursts."""
     rows = content.get("loop", {}).get("realtime")
     if not rows:
@@ -151,7 +149,7 @@ def misses(content: dict[str, Any]) -> Figure | None:
     return figure
 
 
-def lockstep(content: dict[str, Any]) -> Figure | None:
+def lockstep(content: Row) -> Figure | None:
     """Times real time over each link."""
     rows = content.get("loop", {}).get("lockstep")
     if not rows:
@@ -177,7 +175,7 @@ def lockstep(content: dict[str, Any]) -> Figure | None:
     return figure
 
 
-def kernel(content: dict[str, Any]) -> Figure | None:
+def kernel(content: Row) -> Figure | None:
     """ns per step of every law, in the first real type."""
     rows = content.get("kernel")
     if not rows:

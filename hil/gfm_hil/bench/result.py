@@ -39,11 +39,7 @@ def write_result(content: dict[str, Any], path: Path) -> None:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """Read a result from a file or a folder.
-
-    Raises:
-        UserError: it is not a result.
-    """
+    """Read a result from a file or a folder. Raises UserError: it is not a result."""
     file = path / "bench.json" if path.is_dir() else path
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -53,11 +49,8 @@ def read_result(path: Path) -> dict[str, Any]:
 
 
 def check_result(content: Any, source: str) -> dict[str, Any]:
-    """The content, if it is a result.
-
-    Raises:
-        UserError: it is not a result, or one of another version.
-    """
+    """The content, if it is a result. Raises UserError: it is not a result, or one of another
+    version."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UserError(f"{source}: not a result of `gfmhil bench` of format {FORMAT}")
     return content

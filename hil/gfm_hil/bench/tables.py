@@ -40,12 +40,8 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def _percent(key: str) -> Column:
-    return lambda row: percent(row[key])
-
-
-def _micro(key: str) -> Column:
-    return lambda row: micro(row[key])
+def _of(key: str, show: Callable[[Any], str]) -> Column:
+    return lambda row: show(row[key])
 
 
 def _number(key: str, form: str = ",") -> Column:
@@ -57,7 +53,7 @@ def _median(key: str, form: str, unit: str = "") -> Column:
     return lambda row: format(row[key]["median"], form) + unit if row[key] else "–"
 
 
-_PERCENTILES = {name.replace("_", "."): _micro(f"{name}_us") for name in SHARES}
+_PERCENTILES = {name.replace("_", "."): _of(f"{name}_us", micro) for name in SHARES}
 
 
 def latency_tables(content: Row) -> Iterator[Table]:
@@ -81,7 +77,7 @@ def jitter_tables(content: Row) -> Iterator[Table]:
     if "jitter" in content:
         columns = {"": "policy", "load": "load", "wait": "wait", **_PERCENTILES}
         heading = "A loop that only paces, every 100 µs: late by [µs]"
-        yield _table(heading, content["jitter"], columns | {"ticks lost": _percent("lost_pct")})
+        yield _table(heading, content["jitter"], columns | {"ticks lost": _of("lost_pct", percent)})
 
 
 def realtime_tables(content: Row) -> Iterator[Table]:
@@ -96,25 +92,21 @@ def realtime_tables(content: Row) -> Iterator[Table]:
         columns
         | {
             "ticks": _number("ticks"),
-            "missed": _percent("missed_pct"),
-            "the host's own": _percent("host_pct"),
-            "beyond it, median": _percent("beyond_host_pct"),
-            "by work or link": _percent("by_work_or_link_pct"),
+            "missed": _of("missed_pct", percent),
+            "the host's own": _of("host_pct", percent),
+            "beyond it, median": _of("beyond_host_pct", percent),
+            "by work or link": _of("by_work_or_link_pct", percent),
             "trip p50 [µs]": _PERCENTILES["p50"],
             "p99 [µs]": _PERCENTILES["p99"],
         },
     )
-    causes = {cause: _cause(cause) for cause in (rows[0]["causes"] if rows else ())}
-    columns |= causes | {"longest burst": _longest_burst}
+    columns |= {c: _cause(c) for c in (rows[0]["causes"] if rows else ())}
+    columns["longest burst"] = lambda row: str(max((n for n, _ in row["bursts"]), default=0))
     yield _table("Missed ticks by cause", rows, columns)
 
 
 def _cause(cause: str) -> Column:
     return lambda row: format(row["causes"][cause], ",")
-
-
-def _longest_burst(row: Row) -> str:
-    return str(max((length for length, _ in row["bursts"]), default=0))
 
 
 def lockstep_name(row: Row) -> str:

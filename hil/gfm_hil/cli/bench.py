@@ -130,8 +130,7 @@ def call(options: argparse.Namespace) -> int:
 
 def compare_call(options: argparse.Namespace) -> int:
     """Carry the comparison out; returns the exit code."""
-    from gfm_hil.bench.compare import compare, comparison_table
-    from gfm_hil.bench.interleave import interleave
+    from gfm_hil.bench.compare import compare, comparison_table, interleave
     from gfm_hil.bench.result import read_result
 
     remarks = []

@@ -13,8 +13,8 @@ from pydantic import TypeAdapter
 from gfm_hil.core.files import write_text
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
-from gfm_hil.studies.conformity.model import Test
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.criteria.base import UnderTest
+from gfm_hil.studies.conformity.sets import Test
 from gfm_runtime.inner import Inner
 from gfm_runtime.lawfile import LawFile
 

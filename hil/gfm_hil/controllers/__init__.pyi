@@ -1,4 +1,4 @@
-from .external import BenchContext, ControllerError, ControllerProtocol, check_currents
+from .external import BenchContext, ControllerError, ExternalController, check_currents
 from .kinds import FORMS, PIL, controller_file, open_controller, precision
 from .pil import PilController
 from .ports import PortMap, read_map
@@ -8,7 +8,7 @@ __all__ = [
     "PIL",
     "BenchContext",
     "ControllerError",
-    "ControllerProtocol",
+    "ExternalController",
     "PilController",
     "PortMap",
     "check_currents",

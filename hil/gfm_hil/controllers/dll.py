@@ -5,8 +5,6 @@ have any width and any type of number; real-code models that leave out FirstCall
 or Terminate are loaded too.
 """
 
-from __future__ import annotations
-
 import ctypes as c
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
-from gfm_hil.controllers.ports import PortMap, wire
+from gfm_hil.controllers.ports import PortMap, Vector, wire
 from gfm_hil.core.errors import UserError
 
 _EMT, _ERROR = 1, 2
@@ -96,11 +94,11 @@ class _Values:
                 self.names.append(name if width == 1 else f"{name}[{j}]")
                 self._views.append(self._block[f"f{k}"][0, j : j + 1])
 
-    def write(self, values: NDArray[np.float64]) -> None:
+    def write(self, values: Vector) -> None:
         for view, value in zip(self._views, values, strict=True):
             view[0] = value
 
-    def read(self) -> NDArray[np.float64]:
+    def read(self) -> Vector:
         return np.array([view[0] for view in self._views], float)
 
     def view(self, name: str) -> NDArray[Any]:
@@ -165,8 +163,7 @@ class DllController(MappedController):
             *(states.ctypes.data for states in self._states),
         )  # fmt: skip
 
-    def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ControllerProtocol``."""
+    def start(self, u: Vector) -> None:
         self._ticks = 0
         for states in self._states:
             states[:] = 0
@@ -176,14 +173,13 @@ class DllController(MappedController):
         self._out.write(self._wiring.outputs(u, len(self._names)))
         self._call("Model_Initialize")
 
-    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, inputs: Vector) -> Vector:
         self._in.write(inputs)
         self._now.Time = self._ticks * self._T_s
         self._call("Model_Outputs")
         return self._out.read()
 
     def close(self) -> None:
-        """See ``ControllerProtocol``."""
         if hasattr(self._of, "Model_Terminate"):
             self._of.Model_Terminate(c.byref(self._now))
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.controllers.ports import PortWiring
+from gfm_hil.controllers.ports import PortWiring, Vector
 from gfm_hil.core.errors import UserError
 from gfm_plant import Bases
+
+if TYPE_CHECKING:
+    from gfm_runtime.assembly import Controller
+    from gfm_runtime.tustin import DiscreteLaw
+
+    Retuned = tuple[DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
@@ -37,52 +43,59 @@ class ControllerError(Exception):
     """A controller fails while it runs; the message names it and says what it said."""
 
 
-class ControllerProtocol(Protocol):
-    """A controller that is not ours.
+class ExternalController:
+    """A controller that computes u in place of the process's own.
 
     Attributes:
         name: what the run calls it: 1 to 64 printable ASCII characters.
         real: float64 or float32, for the laws that the controller's process has beside it.
+        has_laws: it runs the run's own laws, between which events may change.
+        count: instructions of the law's step in the last tick; -1 where they are not counted.
     """
 
     name: str
-    real: str
+    real = "float64"
+    has_laws = False
+    count = -1
 
-    def start(self, u: NDArray[np.float64]) -> None:
-        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,).
+    def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
+        """Get ready for a run; only one that runs its laws has something to do.
 
-        Raises:
-            ControllerError: it refuses.
-        """
-
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """One tick: u[k] from the references (5,) and the measurements, p.u.
+        Args:
+            controller: at rest, with the laws, in the precision ``real``.
+            changed: further laws, discretised and packed, that may come into its spare places.
 
         Raises:
-            ControllerError: it fails, or blocks the bridge.
+            UserError: a program for the laws cannot be built, or does not start.
         """
+
+    def has(self, law: Retuned) -> bool:
+        """Whether it can change to this law, discretised and packed."""
+        return False
+
+    def start(self, u: Vector) -> None:
+        """Make it ready for tick 0, its outputs beginning at u, p.u., shape (3,) or (4,). Raises
+        ControllerError: it refuses."""
+
+    def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
+        """One tick: u[k] from the references (5,) and the measurements, p.u.; before it one that
+        has our laws changes to that of the index ``changed``, or to none at -1. Raises
+        ControllerError: it fails, or blocks the bridge."""
 
     def close(self) -> None:
         """End it, and remove what it left."""
 
 
-class MappedController:
+class MappedController(ExternalController):
     """A controller whose ports a map wires to the signals, and which steps every so many ticks;
     each kind sets the wiring, the outputs' names and how many ticks."""
 
-    real = "float64"
-    name: str
     _wiring: PortWiring
     _names: list[str]
     _every: int
     _ticks = 0
 
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """See ``ControllerProtocol``."""
+    def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
         if self._ticks % self._every == 0:
             outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
             if blocks >= 0 and outputs[blocks] != 0:
@@ -91,16 +104,13 @@ class MappedController:
             self._wiring.take(outputs, u)
         self._ticks += 1
 
-    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, inputs: Vector) -> Vector:
         raise NotImplementedError
 
 
 def refuse_source(text: str) -> None:
-    """Check that a controller is no source.
-
-    Raises:
-        UserError: it is; the message says how to compile it.
-    """
+    """Check that a controller is no source. Raises UserError: it is; the message says how to
+    compile it."""
     file = Path(text.partition(":")[2])
     if text.startswith(("c:", "dll:")) and file.suffix in (".c", ".h", ".cc", ".cpp"):
         raise UserError(
@@ -112,10 +122,7 @@ def refuse_source(text: str) -> None:
 
 def check_currents(text: str, inner: bool) -> None:
     """Check that a run, with an inner stage or without, carries what a library in C measures.
-
-    Raises:
-        UserError: ``text`` is ``c:FILE``, and the run has no inner stage.
-    """
+    Raises UserError: ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
     if text.startswith("c:") and not inner:
         raise UserError(
@@ -131,11 +138,8 @@ def run_name(kind: str, controller: str) -> str:
 
 
 def ticks_a_step(where: str, step_s: float, T_s: float) -> int:
-    """How many ticks of T_s [s] pass between two steps of a controller.
-
-    Raises:
-        UserError: its step is not a whole number of ticks.
-    """
+    """How many ticks of T_s [s] pass between two steps of a controller. Raises UserError: its step
+    is not a whole number of ticks."""
     ticks = round(step_s / T_s) if step_s > 0 else 0
     if ticks < 1 or abs(step_s - ticks * T_s) > 1e-6 * T_s:
         raise UserError(

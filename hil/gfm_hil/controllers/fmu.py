@@ -1,14 +1,11 @@
 """An FMU for co-simulation, FMI 2.0 or 3.0, as a controller; FMPy loads it."""
 
-from __future__ import annotations
-
 import contextlib
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.controllers.external import (
     BenchContext,
@@ -17,7 +14,7 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
-from gfm_hil.controllers.ports import PortMap, wire
+from gfm_hil.controllers.ports import PortMap, Vector, wire
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import Archive
@@ -86,8 +83,7 @@ class FmuController(MappedController):
         text = said[-1]
         self._said = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
-    def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ControllerProtocol``."""
+    def start(self, u: Vector) -> None:
         self._ticks = 0
         try:
             if not self._fresh:
@@ -103,7 +99,7 @@ class FmuController(MappedController):
         except self._failed as problem:
             raise ControllerError(self._why(problem)) from None
 
-    def _step(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, inputs: Vector) -> Vector:
         outputs = np.zeros(len(self._names))
         try:
             for kind, places, references in self._in:
@@ -116,7 +112,6 @@ class FmuController(MappedController):
         return outputs
 
     def close(self) -> None:
-        """See ``ControllerProtocol``."""
         with contextlib.suppress(self._failed):
             self._it.terminate()
             self._it.freeInstance()
@@ -131,12 +126,8 @@ class FmuController(MappedController):
 
 
 def _check_size(path: Path) -> None:
-    """See that a file is an archive that may be unpacked.
-
-    Raises:
-        OSError: it is no regular file.
-        BadZipFile: it is no archive, or has too many or too large members.
-    """
+    """See that a file is an archive that may be unpacked. Raises OSError: it is no regular file;
+    BadZipFile: it is no archive, or has too many or too large members."""
     with open_regular(path) as file, zipfile.ZipFile(Archive(file, _MEMBERS)) as archive:
         size = sum(info.file_size for info in archive.infolist())
         if size > _UNPACKED:

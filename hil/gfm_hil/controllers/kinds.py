@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from gfm_hil.controllers.dll import DllController
-from gfm_hil.controllers.external import BenchContext, ControllerProtocol, refuse_source
+from gfm_hil.controllers.external import BenchContext, ExternalController, refuse_source
 from gfm_hil.controllers.fmu import FmuController
 from gfm_hil.controllers.library import LibraryController
 from gfm_hil.controllers.ports import PortMap
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gfm_hil.controllers.pil import PilController
 
 PIL = "pil:"
-_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ControllerProtocol]] = {
+_KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ExternalController]] = {
     "dll": DllController,
     "fmu": FmuController,
     "c": LibraryController,
@@ -32,9 +32,7 @@ _LOOK_S = 0.05
 T = TypeVar("T")
 
 
-def open_controller(
-    text: str, ports: PortMap, context: BenchContext
-) -> ControllerProtocol | PilController:
+def open_controller(text: str, ports: PortMap, context: BenchContext) -> ExternalController:
     """The controller that ``text`` names.
 
     Args:
@@ -58,11 +56,8 @@ def open_controller(
 
 def until_signal(what: str, work: Callable[[], T]) -> T:
     """What ``work`` gives, in a thread of its own: foreign code that does not come back would keep
-    signals from acting.
-
-    Raises:
-        UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what`` did not come back.
-    """
+    signals from acting. Raises UserError: SIGINT, SIGTERM or SIGHUP came first; it says ``what``
+    did not come back."""
     found: Future[T] = Future()
 
     def call() -> None:
@@ -81,10 +76,7 @@ def until_signal(what: str, work: Callable[[], T]) -> T:
 
 def controller_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
     """The kind and the file of the controller ``KIND:FILE``; ``forms`` is what the message allows.
-
-    Raises:
-        UserError: there is no such kind or file.
-    """
+    Raises UserError: there is no such kind or file."""
     kind, colon, file = text.partition(":")
     if not colon or kind not in _KINDS or not file:
         raise UserError(f"controller {text!r}: must be {forms}")
@@ -97,16 +89,12 @@ def controller_file(text: str, forms: str = _FILES) -> tuple[str, Path]:
 
 def precision(text: str) -> str:
     """The precision, float64 or float32, of the laws beside the controller that ``text`` names.
-
-    Raises:
-        UserError: it is a target that is not there.
-    """
+    Raises UserError: it is a target that is not there."""
     return _pil(text).real if text.startswith(PIL) else "float64"
 
 
 def _pil(text: str) -> PilController:
-    from gfm_hil.controllers.pil import (
-        PilController,  # brings the compilers in, which few runs need
-    )
+    # brings the compilers in, which few runs need
+    from gfm_hil.controllers.pil import PilController
 
     return PilController(text.removeprefix(PIL))

@@ -7,24 +7,20 @@ of it. The bridge's voltage stays where it is in space until the next call, as t
 does: each tick it is turned back in the frame by what the frame turns.
 """
 
-from __future__ import annotations
-
 import cmath
 import ctypes as c
 import math
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gfm_hil.controllers.external import (
     BenchContext,
     ControllerError,
+    ExternalController,
     check_currents,
     run_name,
     ticks_a_step,
 )
-from gfm_hil.controllers.ports import PortMap
+from gfm_hil.controllers.ports import PortMap, Vector
 from gfm_hil.core.errors import UserError
 from gfm_runtime.signals import carried, names
 
@@ -52,7 +48,7 @@ class _ControllerOutput(c.Structure):
     _fields_ = (("e", _Phases), ("i_dc", c.c_double))
 
 
-class LibraryController:
+class LibraryController(ExternalController):
     """A controller in a shared library.
 
     Args:
@@ -64,8 +60,6 @@ class LibraryController:
         UserError: it cannot be loaded, has not the interface or another version of it, refuses
             this bench, or the run does not carry the currents.
     """
-
-    real = "float64"
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         if beyond := sorted(ports.model_fields_set - {"step_s"}):
@@ -105,15 +99,12 @@ class LibraryController:
         self._v_dc = y["v_dc"]
         self._ref = {name: k for k, name in enumerate(names("ref"))}
 
-    def start(self, u: NDArray[np.float64]) -> None:
-        """See ``ControllerProtocol``; the library starts at the first tick, with measurements."""
+    def start(self, u: Vector) -> None:
+        # the library starts at the first tick, with measurements
         self._ticks, self._speed = 0, float(u[1])
         self._now(complex(u[2], u[3]), float(u[0]))
 
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """See ``ControllerProtocol``."""
+    def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
         if self._ticks % self._every == 0:
             self._measure(ref, y)
             if self._ticks == 0:
@@ -127,7 +118,6 @@ class LibraryController:
         self._ticks += 1
 
     def close(self) -> None:
-        """See ``ControllerProtocol``."""
         self._of.gfmhil_free(self._self)
 
     def _angle(self, ticks: float) -> float:
@@ -143,7 +133,7 @@ class LibraryController:
         self._out.e[:] = _phases(turned)
         self._out.i_dc = i_u * self._dc_A
 
-    def _measure(self, ref: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+    def _measure(self, ref: Vector, y: Vector) -> None:
         bases, turn = self._context.bases, cmath.exp(1j * self._angle(self._ticks))
         self._in.t = self._ticks * self._context.T_s
         for name, (d, q) in self._pairs.items():

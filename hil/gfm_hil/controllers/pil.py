@@ -15,12 +15,13 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.controllers.external import ControllerError
+from gfm_hil.controllers.external import ControllerError, ExternalController
+from gfm_hil.controllers.ports import Vector
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import our_controller_on
@@ -33,9 +34,9 @@ from gfm_runtime.firmware.loop import CHANGE, CHECK, FROM, START, TICK, TO, Loop
 from gfm_runtime.firmware.module import RESULTS, Module
 from gfm_runtime.signals import REF_NAMES, carried
 from gfm_runtime.states import BAD_U, BAD_Y, OK
-from gfm_runtime.tustin import DiscreteLaw
 
-Retuned = tuple[DiscreteLaw, NDArray[Any]]
+if TYPE_CHECKING:
+    from gfm_hil.controllers.external import Retuned
 
 _START_S, _LOOK_S = 30.0, 0.05
 _LINES, _BYTES = 3, 2000  # of what QEMU says, at most
@@ -43,20 +44,17 @@ _SIGNALS = {BAD_Y: carried("y", True), RESULTS["BAD_REF"][0]: REF_NAMES}
 _SAID = dict(RESULTS.values())
 
 
-class PilController:
+class PilController(ExternalController):
     """The laws of a run on a target; a context in which its program runs.
 
     Args:
         target: one of ``gfm_runtime.firmware.TARGETS``.
 
-    Attributes:
-        name: what the run calls it.
-        real: of its arithmetic, float32 or float64.
-        count: instructions of the law's step in the last tick; -1 where they are not counted.
-
     Raises:
         UserError: there is no such target, or its tools are missing (the packages are named).
     """
+
+    has_laws = True
 
     def __init__(self, target: str) -> None:
         if target not in TARGETS:
@@ -73,21 +71,14 @@ class PilController:
         except LawError as problem:
             raise UserError(f"controller pil: {problem}") from None
         self.name = our_controller_on(target)
-        self.count = -1
         self._starts: select.poll | None = None
         self._target = target
         self._ends = contextlib.ExitStack()
 
     def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
-        """Build the program for a controller's laws, and start it.
-
-        Args:
-            controller: in the precision ``real``; ``start`` and ``tick`` work on its records.
-            changed: further laws, discretised and packed, that may come into its spare places.
-
-        Raises:
-            UserError: it cannot be built, does not start, or gives other bits than the kernel.
-        """
+        """Build the program for a controller's laws, on whose records it then works, and start it.
+        Raises UserError: it cannot be built, does not start, or gives other bits than the
+        kernel."""
         self._controller, kind = controller, controller.laws.dtype
         ready = [*zip(controller.discrete, controller.laws, strict=True)][:-SPARE]
         ready += [(discrete, packed.astype(kind)[0]) for discrete, packed in changed]
@@ -106,7 +97,6 @@ class PilController:
             raise UserError(f"controller pil: {problem}") from None
 
     def has(self, law: Retuned) -> bool:
-        """Whether the program has this law, discretised and packed."""
         return _numbers(law[1].astype(self._controller.laws.dtype)[0]) in self._places
 
     def _run(self, program: LoopProgram) -> None:
@@ -139,11 +129,8 @@ class PilController:
         self._none = int(self._answer["count"][0])
 
     def _check(self, modules: Sequence[Module], rows: Golden) -> None:
-        """Step the program through golden rows; from then on reading waits for ever.
-
-        Raises:
-            ControllerError: a bit is not the kernel's, or the program has ended.
-        """
+        """Step the program through golden rows; from then on reading waits for ever. Raises
+        ControllerError: a bit is not the kernel's, or the program has ended."""
         differ = []
         for row in rows.words:
             self._request["what"], self._give_up = CHECK, time.monotonic() + _START_S
@@ -164,12 +151,8 @@ class PilController:
         self._starts = None
         os.set_blocking(self._from, True)
 
-    def start(self) -> None:
-        """Load the controller's active law in its present state.
-
-        Raises:
-            ControllerError: the program has ended.
-        """
+    def start(self, u: Vector) -> None:
+        """Load the controller's active law in its present state, in which u is."""
         c = self._controller
         k = int(c.ctl["active"][0])
         request, state = self._request, self._state
@@ -180,18 +163,9 @@ class PilController:
         self._send(request)
         self._send(state)
 
-    def tick(self, changed: int, u: NDArray[np.float64]) -> None:
-        """One tick: u[k] from the controller's references and measurements of this tick, p.u.
-
-        What a run records of a law is then in the controller's records.
-
-        Args:
-            changed: the law to change to before, as its index; -1: the active one stays.
-            u: shape (3,) or (4,); NaN in what is not finite.
-
-        Raises:
-            ControllerError: the program has ended, or refuses.
-        """
+    def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
+        """u from the controller's records, where what a run records of a law is then; NaN in what
+        is not finite."""
         ctl, states = self._controller.ctl, self._controller.states
         request, answer = self._request, self._answer
         request["what"] = TICK
@@ -217,18 +191,13 @@ class PilController:
             ctl["bump"] = one["bump"]
 
     def close(self) -> None:
-        """End the program, and remove what it left."""
         self._ends.close()
 
     def _send(self, what: NDArray[Any]) -> None:
         os.write(self._to, what.view(np.uint8).data)
 
     def _receive(self) -> None:
-        """The next answer.
-
-        Raises:
-            ControllerError: the program has ended.
-        """
+        """The next answer. Raises ControllerError: the program has ended."""
         into = self._answer.view(np.uint8).data
         while len(into):
             while self._starts and not self._starts.poll(_LOOK_S * 1e3):
@@ -262,11 +231,8 @@ class PilController:
         return self._places[_numbers(self._controller.laws[k])]
 
     def _refuse(self, result: int, channel: int, n_u: int) -> None:
-        """Say why there is no u; an output that is not finite the controller itself reports.
-
-        Raises:
-            ControllerError: the law refuses its inputs, or the answer is none.
-        """
+        """Say why there is no u; an output that is not finite the controller itself reports. Raises
+        ControllerError: the law refuses its inputs, or the answer is none."""
         names = {**_SIGNALS, BAD_U: range(n_u)}.get(result, ())
         if not 0 <= channel < len(names):
             raise self._problem(f"answers {result} for signal {channel}, which no law does")

@@ -1,34 +1,26 @@
 """Which signal each port of a controller is: by their names, or by a map in a TOML file."""
 
-from __future__ import annotations
-
-import math
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.schema import StrictSchema
 from gfm_runtime.signals import carried, command_rows, names
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
 #: the groups that an FMU of ours puts before its names
 _GROUP = re.compile(r"^(ref|y|u)\.")
 #: an output of our own controllers: 0, or why the bridge must be blocked
 REASON = "reason"
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class Scaled(_Strict):
+class Scaled(StrictSchema):
     """A signal and its scale.
 
     Attributes:
@@ -37,10 +29,10 @@ class Scaled(_Strict):
     """
 
     signal: str
-    scale: _Number = 1.0
+    scale: float = 1.0
 
 
-class PortMap(_Strict):
+class PortMap(StrictSchema):
     """What a map file holds.
 
     Attributes:
@@ -52,20 +44,17 @@ class PortMap(_Strict):
         step_s: time between two steps of the controller, s; by default what it says itself.
     """
 
-    inputs: dict[str, str | _Number | Scaled] = {}
-    outputs: dict[str, str | Scaled] = {}
-    fixed: dict[str, _Number] = {}
-    parameters: dict[str, _Number] = {}
+    inputs: dict[str, str | float | Scaled] = Field({})
+    outputs: dict[str, str | Scaled] = Field({})
+    fixed: dict[str, float] = Field({})
+    parameters: dict[str, float] = Field({})
     blocks: str | None = None
-    step_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    step_s: float | None = Field(None, gt=0)
 
 
 def read_map(file: Path | None) -> PortMap:
-    """The map in a file; an empty one without a file.
-
-    Raises:
-        UserError: the file cannot be read, or a key or value is wrong.
-    """
+    """The map in a file; an empty one without a file. Raises UserError: the file cannot be read, or
+    a key or value is wrong."""
     if file is None:
         return PortMap()
     try:
@@ -78,57 +67,54 @@ def read_map(file: Path | None) -> PortMap:
         raise UserError("\n".join(f"{file}: {line}" for line in lines(problem))) from None
 
 
-@dataclass(frozen=True)
-class PortWiring:
+Vector = NDArray[np.float64]
+#: of some ports, each with a signal: their places among the controller's, the signals' places, and
+#: the ports' values at 1 p.u.
+_Wires = tuple[NDArray[np.int64], NDArray[np.int64], Vector]
+
+
+class PortWiring(NamedTuple):
     """The map of a controller's ports, made for a run.
 
     Attributes:
         constants: shape (inputs,), what a port gets that has no signal.
-        ports, signals, scales: for each input with a signal: its place among the inputs, the
-            signal's place among references and measurements, and the port's value at 1 p.u.
-        sources, targets, units: for each output that is a signal of u: its place among the
-            outputs, the signal's place in u, and the port's value at 1 p.u.
+        into, out: of the inputs, the signals being references and measurements, and of the
+            outputs, the signals being those of u.
         fixed: shape (3,) or (4,): values of u that no port gives.
         blocks: place of the output that blocks the bridge, or -1.
     """
 
-    constants: NDArray[np.float64]
-    ports: NDArray[np.int64]
-    signals: NDArray[np.int64]
-    scales: NDArray[np.float64]
-    sources: NDArray[np.int64]
-    targets: NDArray[np.int64]
-    units: NDArray[np.float64]
-    fixed: NDArray[np.float64]
+    constants: Vector
+    into: _Wires
+    out: _Wires
+    fixed: Vector
     blocks: int
 
-    def inputs(self, ref: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def inputs(self, ref: Vector, y: Vector) -> Vector:
         """The values of all inputs, from references and measurements in p.u."""
-        values = self.constants.copy()
-        values[self.ports] = np.concatenate((ref, y))[self.signals] * self.scales
+        values, (ports, signals, scales) = self.constants.copy(), self.into
+        values[ports] = np.concatenate((ref, y))[signals] * scales
         return values
 
-    def outputs(self, u: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    def outputs(self, u: Vector, count: int) -> Vector:
         """The values of all ``count`` outputs at which u comes out; 0 where there is no signal."""
-        values = np.zeros(count)
-        values[self.sources] = u[self.targets] * self.units
+        values, (ports, signals, scales) = np.zeros(count), self.out
+        values[ports] = u[signals] * scales
         return values
 
-    def take(self, outputs: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+    def take(self, outputs: Vector, u: Vector) -> None:
         """Set u, p.u., from the values of all outputs."""
+        ports, signals, scales = self.out
         u[:] = self.fixed
-        u[self.targets] = outputs[self.sources] / self.units
+        u[signals] = outputs[ports] / scales
 
 
 def wire(
     where: str, ports: PortMap, inputs: Sequence[str], outputs: Sequence[str], inner: bool
 ) -> PortWiring:
-    """Map a controller's ports, which are in its order, to the signals of a run.
-
-    Raises:
-        UserError: a port or a signal that is not there, a port without a signal, or a signal of u
-            that comes from nowhere or twice.
-    """
+    """Map a controller's ports, which are in its order, to the signals of a run. Raises UserError:
+    a port or a signal that is not there, a port without a signal, or a signal of u that comes from
+    nowhere or twice."""
     known, u = [*names("ref"), *carried("y", inner)], [s.name for s in command_rows(inner)]
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):
@@ -163,15 +149,11 @@ def wire(
         raise UserError(
             f"{where}: blocks = {blocks!r} in its map: must be one of {', '.join(outputs)}"
         )
-    (ports_in, signals, scales), (sources, targets, units) = map(_columns, (into, out))
     place = -1 if blocks is None else list(outputs).index(blocks)
-    return PortWiring(constants, ports_in, signals, scales, sources, targets, units, fixed, place)
+    return PortWiring(constants, _columns(into), _columns(out), fixed, place)
 
 
-_Column = NDArray[np.int64]
-
-
-def _columns(rows: list[tuple[int, int, float]]) -> tuple[_Column, _Column, NDArray[np.float64]]:
+def _columns(rows: list[tuple[int, int, float]]) -> _Wires:
     first, second, scales = zip(*rows, strict=True) if rows else ((), (), ())
     return np.array(first, np.int64), np.array(second, np.int64), np.array(scales, np.float64)
 
@@ -189,6 +171,6 @@ def _place(where: str, asked: str | Scaled, known: Sequence[str]) -> tuple[int, 
             f"{where}: signal {wanted.signal!r} must be one of {', '.join(known)}; "
             "name it in the map file"
         )
-    if wanted.scale == 0 or not math.isfinite(wanted.scale):
+    if wanted.scale == 0:
         raise UserError(f"{where}: scale = {wanted.scale:g} must not be 0")
     return list(known).index(wanted.signal), wanted.scale

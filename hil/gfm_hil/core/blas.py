@@ -4,8 +4,6 @@ The matrices here are small: more threads only wait for each other and spin on p
 loop needs. A value that the user has set stays.
 """
 
-from __future__ import annotations
-
 import os
 
 for _name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

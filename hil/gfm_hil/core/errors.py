@@ -1,7 +1,5 @@
 """Errors that the user can fix: printed as one line, without a traceback."""
 
-from __future__ import annotations
-
 import importlib.util
 
 from gfm_runtime.mistakes import lines as lines

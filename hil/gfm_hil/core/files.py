@@ -4,8 +4,6 @@ A folder may come from anybody: what lies in place of a file may be a link, a pi
 larger than memory. ``open_file``, ``read_file`` and ``read_json`` are the only ways in.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os
@@ -36,12 +34,8 @@ def check_empty(folder: Path) -> None:
 
 
 def open_file(path: Path, most: int | None = None) -> io.BufferedReader:
-    """Open a file of a run folder for reading: regular, no link, at most so many bytes.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        UserError: it is something else, or too large.
-    """
+    """Open a file of a run folder for reading: regular, no link, at most so many bytes. Raises
+    FileNotFoundError: it is not there; UserError: it is something else, or too large."""
     with _refused(path):
         return open_regular(path, most, links=False)
 
@@ -87,11 +81,8 @@ def read_json(path: Path, model: type[BaseModel], most: int = SMALL) -> dict[str
 
 
 def check_values(path: Path, data: bytes) -> None:
-    """See that a JSON text takes a limited memory when it is parsed.
-
-    Raises:
-        UserError: it may hold too many values.
-    """
+    """See that a JSON text takes a limited memory when it is parsed. Raises UserError: it may hold
+    too many values."""
     if sum(data.count(sign) for sign in (b",", b"[", b"{")) > _MOST_VALUES:
         raise UserError(f"{path}: holds more than {_MOST_VALUES} values")
 
@@ -110,11 +101,8 @@ class Archive(io.BufferedReader):
         self._members = members
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As of any file; ``zipfile`` reads the directory at once.
-
-        Raises:
-            BadZipFile: the directory is too long.
-        """
+        """As of any file; ``zipfile`` reads the directory at once. Raises BadZipFile: the directory
+        is too long."""
         most = self._members * _LONGEST
         left = min(most, self._end - self.tell()) + 1  # a read of more would first take the memory
         data = super().read(min(left, size) if size is not None and size >= 0 else left)
@@ -130,10 +118,8 @@ def replacing(path: Path) -> Iterator[Path]:
     The data is on disk before the rename is, so that a power failure leaves either the old file or
     the new one. If the block raises, ``path`` stays as it was. The file is new and its name cannot
     be told in advance, so that nobody can put a link in its place; if ``path`` is a link, the file
-    replaces the link.
-
-    Raises:
-        OSError: the file cannot be written; it names ``path``, not the path beside it.
+    replaces the link. Raises OSError: the file cannot be written; it names ``path``, not the path
+    beside it.
     """
     part = path.with_name(f"{_PREFIX}{secrets.token_hex(8)}-{path.name}")
     try:

@@ -1,7 +1,5 @@
 """Who gives a command, for the log of the run."""
 
-from __future__ import annotations
-
 import os
 import pwd
 from typing import Any

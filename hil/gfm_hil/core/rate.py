@@ -1,7 +1,5 @@
 """Rate limit of commands: a token bucket."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable
@@ -31,11 +29,8 @@ class Rate:
         self.refused = 0
 
     def take(self) -> None:
-        """Count one command.
-
-        Raises:
-            UserError: it exceeds the limit; the caller must not carry it out.
-        """
+        """Count one command. Raises UserError: it exceeds the limit; the caller must not carry it
+        out."""
         with self._lock:
             now = self._clock()
             gained = (now - self._since) * self._per_s

@@ -1,7 +1,5 @@
 """The two roles of a run: the controller and the plant."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 Role = Literal["controller", "plant"]

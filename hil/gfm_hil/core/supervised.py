@@ -1,7 +1,5 @@
 """Background work that survives its exceptions: they are reported, and the work restarts."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

@@ -6,8 +6,6 @@ files of our own user are locked, read or removed: another user may put anything
 any name, and may hold a lock on any file that that user can open.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os
@@ -31,10 +29,8 @@ def is_private(found: os.stat_result) -> bool:
 
 def private_folder() -> Path:
     """The folder of our user in memory, made if it is not there; nobody else has any access to it.
-
-    Raises:
-        PermissionError: what is there belongs to another user, is open to others or no folder.
-    """
+    Raises PermissionError: what is there belongs to another user, is open to others or no
+    folder."""
     place = MEMORY / f"gfmhil-{os.geteuid()}"
     with contextlib.suppress(FileExistsError):
         place.mkdir(0o700)
@@ -126,11 +122,8 @@ def temporary(prefix: str) -> Iterator[Path]:
 
 
 def held(place: Path) -> bool:
-    """Whether a process uses a folder.
-
-    Raises:
-        OSError: it is unknown, for example because no descriptors are left.
-    """
+    """Whether a process uses a folder. Raises OSError: it is unknown, for example because no
+    descriptors are left."""
     try:
         handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY)
     except FileNotFoundError:  # it is gone
@@ -170,10 +163,7 @@ def left_behind(prefix: str, where: Path) -> Iterator[tuple[Path, int]]:
 
 def copy_files(names: list[str], source: int, target: int) -> None:
     """Copy regular files of our user from one open folder to another, readable by our user alone.
-
-    Raises:
-        OSError: a file does not belong to our user, or there is no room.
-    """
+    Raises OSError: a file does not belong to our user, or there is no room."""
     for name in names:
         handle = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=source)
         with os.fdopen(handle, "rb") as file:

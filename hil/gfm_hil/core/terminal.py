@@ -1,7 +1,5 @@
 """Tables: on a terminal of any width, in a pipe or a file, and in Markdown."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from typing import Any

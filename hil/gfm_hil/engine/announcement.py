@@ -1,7 +1,5 @@
 """Which command servers a run folder announces; a killed process leaves its file behind."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +38,8 @@ def announcement(folder: Path, role: Role) -> Path:
 
 
 def announced(folder: Path, role: Role) -> dict[str, Any] | None:
-    """What a role's command server announces, or None if no living process has one.
-
-    Raises:
-        UserError: the file or process cannot be examined; the run itself may be fine.
-    """
+    """What a role's command server announces, or None if no living process has one. Raises
+    UserError: the file or process cannot be examined; the run itself may be fine."""
     file = announcement(folder, role)
     try:
         found = Announcement(**read_json(file, Announcement))
@@ -59,11 +54,8 @@ def announced(folder: Path, role: Role) -> dict[str, Any] | None:
 
 
 def present(folder: Path) -> list[Role]:
-    """The roles whose command server is alive.
-
-    Raises:
-        UserError: a file or process cannot be examined.
-    """
+    """The roles whose command server is alive. Raises UserError: a file or process cannot be
+    examined."""
     return [role for role in ROLES if announced(folder, role) is not None]
 
 

@@ -142,11 +142,8 @@ class CommandServer:
             return {"ok": False, "error": f"it cannot be carried out: {problem!r}"}
 
     def _checked(self, content: Any) -> Event:
-        """The checked event; whatever could fail in the loop is tried here first.
-
-        Raises:
-            ValueError: it is no event, belongs to the other role, or cannot be carried out.
-        """
+        """The checked event; whatever could fail in the loop is tried here first. Raises
+        ValueError: it is no event, belongs to the other role, or cannot be carried out."""
         event: Event = _EVENT.validate_python(content)
         if event.side != self._role:
             raise ValueError(f"type = {event.type!r}: for the {event.side}, not the {self._role}")

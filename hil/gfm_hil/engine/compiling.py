@@ -4,16 +4,14 @@ numba compiles a function when it is first called, and keeps the result in its c
 run of an installation on a machine compiles for minutes, and those after it only load.
 """
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numba.core import event
-from numpy.typing import NDArray
 
+from gfm_hil.controllers import ExternalController
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.inproc import compile_loop, rows
@@ -61,10 +59,10 @@ def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
     return compiled
 
 
-def compiled_bench(
+def compiled_benches(
     scenario: Scenario, notice: Callable[[str], None], roles: Iterable[Role] = ROLES
-) -> Bench:
-    """The bench of a scenario, with everything compiled that a tick calls.
+) -> list[Bench]:
+    """The benches of a scenario's converters, with everything compiled that a tick calls.
 
     Args:
         scenario: checked.
@@ -72,47 +70,22 @@ def compiled_bench(
         roles: the sides to compile for.
 
     Raises:
-        UserError: as ``make_bench``.
-    """
-    found: list[Bench] = []
-    sets: list[Set] = [("the operating point", lambda: found.append(make_bench(scenario)))]
-    sets.extend(_loops(scenario, found, roles))
-    compile_sets(sets, notice)
-    return found[0]
-
-
-def compiled_benches(
-    scenario: Scenario, notice: Callable[[str], None], roles: Iterable[Role] = ROLES
-) -> list[Bench]:
-    """The benches of a network's converters, with everything compiled that a tick calls.
-
-    Args:
-        scenario, notice, roles: as for ``compiled_bench``.
-
-    Raises:
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
     sets: list[Set] = [("the operating point", lambda: found.extend(make_benches(scenario)))]
-    sets.extend(_loops(scenario, found, roles))
+    if scenario.in_process:
+        sets.append(_both(found))
+    else:
+        sets += [_role(role, found) for role in roles]
+        links = {json.dumps([link.type, link.options]): link for link in scenario.links}
+        sets += [_link(link.type, link.options, scenario.has_inner) for link in links.values()]
+        if any(link.impairment is not None for link in links.values()):
+            sets.append(("the link's impairment", impaired.warm_up))
+        if scenario.mode == "realtime":
+            sets.append(_IDLE)
     compile_sets(sets, notice)
     return found
-
-
-def _loops(scenario: Scenario, found: list[Bench], roles: Iterable[Role]) -> Iterator[Set]:
-    """The loops of the benches that will be ``found``, and what they call."""
-    if scenario.in_process:
-        yield _both(found)
-        return
-    for role in roles:
-        yield _role(role, found)
-    links = {json.dumps([link.type, link.options]): link for link in scenario.links}
-    for link in links.values():
-        yield _link(link.type, link.options, scenario.has_inner)
-    if any(link.impairment is not None for link in links.values()):
-        yield "the link's impairment", impaired.warm_up
-    if scenario.mode == "realtime":
-        yield _IDLE
 
 
 def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
@@ -144,32 +117,16 @@ def compile_external(
     """Compile what the controller's side calls to step an external controller.
 
     Args:
-        scenario, notice: as for ``compiled_bench``.
+        scenario, notice: as for ``compiled_benches``.
         real: of its laws.
 
     Raises:
         UserError: as ``make_bench``.
     """
-    bench = make_bench(scenario, real)
-    bench.external = SteppedController(_Nothing(), bench.controller, bench.u)
+    bench, nothing = make_bench(scenario, real), ExternalController()
+    nothing.name = "nothing"
+    bench.external = SteppedController(nothing, bench.controller, bench.u)
     compile_sets([_role("controller", [bench], " of an external controller")], notice)
-
-
-class _Nothing:
-    """An external controller that is not there."""
-
-    name, real = "nothing", "float64"
-
-    def start(self, u: NDArray[np.float64]) -> None:
-        """Nothing."""
-
-    def tick(
-        self, ref: NDArray[np.float64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
 
 
 _IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)

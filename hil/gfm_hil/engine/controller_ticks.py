@@ -9,8 +9,6 @@ Over a link with ``every`` = n > 1, y[k] comes at every n-th tick only. When it 
 first computes the ticks since the last one, with the y of that one, and sends no u of them.
 """
 
-from __future__ import annotations
-
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
 from gfm_hil.engine.tick import answer
 from gfm_hil.links.frame import judge, pack, pack_again, skip, unpack

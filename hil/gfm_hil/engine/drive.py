@@ -1,12 +1,13 @@
 """Driving the compiled loops: call them, and do in Python what they came back for.
 
-Both functions are meant for a thread of their own.
+The loop has a thread of its own, which the main thread watches; that one receives Ctrl-C.
 """
 
-from __future__ import annotations
-
+import contextlib
+import threading
 import time
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.engine.controller_ticks import controller_ticks
 from gfm_hil.engine.loop_records import (
     FLAGS,
+    STOP,
     ControllerRecords,
     LinkEnd,
     Records,
@@ -29,19 +31,23 @@ from gfm_hil.engine.loop_records import (
 from gfm_hil.engine.plant_ticks import plant_ticks
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.timeline import Timeline, report_check
-from gfm_hil.engine.waiting import part_from
 from gfm_hil.links import Link, Port, port_function
-from gfm_hil.links.frame import FrameReader, FrameWriter
+from gfm_hil.links.frame import LAST_TIMES, FrameError, FrameReader, FrameWriter
+from gfm_hil.links.pump import ported
 from gfm_hil.realtime.clock import now_ns, sleep_until
+from gfm_hil.realtime.priority import restore_priority
 from gfm_hil.recording.log import PLANT_LEFT
 from gfm_hil.recording.parts import RolePart
 from gfm_plant import NO_FRESH_U
 from gfm_plant.names import CONTROLLER_GONE, CONTROLLER_LEFT
+from gfm_runtime.signals import names
 from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
 _FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
 _SOON = 200  # looks
+_LAST_NS = 500_000_000  # how long to go on sending, or waiting for, last frames
+_LOOK_S = 0.05
 
 
 class Share(NamedTuple):
@@ -92,11 +98,7 @@ class _End:
         return int(self.loop["tick"][0])
 
     def checked(self, why: ReturnReason) -> ReturnReason:
-        """Why the loop returned.
-
-        Raises:
-            PeerLost: the link is gone.
-        """
+        """Why the loop returned. Raises PeerLost: the link is gone."""
         if why == ReturnReason.GONE:
             self.link.receive()  # raises and says more
             raise PeerLost("the link is gone")
@@ -217,6 +219,118 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     return end.reader
 
 
+def send_last(
+    link: Link, writer: FrameWriter, tick: int, state: int, reason: int, values: NDArray[np.float64]
+) -> None:
+    """Send the frame that ends a run several times, because one alone might be lost.
+
+    If the link is full because the other side is behind, retry for a while.
+    """
+    give_up = time.monotonic_ns() + _LAST_NS
+    for _ in range(LAST_TIMES):
+        message = writer.pack(tick, state, reason, values)
+        while not link.send(message) and time.monotonic_ns() < give_up:
+            time.sleep(0.001)
+
+
+def part_from(
+    link: Link,
+    writer: FrameWriter,
+    reader: FrameReader,
+    tick: int,
+    state: int,
+    reason: int,
+    values: NDArray[np.float64],
+) -> None:
+    """Send the frames that end a run and wait a moment for the other side's.
+
+    A side that closed at once could lose its last frames: libzmq drops what a peer that is 64
+    frames behind has not read yet.
+    """
+    send_last(link, writer, tick, state, reason, values)
+    give_up = time.monotonic_ns() + _LAST_NS
+    unused = np.empty(len(names(reader.group)))
+    with contextlib.suppress(PeerLost):
+        while reader.state not in (SAFE, STOPPED) and time.monotonic_ns() < give_up:
+            message = link.receive()
+            if message is None:
+                link.wait(0.01)
+                continue
+            with contextlib.suppress(FrameError):
+                reader.unpack(message, unused)
+
+
+def run_loop(
+    role: Role,
+    shares: Sequence[Share],
+    t0_ns: int,
+    stopped: Callable[[], bool],
+    flags: NDArray[np.int64] | None = None,
+) -> list[FrameReader]:
+    """Run one side of a scenario after the handshakes, in a thread; returns its frame counters.
+
+    The thread inherits processor and priority from the caller. The caller then steps back to
+    ordinary priority and only looks, a few times a second, whether to stop and what to write down.
+    A link without a port gets a thread that pumps its messages.
+
+    Raises:
+        PeerLost: an external controller does not answer; its thread is left behind.
+
+    Args:
+        shares: of the controller one, of the plant one for each converter.
+        flags: shape (FLAGS,), what other threads tell the loop, see
+            ``gfm_hil.engine.loop_records``.
+    """
+    if flags is None:
+        flags = np.zeros(FLAGS, np.int64)
+    shares = [share._replace(link=ported(share.link)) for share in shares]
+    timelines = [share.timeline for share in shares]
+    external = shares[0].bench.external if role == "controller" else None
+    for share in shares:
+        getattr(share.link, "start", _not_there)()
+    found: list[FrameReader] = []
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            if role == "plant":
+                found.extend(drive_plant(shares, t0_ns, flags))
+            else:
+                found.append(drive_controller(shares[0], t0_ns, flags))
+        except BaseException as problem:  # the caller's thread raises it
+            failed.append(problem)
+
+    for timeline in timelines:
+        timeline.put_off = True
+    thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
+    thread.start()
+    restore_priority()
+    try:
+        while thread.is_alive():
+            thread.join(_LOOK_S)
+            for timeline in timelines:
+                timeline.flush()
+            flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
+            if external is not None:
+                external.watch(timelines[0].end, shares[0].bench.scenario.answer_timeout_s)
+    finally:  # also after a second Ctrl-C: the thread must end before its arrays go
+        flags[STOP] = 1
+        while thread.is_alive() and not (external is not None and external.abandoned):
+            with contextlib.suppress(KeyboardInterrupt):
+                thread.join()
+        for timeline in timelines:
+            timeline.put_off = False
+        for share in shares:
+            getattr(share.link, "stop", _not_there)()
+    if failed:
+        raise failed[0]
+    return found
+
+
+def _not_there() -> None:
+    """The start and the stop of a link that has neither method."""
+
+
 def _ticks(bench: Bench) -> Callable[..., ReturnReason]:
     return bench.external or controller_ticks
 
@@ -227,8 +341,9 @@ def _records(bench: Bench) -> ControllerRecords:
 
 
 def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
-    """Compile (or load from cache) a side's loop without running a tick."""
-    nowhere: Any = _NullLink()
+    """Compile (or load from cache) a side's loop, which is the same for all links, without running
+    a tick."""
+    nowhere: Any = SimpleNamespace(port=Port(np.zeros(1, np.int64), _nothing, _nothing, 0))
     unused: Any = None
     ends = [
         _End(role, Share(bench, nowhere, part, unused), 0, np.ones(FLAGS, np.int64))
@@ -250,11 +365,3 @@ def _rest(handle, message):
 @port_function
 def _nothing(handle, message):
     return 0
-
-
-class _NullLink:
-    """A link without a peer; enough to compile a loop, which is the same for all links."""
-
-    @property
-    def port(self) -> Port:
-        return Port(np.zeros(1, np.int64), _nothing, _nothing, 0)

@@ -15,7 +15,7 @@ import numpy as np
 from numba import typeof, types
 from numpy.typing import NDArray
 
-from gfm_hil.controllers import ControllerError, ControllerProtocol
+from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost
 from gfm_hil.engine.controller_ticks import plant_tripped, receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
@@ -30,8 +30,7 @@ from gfm_runtime.signals import NY
 from gfm_runtime.states import READY, RUNNING
 
 if TYPE_CHECKING:
-    from gfm_hil.controllers import PilController
-    from gfm_hil.scenario.events.gains import Retuned
+    from gfm_hil.controllers.external import Retuned
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")
@@ -55,47 +54,27 @@ class SteppedController:
 
     def __init__(
         self,
-        external: ControllerProtocol | PilController,
+        external: ExternalController,
         controller: Controller,
         u: NDArray[np.float64],
         changed: Sequence[Retuned] = (),
     ) -> None:
-        from gfm_hil.controllers import (
-            PilController,  # brings the compilers in, which few runs need
-        )
-
-        self.name = external.name
+        self.name, self.has_laws, self._external = external.name, external.has_laws, external
         self.abandoned = False
         self.last_words: Callable[[], None] = lambda: None
         self._u, self._start = u.copy(), u.copy()
-        self._foreign: ControllerProtocol | None = None
-        self._ours: PilController | None = None
-        if isinstance(external, PilController):
-            self._ours = external
-        else:
-            self._foreign = external
         self._began, self._tick = 0, 0  # of the call in progress, ns; 0 if there is none
         self._calls: tuple[Any, ...] = ()
-        if self._ours is not None:
-            self._ours.begin(controller, changed)
-        self._start_external()
-
-    @property
-    def has_laws(self) -> bool:
-        """Whether it runs the run's own laws, between which events may change."""
-        return self._ours is not None
+        external.begin(controller, changed)
+        external.start(self._start)
 
     def check(self, event: Event, controller: Controller) -> None:
-        """Refuse an event that the external controller cannot follow.
-
-        Raises:
-            ValueError: why.
-        """
+        """Refuse an event that the external controller cannot follow. Raises ValueError: why."""
         if not event.changes_law:
             return
-        if self._ours is None:
+        if not self.has_laws:
             raise ValueError(f"{self.name} has a law of its own")
-        if isinstance(event, GainChange) and not self._ours.has(
+        if isinstance(event, GainChange) and not self._external.has(
             ready_gains(controller, event.values)
         ):
             raise ValueError(
@@ -104,48 +83,26 @@ class SteppedController:
 
     def close(self) -> None:
         """End the external controller: one that is not ours only if it still answers."""
-        if self._ours is not None:
-            self._ours.close()
-        elif self._foreign is not None and not self.abandoned:
-            self._foreign.close()
-
-    def _start_external(self) -> None:
-        if self._ours is not None:
-            self._ours.start()
-        elif self._foreign is not None:
-            self._foreign.start(self._start)
+        if self.has_laws or not self.abandoned:
+            self._external.close()
 
     def _begin_anew(self, ctl: Any, y: NDArray[np.float64]) -> None:
-        """Start after a reset: as at the beginning, or from what is measured in a network that
-        went on.
-
-        Raises:
-            gfm_hil.controllers.ControllerError: it refuses, or runs our laws, which its program
-                starts from rest only.
-        """
+        """Start after a reset: as at the beginning, or from what is measured in a network that went
+        on. Raises gfm_hil.controllers.ControllerError: it refuses, or runs our laws, which its
+        program starts from rest only."""
         if ctl["joins"][0]:
             ctl["joins"] = 0
-            if self._ours is not None:
+            if self.has_laws:
                 raise ControllerError(f"{self.name}: cannot join a network that goes on")
             self._start[:] = 0.0
             measured(y, self._start)
-        self._start_external()
-
-    def _find_u(self, changed: int, ref: NDArray[np.float64], records: Records) -> None:
-        if self._ours is not None:
-            self._ours.tick(changed, self._u)
-            records.times[self._tick, _COUNT] = self._ours.count
-        elif self._foreign is not None:
-            self._foreign.tick(ref, records.y, self._u)
+        self._external.start(self._start)
 
     def __call__(
         self, end: LinkEnd, records: Records, controller: ControllerRecords, event: int
     ) -> ReturnReason:
-        """As ``controller_ticks``.
-
-        Raises:
-            gfm_hil.controllers.ControllerError: the external controller fails.
-        """
+        """As ``controller_ticks``. Raises gfm_hil.controllers.ControllerError: the external
+        controller fails."""
         ctl, u, given = controller.ctl, self._u, (end, records, controller)
         if not self._calls:
             # numba finds out the types of such arguments anew at each call, which takes 400 µs
@@ -164,7 +121,8 @@ class SteppedController:
             if took == RESTARTED:
                 self._begin_anew(ctl, records.y)
             if took != REFUSED:
-                self._find_u(changed, ctl["ref"][0], records)
+                self._external.tick(ctl["ref"][0], records.y, u, changed)
+                records.times[self._tick, _COUNT] = self._external.count
             self._began = 0
             if self.abandoned:
                 raise PeerLost(f"{self.name}: has answered too late")
@@ -177,11 +135,7 @@ class SteppedController:
 
     def watch(self, end: Callable[[Status, str, int], None], patience_s: float) -> None:
         """End the run if the external controller has not answered for that long; another thread
-        calls this.
-
-        Raises:
-            PeerLost: it has not.
-        """
+        calls this. Raises PeerLost: it has not."""
         began = self._began
         silent_s = (time.monotonic_ns() - began) * 1e-9 if began else 0.0
         if silent_s > patience_s:

@@ -13,9 +13,8 @@ A side refuses and counts a malformed greeting, and goes on waiting. It shows a 
 escaped and cut.
 """
 
-from __future__ import annotations
-
 import json
+import os
 import secrets
 import threading
 import time
@@ -30,7 +29,6 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from gfm_hil.core.errors import PeerLost, lines
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.engine.loop_records import limited_reader
-from gfm_hil.engine.waiting import await_message
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError
@@ -38,6 +36,7 @@ from gfm_hil.scenario import Scenario
 from gfm_runtime.signals import TABLE_VERSION, carried, table_hash
 
 _PREFIX = b"GFMHIL "
+_SPIN_NS = 50_000  # longer would starve the threads that bring the answer
 _REPEAT_NS = 100_000_000
 _AGAIN_NS = 2_000_000_000  # after which a link that knows how reaches out anew
 _LEAD_NS = 20_000_000  # from START to tick 0
@@ -187,6 +186,26 @@ def shake_hands(
     raise side.lost()
 
 
+def await_message(link: Link, deadline_ns: int, stopped: Callable[[], bool]) -> bytes | None:
+    """The next message, or None at the deadline (CLOCK_MONOTONIC, ns) or once ``stopped()``.
+
+    It yields after every poll, because a pure spin would starve libzmq's own thread on two cores,
+    and sleeps between two polls after 50 us.
+    """
+    spin_until = time.monotonic_ns() + _SPIN_NS
+    while True:
+        message = link.receive()
+        if message is not None:
+            return message
+        now = time.monotonic_ns()
+        if now >= deadline_ns or stopped():
+            return None
+        if now < spin_until:
+            os.sched_yield()
+        else:
+            link.wait(min(0.02, (deadline_ns - now) * 1e-9))
+
+
 class _Side:
     """What one side of the handshake has said, and what it has learned of the other.
 
@@ -217,11 +236,8 @@ class _Side:
         self._link.send(_PREFIX + json.dumps(greeting).encode())
 
     def take(self, message: bytes | None, now: int) -> Start | None:
-        """Process what came, if anything; returns what both sides agreed on once they have.
-
-        Raises:
-            PeerLost: the other side runs something else.
-        """
+        """Process what came, if anything; returns what both sides agreed on once they have. Raises
+        PeerLost: the other side runs something else."""
         try:
             greeting = None if message is None else _read(message)
             if isinstance(greeting, _Hello):
@@ -260,11 +276,8 @@ class _Side:
         self.met = True
 
     def _start_at(self, t0: int, now: int) -> Start:
-        """Take the plant's time of tick 0.
-
-        Raises:
-            _Refused: it lies before this side began to wait, or far ahead.
-        """
+        """Take the plant's time of tick 0. Raises _Refused: it lies before this side began to wait,
+        or far ahead."""
         if not self._one_clock:
             return self._agreed(now + _LEAD_NS)
         if not self.begin <= t0 <= now + _MOST_LEAD_NS:
@@ -328,11 +341,8 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
 
 
 def _read(message: bytes) -> _Hello | _Go | None:
-    """The greeting in a message; None if it does not begin as one.
-
-    Raises:
-        _Refused: it begins as one, but is none.
-    """
+    """The greeting in a message; None if it does not begin as one. Raises _Refused: it begins as
+    one, but is none."""
     if message[: len(_PREFIX)] != _PREFIX[: len(message)]:
         return None
     try:

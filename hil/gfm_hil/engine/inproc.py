@@ -4,8 +4,6 @@ The result is bit for bit that of two processes over a link, because a frame car
 each tick calls the same functions in the same order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What a compiled loop works on, what it remembers from call to call, and why it returns."""
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 from typing import Any, NamedTuple

@@ -11,8 +11,6 @@ Over a link with ``every`` = n > 1, y[k] is sent at every n-th tick only, and it
 tick k + n on (before tick n u[0] acts): a delay of n ticks, in lockstep as in real time.
 """
 
-from __future__ import annotations
-
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
 from gfm_hil.engine.tick import apply_peer_state, asks_to_start, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, skip, unpack

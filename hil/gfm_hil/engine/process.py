@@ -1,7 +1,5 @@
 """One role as a process of its own: set up the bench, shake hands, run, record."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -9,24 +7,22 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.controllers import ControllerError, ControllerProtocol
+from gfm_hil.controllers import ControllerError, ExternalController
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.roles import OUR_CONTROLLER, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.command_server import CommandServer
-from gfm_hil.engine.drive import Share, compile_loops
+from gfm_hil.engine.drive import Share, compile_loops, run_loop
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
-from gfm_hil.engine.loop_thread import run_loop
 from gfm_hil.engine.sd_notify import Watched, notify
-from gfm_hil.engine.setup import Bench, make_bench, make_benches
+from gfm_hil.engine.setup import Bench, make_benches
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
@@ -48,9 +44,6 @@ from gfm_plant import plant_command, plant_sample, plant_step
 from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
 
-if TYPE_CHECKING:
-    from gfm_hil.controllers import PilController
-
 
 def run_role(
     role: Role,
@@ -58,7 +51,7 @@ def run_role(
     folder: Path,
     endpoints: Mapping[str, str] = MappingProxyType({}),
     notice: Callable[[str], None] = print,
-    external: ControllerProtocol | PilController | None = None,
+    external: ExternalController | None = None,
 ) -> Outcome:
     """Run one side of a scenario at its endpoints; record to ``folder``.
 
@@ -77,7 +70,7 @@ def run_role(
     """
     with Interrupt() as interrupt, ExitStack() as stack:
         real = "float64" if external is None else external.real
-        benches = make_benches(scenario) if scenario.parts else [make_bench(scenario, real)]
+        benches = make_benches(scenario, real)
         sides = []
         if external is not None:
             stack.enter_context(one_processor(scenario.mode))
@@ -95,16 +88,11 @@ def run_role(
         return _run(role, sides, notice, interrupt)
 
 
-def _stepped(external: ControllerProtocol | PilController, bench: Bench) -> SteppedController:
-    """An external controller ready for tick 0 at the operating point.
-
-    Raises:
-        UserError: it refuses, or the scenario has events that are about a law.
-    """
-    from gfm_hil.controllers import PilController  # brings compilers in, which few runs need
-
+def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
+    """An external controller ready for tick 0 at the operating point. Raises UserError: it refuses,
+    or the scenario has events that are about a law."""
     scenario = bench.scenario
-    if not isinstance(external, PilController):
+    if not external.has_laws:
         for event in scenario.events:
             if event.changes_law:
                 raise UserError(f"events, {event.label()}: {external.name} has a law of its own")
@@ -145,11 +133,7 @@ class _SideResources:
         stack.callback(self.timeline.close)
 
     def open(self, stack: ExitStack) -> None:
-        """Open the link.
-
-        Raises:
-            UserError: the endpoint cannot be opened.
-        """
+        """Open the link. Raises UserError: the endpoint cannot be opened."""
         given = self.scenario.link
         assert given.endpoint is not None
         self.good = open_link(
@@ -200,12 +184,8 @@ def _meet_and_run(
     notice: Callable[[str], None],
     interrupt: Interrupt,
 ) -> None:
-    """Open the links, meet the other sides, run, and keep what the links counted.
-
-    Raises:
-        PeerLost: another side did not come.
-        UserError: an endpoint cannot be opened.
-    """
+    """Open the links, meet the other sides, run, and keep what the links counted. Raises PeerLost:
+    another side did not come; UserError: an endpoint cannot be opened."""
     scenario = sides[0].scenario
     rights = None
     if scenario.mode == "realtime":
@@ -252,10 +232,7 @@ def _meet(
     notice: Callable[[str], None],
 ) -> list[Start]:
     """Shake hands over all links at a time: the controllers of a plant may come in any order.
-
-    Raises:
-        PeerLost: one did not come.
-    """
+    Raises PeerLost: one did not come."""
     meeting, failed = Meeting(len(sides)), threading.Event()
     external = sides[0].bench.external
 

@@ -1,7 +1,5 @@
 """Starts controllers and plant as processes, watches them to their end, and leaves none behind."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import subprocess

@@ -4,8 +4,6 @@ Both sides build the same bench from the same scenario, possibly on two machines
 frames have to cross the link.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -71,9 +69,7 @@ class Bench:
         """Take the controller from SAFE to READY, with its first law and references.
 
         That of a converter in a network will begin with the voltage and frequency that it measures.
-
-        Raises:
-            ValueError: it is not in SAFE.
+        Raises ValueError: it is not in SAFE.
         """
         c = self.controller
         state, changes = int(c.ctl["state"][0]), int(c.ctl["changes"][0])
@@ -110,21 +106,16 @@ def make_bench(scenario: Scenario, real: str = "float64") -> Bench:
     Raises:
         UserError: the law has no steady state on this grid, or the scenario has a network.
     """
-    if scenario.network is not None and scenario.converter is None:
+    if scenario.parts:
         raise UserError(ONE_CONVERTER)
-    benches = make_benches(scenario, real)
-    return next(b for b in benches if b.scenario.converter == scenario.converter)
+    (bench,) = make_benches(scenario, real)
+    return bench
 
 
 def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     """Build both sides of a scenario at its operating point: a bench for each converter, with a
-    controller of its own and one plant in common.
-
-    Args:
-        scenario, real: as for ``make_bench``.
-
-    Raises:
-        UserError: the laws have no steady state on this grid.
+    controller of its own and one plant in common; as the controller of one of them sees it, the
+    bench of that one. Arguments and errors as of ``make_bench``.
     """
     each = [scenario.of(name) for name in scenario.converters] or [scenario]
     plant = plant_of(scenario)
@@ -158,7 +149,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         bench.keep()
         gains_of(one, controller.omega_b)
         benches.append(bench)
-    return benches
+    return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
 
 
 def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:

@@ -5,8 +5,6 @@ Plant, tick k: ``sample`` y[k]; then ``apply_peer_state``, the state that came w
 Controller, tick k: ``answer`` y[k] with u[k].
 """
 
-from __future__ import annotations
-
 from gfm_hil.engine.loop_records import ReturnReason
 from gfm_hil.recording.recorder import record_sample
 from gfm_plant import plant_command, plant_sample

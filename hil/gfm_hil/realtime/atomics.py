@@ -5,8 +5,6 @@ the value of a release store sees all writes before that store (C11 and LLVM's "
 Ordering").
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from llvmlite import ir

@@ -3,8 +3,6 @@
 They call libc directly, so that they allocate nothing and numba can cache them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from llvmlite import ir

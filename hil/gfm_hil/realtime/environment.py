@@ -1,7 +1,5 @@
 """What timing on this machine depends on: its badge, and caveats for readers of its times."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

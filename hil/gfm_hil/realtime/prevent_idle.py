@@ -5,8 +5,6 @@ which may return it late, so that a loop misses more deadlines on an idle machin
 one. A thread of idle priority, which runs only when nothing else does, keeps the processor busy.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """What a real-time side requests from the system at its start; if refused, it runs without."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

@@ -5,8 +5,6 @@ the plant itself, of the controller and of the two clocks. Export files, figures
 streams, data frames and the documentation take names and units from here.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

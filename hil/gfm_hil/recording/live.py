@@ -3,8 +3,6 @@
 Reading does not disturb the loops, which only append rows to memory-mapped files.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Mapping
@@ -31,11 +29,7 @@ class LiveRun:
 
     @cached_property
     def T_s(self) -> float:
-        """The sampling time, s.
-
-        Raises:
-            UserError: scenario.toml does not say it.
-        """
+        """The sampling time, s. Raises UserError: scenario.toml does not say it."""
         try:
             T_s = read_toml(self.folder / "scenario.toml", links=False)["T_s"]
             if not isinstance(T_s, float) or not 0 < T_s < math.inf:

@@ -1,7 +1,5 @@
 """The log of a run, one JSON object per line, and the outcome that follows from it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Sequence
@@ -130,10 +128,8 @@ def read_log(*paths: Path, most: int = _MOST) -> list[dict[str, Any]]:
     """The lines of one or more logs of at most so many bytes each, in order of their ticks; of one
     tick, a cause stands before what the other role says of it.
 
-    It skips damaged lines: the last line of a process that was killed may be incomplete.
-
-    Raises:
-        UserError: a log is no regular file, or longer than that of any run.
+    It skips damaged lines: the last line of a process that was killed may be incomplete. Raises
+    UserError: a log is no regular file, or longer than that of any run.
     """
     found: list[dict[str, Any]] = []
     for path in paths:
@@ -168,12 +164,8 @@ def event_text(event: dict[str, Any]) -> str:
 
 
 def read_summary(folder: Path, ticks: int) -> dict[str, Any]:
-    """The content of the summary.json of a run of so many ticks.
-
-    Raises:
-        FileNotFoundError: the run is not over, or was killed.
-        UserError: the file is not a summary.
-    """
+    """The content of the summary.json of a run of so many ticks. Raises FileNotFoundError: the run
+    is not over, or was killed; UserError: the file is not a summary."""
     return read_json(folder / "summary.json", Summary, most_bytes(ticks))
 
 

@@ -1,7 +1,5 @@
 """Makes signals.npz and timing.npz from the parts of both roles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path

@@ -71,10 +71,7 @@ class ColumnGroup:
 
 def write_npz(path: Path, tables: Iterable[ColumnGroup]) -> None:
     """Write ``path`` as a whole, one table after the other, each read once from its first row on.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    Raises OSError: the file cannot be written."""
     with replacing(path) as part, part.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
         for table in tables:
             with contextlib.ExitStack() as stack:
@@ -166,11 +163,7 @@ class Column:
         return self.rows
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """The rows of a slice with step 1.
-
-        Raises:
-            UserError: the file is gone or damaged.
-        """
+        """The rows of a slice with step 1. Raises UserError: the file is gone or damaged."""
         first, last, _ = rows.indices(self.rows)
         found = np.empty(max(0, last - first), self.dtype)
         at = first
@@ -206,12 +199,8 @@ class Column:
 
 
 def open_npz(path: Path) -> dict[str, Column]:
-    """The columns of an .npz file, none of them read yet.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        UserError: it is no regular file, or is damaged.
-    """
+    """The columns of an .npz file, none of them read yet. Raises FileNotFoundError: it is not
+    there; UserError: it is no regular file, or is damaged."""
     with open_file(path) as file:
         try:
             with _archive(file) as archive:
@@ -252,11 +241,8 @@ def _column(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Colu
 
 
 def read_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """The shape and the type of an array that begins in an open file, as numpy writes it.
-
-    Raises:
-        ValueError: there is none, or a recording has none of its type.
-    """
+    """The shape and the type of an array that begins in an open file, as numpy writes it. Raises
+    ValueError: there is none, or a recording has none of its type."""
     try:
         shape, fortran, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
     except Exception as problem:  # numpy has no common base for its errors

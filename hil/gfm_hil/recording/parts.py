@@ -83,11 +83,8 @@ class RolePart:
 
     @staticmethod
     def read(folder: Path, role: Role) -> RolePart | None:
-        """The files of a role, or None if one of them does not exist.
-
-        Raises:
-            UserError: a file is damaged, or ``parts`` is a link as of ``place_of``.
-        """
+        """The files of a role, or None if one of them does not exist. Raises UserError: a file is
+        damaged, or ``parts`` is a link as of ``place_of``."""
         place = place_of(folder)
         files = [place / f"{role}_{what}.npy" for what in _KINDS] if place is not None else []
         if not files or not all(os.path.lexists(file) for file in files):
@@ -103,11 +100,7 @@ class RolePart:
 
 
 def mapped(file: Path) -> NDArray[Any]:
-    """The array in a file of a part, mapped.
-
-    Raises:
-        UserError: the file is gone or damaged.
-    """
+    """The array in a file of a part, mapped. Raises UserError: the file is gone or damaged."""
     try:
         with open_file(file) as opened:
             shape, dtype = read_header(opened)
@@ -117,12 +110,9 @@ def mapped(file: Path) -> NDArray[Any]:
 
 
 def check_parts(folder: Path, ticks: int) -> None:
-    """See that the parts in a folder are what a run of so many ticks wrote.
-
-    Raises:
-        UserError: one is damaged, has another length, or bytes that were never written: a run fills
-            its files before it begins, and writes no zeros over a whole page.
-    """
+    """See that the parts in a folder are what a run of so many ticks wrote. Raises UserError: one
+    is damaged, has another length, or bytes that were never written: a run fills its files before
+    it begins, and writes no zeros over a whole page."""
     for role in ROLES:
         part, place = RolePart.read(folder, role), place_of(folder)
         if part is None or place is None:
@@ -174,10 +164,8 @@ def keep_in_memory(
     touches the page waits for the disk. ``folder``/parts becomes a link. Every process of the run
     calls this, and then holds the place until it removes the parts or ends. Parts of a run whose
     processes were all killed are first moved to the folder of that run. If that is not possible,
-    they stay, and ``notice`` is called with their place: no recording is lost.
-
-    Raises:
-        UserError: ``folder``/parts is a link, but not one of our user to a place in memory.
+    they stay, and ``notice`` is called with their place: no recording is lost. Raises UserError:
+    ``folder``/parts is a link, but not one of our user to a place in memory.
     """
     if not _MEMORY.is_dir():
         return
@@ -204,11 +192,8 @@ def keep_in_memory(
 
 def place_of(folder: Path) -> Path | None:
     """Where the parts of a run lie: in ``folder``/parts, or in the folder in memory to which
-    ``keep_in_memory`` has linked it; None if there is neither.
-
-    Raises:
-        UserError: ``parts`` is something else, or a link to anything else.
-    """
+    ``keep_in_memory`` has linked it; None if there is neither. Raises UserError: ``parts`` is
+    something else, or a link to anything else."""
     parts = folder / "parts"
     if not parts.is_symlink():
         if os.path.lexists(parts) and not parts.is_dir():
@@ -293,10 +278,8 @@ def _move(names: list[str], source: int, run: int, link: str) -> None:
 def remove_parts(folder: Path) -> None:
     """Remove the parts from disk and memory.
 
-    If the process is killed meanwhile, the next call removes the rest.
-
-    Raises:
-        UserError: ``parts`` is a link as of ``place_of``.
+    If the process is killed meanwhile, the next call removes the rest. Raises UserError: ``parts``
+    is a link as of ``place_of``.
     """
     parts = folder / "parts"
     place = place_of(folder)

@@ -1,7 +1,5 @@
 """Recording of a tick, compiled into the loops."""
 
-from __future__ import annotations
-
 from gfm_hil.realtime.atomics import prefetch
 from gfm_plant import TRUTH, plant_truth
 from gfm_runtime.compiled import compiled

@@ -299,11 +299,8 @@ def controlled_by(summary: Mapping[str, Any]) -> str:
 
 
 def bases(scenario: Scenario) -> Bases:
-    """The bases of the scenario's converter.
-
-    Raises:
-        UserError: the converter's file cannot be read.
-    """
+    """The bases of the scenario's converter. Raises UserError: the converter's file cannot be
+    read."""
     name = scenario.plant.converter
     try:
         return load_converter(name).bases
@@ -317,11 +314,8 @@ def nominal_frequency(scenario: Scenario) -> float:
 
 
 def read_scenario(folder: Path) -> Scenario:
-    """The scenario of a run as it was resolved; its law files may be gone.
-
-    Raises:
-        UserError: there is none in the folder, or it is damaged.
-    """
+    """The scenario of a run as it was resolved; its law files may be gone. Raises UserError: there
+    is none in the folder, or it is damaged."""
     try:
         content = read_toml(folder / "scenario.toml", links=False)
         look_beside(content, folder)
@@ -348,12 +342,8 @@ def began(folder: Path) -> float:
 
 
 def read_recording(folder: Path) -> tuple[dict[str, Column], dict[str, Column], list[str]]:
-    """The columns of signals.npz and of timing.npz, and the labels of the laws.
-
-    Raises:
-        FileNotFoundError: a file is not there.
-        UserError: a file is damaged.
-    """
+    """The columns of signals.npz and of timing.npz, and the labels of the laws. Raises
+    FileNotFoundError: a file is not there; UserError: a file is damaged."""
     files = folder / "signals.npz", folder / "timing.npz"
     signals, timing = map(open_npz, files)
     for name in ("tick", "t", "laws"):

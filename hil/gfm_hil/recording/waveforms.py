@@ -10,8 +10,6 @@ which is the inverse of Clarke's amplitude-invariant transform. There is no zero
 converter has three wires. The line's current follows from p + j q = v conj(i_o).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -92,9 +92,7 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 
 
-def _converters(
-    scenario: Scenario,
-) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
+def _converters(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
     """The plant, what results call the law, and the node of each converter, by its name."""
     if scenario.network is None:
         return {"": scenario.plant}, {"": law_titles([scenario.law])[scenario.law]}, {"": ""}

@@ -265,11 +265,7 @@ def _save_small(figure: Figure, path: Path) -> None:
 
 
 def draw_run(
-    folder: Path,
-    scenario: Scenario,
-    signals: Columns,
-    timing: Columns,
-    summary: dict[str, Any],
+    folder: Path, scenario: Scenario, signals: Columns, timing: Columns, summary: dict[str, Any]
 ) -> list[Picture]:
     """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png."""
     pictures = []

@@ -16,19 +16,12 @@ STYLES = {"good": "green", "warn": "yellow", "bad": "red", "head": "bold", "dim"
 
 
 class Cell(NamedTuple):
-    """A cell with more than a text.
+    """A cell with more than a text."""
 
-    Attributes:
-        text: as ``shown`` writes values.
-        style: a key of ``STYLES``, or "".
-        link: address that a page links it to, or "".
-        classes: of HTML, further ones.
-    """
-
-    text: Any
-    style: str = ""
-    link: str = ""
-    classes: str = ""
+    text: Any  # as ``shown`` writes values
+    style: str = ""  # a key of ``STYLES``, or ""
+    link: str = ""  # address that a page links it to, or ""
+    classes: str = ""  # of HTML, further ones
 
 
 def shown(value: Any) -> str:
@@ -47,23 +40,16 @@ def shown(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under heads, which name the units.
+    """Rows under heads, which name the units."""
 
-    Attributes:
-        heads: of the columns; none for a table without a line of heads.
-        rows: values, as ``shown`` writes them, or cells.
-        title, caption: above and below it.
-        text: how many columns from the left are text; the others are numbers, at the right. None:
-            all are text.
-        fold: which column of text is broken first where the terminal is narrow.
-    """
-
-    heads: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-    title: str = ""
+    heads: Sequence[str]  # of the columns; none for a table without a line of heads
+    rows: Sequence[Sequence[Any]]  # values, as ``shown`` writes them, or cells
+    title: str = ""  # title, caption: above and below it
     caption: str = ""
+    # how many columns from the left are text; the others are numbers, at the right. None: all are
+    # text
     text: int | None = 1
-    fold: int | None = None
+    fold: int | None = None  # which column of text is broken first where the terminal is narrow
 
     def is_text(self, column: int) -> bool:
         """Whether a column is text."""

@@ -1,8 +1,6 @@
 """The checks of one signal behind the assertions of tests and the clauses of the conformity tests:
 each returns None, or what is wrong and where."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,10 +179,8 @@ def read_envelope(path: Path, t: Vector) -> tuple[Vector, Vector]:
     """The limits of a CSV file with the columns t, low, high at the times ``t`` after the step.
 
     They are interpolated between lines; there is no limit before the first line, after the last
-    line, and where a field is empty.
-
-    Raises:
-        UserError: the file does not exist or does not have this form.
+    line, and where a field is empty. Raises UserError: the file does not exist or does not have
+    this form.
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:

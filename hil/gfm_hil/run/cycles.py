@@ -1,8 +1,6 @@
 """Means over one cycle of the nominal frequency, which take a column piece by piece, and the window
 of a spectrum."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache
 

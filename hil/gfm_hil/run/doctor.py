@@ -4,14 +4,12 @@ Green: nothing to do. Yellow: the longest times are longer than necessary. Red: 
 or the machine refuses something that a run needs.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import resource
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -114,126 +112,103 @@ def judge(facts: Facts) -> list[Finding]:
     """One finding per rule, in the order of the table."""
     return [
         Finding(what, found, level, "" if level == "green" else advice)
-        for what, rule in _RULES.items()
-        for found, level, advice in [rule(facts)]
+        for what, found, level, advice in (*_judge_processors(facts), *_judge_rest(facts))
     ]
 
 
-def worst(findings: Iterable[Finding]) -> Level:
-    """The level of the worst of them."""
-    levels = {f.level for f in findings}
-    return "red" if "red" in levels else "yellow" if "yellow" in levels else "green"
+# what, found, level, and what to do unless that is green
+_Row = tuple[str, str, Level, str]
 
 
-# What each rule found, its level, and what to do unless that is green.
-Judged = tuple[str, Level, str]
-
-
-def _kernel(facts: Facts) -> Judged:
-    model = facts["preemption"]
+def _judge_processors(facts: Facts) -> Iterator[_Row]:
+    """The kernel, and what it does with the processors."""
+    model, cpus = facts["preemption"], facts["cpus"]
     slow: Level = "red" if re.search(r"none|voluntary", model) else "yellow"
-    return (
-        f"{facts['kernel']}, {model}",
-        "green" if model == "PREEMPT_RT" else slow,
+    yield (
+        "kernel", f"{facts['kernel']}, {model}", "green" if model == "PREEMPT_RT" else slow,
         "boot a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or preempt=full on its command "
         "line",
-    )
+    )  # fmt: skip
+    few: Level = "red" if cpus < 2 else "yellow" if cpus < 3 else "green"
+    yield (
+        "processors", f"{cpus} of {facts['cpus_of_machine']}, {facts['cpu']}", few,
+        "the two sides need a processor each: a larger machine, or one for each side" if cpus < 2
+        else "the loops leave none for other work: one side on a machine of its own",
+    )  # fmt: skip
+    isolated = facts["isolated_cpus"]
+    yield (
+        "isolated processors", isolated, "yellow" if isolated == "none" else "green",
+        "isolate the loops' processors at boot: deploy/tune-realtime prints the options",
+    )  # fmt: skip
+    yield (
+        "hyper-threads", *(("on", "yellow") if facts["smt"] else ("off", "green")),
+        "keep the sibling of a loop's processor free, or nosmt on the kernel's command line",
+    )  # fmt: skip
+    governors, us = facts["governors"], facts["deepest_idle_us"]
+    yield (
+        "frequency governor", ", ".join(governors) or "none",
+        "green" if governors in ([], ["performance"]) else "yellow",
+        "performance: deploy/tune-realtime --apply",
+    )  # fmt: skip
+    yield (
+        "deepest idle state", "none" if us is None else f"wakes in {us} µs",
+        "yellow" if (us or 0) > _WAKE_US else "green", "deploy/tune-realtime --apply",
+    )  # fmt: skip
 
 
-def _processors(facts: Facts) -> Judged:
-    found = f"{facts['cpus']} of {facts['cpus_of_machine']}, {facts['cpu']}"
-    if facts["cpus"] < 2:
-        advice = "the two sides need a processor each: a larger machine, or one for each side"
-        return found, "red", advice
-    advice = "the loops leave none for other work: one side on a machine of its own"
-    return found, "yellow" if facts["cpus"] < 3 else "green", advice
-
-
-def _isolated(facts: Facts) -> Judged:
-    found = facts["isolated_cpus"]
-    advice = "isolate the loops' processors at boot: deploy/tune-realtime prints the options"
-    return found, "yellow" if found == "none" else "green", advice
-
-
-def _threads(facts: Facts) -> Judged:
-    advice = "keep the sibling of a loop's processor free, or nosmt on the kernel's command line"
-    return ("on", "yellow", advice) if facts["smt"] else ("off", "green", "")
-
-
-def _governor(facts: Facts) -> Judged:
-    good = facts["governors"] in ([], ["performance"])
-    found = ", ".join(facts["governors"]) or "none"
-    return found, "green" if good else "yellow", "performance: deploy/tune-realtime --apply"
-
-
-def _idle(facts: Facts) -> Judged:
-    us = facts["deepest_idle_us"]
-    found = "none" if us is None else f"wakes in {us} µs"
-    return found, "yellow" if (us or 0) > _WAKE_US else "green", "deploy/tune-realtime --apply"
-
-
-def _priority(facts: Facts) -> Judged:
-    highest, n = facts["rt_priority"], PRIORITY
-    return (
-        f"up to {highest}" if facts["sched_fifo"] and highest else "refused",
-        "green" if facts["sched_fifo"] and highest >= n else "red",
+def _judge_rest(facts: Facts) -> Iterator[_Row]:
+    """Rights, clock, memory, other work, and what is installed."""
+    highest, fifo, n = facts["rt_priority"], facts["sched_fifo"], PRIORITY
+    yield (
+        "SCHED_FIFO", f"up to {highest}" if fifo and highest else "refused",
+        "green" if fifo and highest >= n else "red",
         f"the loops ask for {n}: LimitRTPRIO={n} in a unit, --ulimit rtprio={n} for a container, "
         f"'<user> - rtprio {n}' in /etc/security/limits.d for a login",
-    )
-
-
-def _memory(facts: Facts) -> Judged:
-    return (
-        facts["mlock"],
-        "green" if facts["mlock"] == "unlimited" else "red",
+    )  # fmt: skip
+    yield (
+        "locked memory", facts["mlock"], "green" if facts["mlock"] == "unlimited" else "red",
         "unlimited: LimitMEMLOCK=infinity in a unit, --ulimit memlock=-1 for a container, "
         "'<user> - memlock unlimited' in /etc/security/limits.d for a login",
-    )
-
-
-def _throttling(facts: Facts) -> Judged:
+    )  # fmt: skip
     share = facts["rt_share"]
-    if share is None or share < 0:
-        return "unknown" if share is None else "unlimited", "green", ""
-    # the loops sleep in every tick
-    level: Level = "green" if share >= 0.9 else "red"
-    return f"{share:.0%}", level, "sysctl kernel.sched_rt_runtime_us=950000"
-
-
-def _clock(facts: Facts) -> Judged:
-    name = facts["clock_source"]
-    slow: Level = "red" if name else "yellow"
-    advice = "every look at the clock is a system call: tsc=reliable, or a look into dmesg why not"
-    return name or "unknown", "green" if name in _FAST_CLOCKS else slow, advice
-
-
-def _room(facts: Facts) -> Judged:
-    minutes = facts["shm_minutes"]
+    found = "unknown" if share is None else "unlimited" if share < 0 else f"{share:.0%}"
+    scarce = share is not None and 0 <= share < 0.9  # the loops sleep in every tick
+    advice = "sysctl kernel.sched_rt_runtime_us=950000"
+    yield "real-time share", found, "red" if scarce else "green", advice
+    clock, minutes = facts["clock_source"], facts["shm_minutes"]
+    slow: Level = "red" if clock else "yellow"
+    yield (
+        "clock source", clock or "unknown", "green" if clock in _FAST_CLOCKS else slow,
+        "every look at the clock is a system call: tsc=reliable, or a look into dmesg why not",
+    )  # fmt: skip
     if minutes is None:
-        return "none", "red", "recordings go to the disk, and a tick may wait for it: mount a tmpfs"
-    return (
-        f"room for {minutes:g} min at 10 kHz",
-        "red" if minutes < 1 else "yellow" if minutes < 10 else "green",
-        "a longer run records to the disk: mount -o remount,size=… /dev/shm",
-    )
-
-
-def _virtual(facts: Facts) -> Judged:
+        advice = "recordings go to the disk, and a tick may wait for it: mount a tmpfs"
+        yield "/dev/shm", "none", "red", advice
+    else:
+        room: Level = "red" if minutes < 1 else "yellow" if minutes < 10 else "green"
+        advice = "a longer run records to the disk: mount -o remount,size=… /dev/shm"
+        yield "/dev/shm", f"room for {minutes:g} min at 10 kHz", room, advice
     kind, steal = facts["virtual_machine"], facts["steal_pct"]
-    if kind == "no":
-        return "no", "green", ""
-    found = kind if steal is None else f"{kind}, host takes {steal:g} %"
-    advice = "the host can stop it for milliseconds: bare metal, or processors pinned by the host"
-    return found, "red" if (steal or 0.0) > 1 else "yellow", advice
-
-
-def _load(facts: Facts) -> Judged:
+    stopped: Level = "red" if (steal or 0.0) > 1 else "yellow"
+    yield (
+        "virtual machine",
+        kind if steal is None or kind == "no" else f"{kind}, host takes {steal:g} %",
+        "green" if kind == "no" else stopped,
+        "the host can stop it for milliseconds: bare metal, or processors pinned by the host",
+    )  # fmt: skip
     load = facts["load_average"][0]
-    advice = "other work runs on this machine: stop it, or isolate the loops' processors"
-    return f"{load:g}", "yellow" if load / facts["cpus"] > 0.5 else "green", advice
+    yield (
+        "load", f"{load:g}", "yellow" if load / facts["cpus"] > 0.5 else "green",
+        "other work runs on this machine: stop it, or isolate the loops' processors",
+    )  # fmt: skip
+    yield ("CAN", *_can(facts))
+    names = ("python", "gfmhil", *_NEEDED, "libzmq")
+    missing = [name for name in _NEEDED if facts[name] is None]
+    found = ", ".join(f"{name} {facts[name]}" for name in names if facts[name])
+    yield "versions", found, "red" if missing else "green", f"pip install {' '.join(missing)}"
 
 
-def _can(facts: Facts) -> Judged:
+def _can(facts: Facts) -> tuple[str, Level, str]:
     names = [f"{name} {state}" for name, state in facts["can"].items()]
     if names:
         up = any(not name.endswith(" down") for name in names)
@@ -246,30 +221,10 @@ def _can(facts: Facts) -> Judged:
     return "no driver", "yellow", advice
 
 
-def _versions(facts: Facts) -> Judged:
-    names = ("python", "gfmhil", *_NEEDED, "libzmq")
-    missing = [name for name in _NEEDED if facts[name] is None]
-    found = ", ".join(f"{name} {facts[name]}" for name in names if facts[name])
-    return found, "red" if missing else "green", f"pip install {' '.join(missing)}"
-
-
-_RULES: dict[str, Callable[[Facts], Judged]] = {
-    "kernel": _kernel,
-    "processors": _processors,
-    "isolated processors": _isolated,
-    "hyper-threads": _threads,
-    "frequency governor": _governor,
-    "deepest idle state": _idle,
-    "SCHED_FIFO": _priority,
-    "locked memory": _memory,
-    "real-time share": _throttling,
-    "clock source": _clock,
-    "/dev/shm": _room,
-    "virtual machine": _virtual,
-    "load": _load,
-    "CAN": _can,
-    "versions": _versions,
-}
+def worst(findings: Iterable[Finding]) -> Level:
+    """The level of the worst of them."""
+    levels = {f.level for f in findings}
+    return "red" if "red" in levels else "yellow" if "yellow" in levels else "green"
 
 
 def _text(path: Path) -> str:

@@ -6,8 +6,6 @@ since then. This additional delay uses up the margin. The time from y[k] sent to
 received shows how close a run is to misses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ frequency or above leaves them alone. ``cycle`` in a name says so; ``p_peak``, `
 ``v_min``, ``v_max`` and ``t90_s`` are of every tick.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

@@ -10,8 +10,6 @@ Exponentials are what a loop does that is left to itself. So the fit begins wher
 scenario acts any more: after the end of a ramp, a course, a sag or a fault.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cache
@@ -25,7 +23,7 @@ from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, hann, whole_ticks
 from gfm_hil.scenario import Scenario
-from gfm_hil.scenario.events.fault_clear import FaultClear
+from gfm_hil.scenario.events.fault import FaultClear
 from gfm_hil.scenario.events.grid_frequency import GridFrequency
 from gfm_hil.scenario.events.grid_voltage import GridVoltage
 from gfm_hil.scenario.events.reference import Reference

@@ -131,11 +131,8 @@ class NetworkRun(Mapping[str, Run]):
 
 
 def _places(folder: Path, scenario: Scenario) -> dict[str, Path]:
-    """The run folders of a network's converters in its own folder, by their names.
-
-    Raises:
-        UserError: one is a link.
-    """
+    """The run folders of a network's converters in its own folder, by their names. Raises
+    UserError: one is a link."""
     places = {name: folder / name for name in scenario.parts}
     for name, place in places.items():
         if place.is_symlink() or place.parent != folder or name == "..":
@@ -148,11 +145,8 @@ def save_network(
     folder: str | Path,
     report: Report | None = None,
 ) -> Path:
-    """Write a folder with the run folder of each converter, and a figure of all; returns it.
-
-    Raises:
-        UserError: the folder holds something already, or cannot be written.
-    """
+    """Write a folder with the run folder of each converter, and a figure of all; returns it. Raises
+    UserError: the folder holds something already, or cannot be written."""
     folder = Path(folder)
     check_empty(folder)
     for name, one in run.items():

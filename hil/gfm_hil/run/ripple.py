@@ -9,8 +9,6 @@ unbalance of the grid, or an unbalanced fault, that is still there explains the 
 the grid's frequency.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

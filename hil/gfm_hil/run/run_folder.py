@@ -5,8 +5,6 @@ files are made of, and ``recover`` can make them again. ``merge_roles`` makes on
 that the sides of a run leave if they were started apart.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json
@@ -47,11 +45,9 @@ _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 def check_free(folder: Path, ticks: int, inner: bool = False) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
 
-    ``inner``: the run has an inner stage.
-
-    Raises:
-        UserError: it holds something, cannot be made or written, or the disk is too full; a
-            memory-mapped file on a full disk would end the process without a word.
+    ``inner``: the run has an inner stage. Raises UserError: it holds something, cannot be made or
+    written, or the disk is too full; a memory-mapped file on a full disk would end the process
+    without a word.
     """
     there = folder
     while not there.exists():
@@ -153,11 +149,8 @@ class _LinkEnd(BaseModel):
 
 @contextlib.contextmanager
 def in_use(folder: Path) -> Iterator[None]:
-    """While this process runs the run of ``folder``, ``recover`` refuses it.
-
-    Raises:
-        UserError: another process is just recovering it.
-    """
+    """While this process runs the run of ``folder``, ``recover`` refuses it. Raises UserError:
+    another process is just recovering it."""
     with contextlib.ExitStack() as stack:
         handle = _open_lock(folder)
         stack.callback(os.close, handle)
@@ -265,10 +258,8 @@ def _link_ends(folder: Path) -> dict[Role, dict[str, Any]]:
 def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
     """Write the folder of a run in memory, or copy that of another; returns it.
 
-    A law that was an object is there as ``law.toml``, which the scenario names.
-
-    Raises:
-        UserError: the folder holds something already, or cannot be written.
+    A law that was an object is there as ``law.toml``, which the scenario names. Raises UserError:
+    the folder holds something already, or cannot be written.
     """
     folder = Path(folder)
     check_empty(folder)

@@ -5,21 +5,21 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.controllers import ControllerProtocol, PilController
+from gfm_hil.controllers import ExternalController
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.compiling import compiled_bench, compiled_benches
+from gfm_hil.engine.compiling import compiled_benches
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
-from gfm_hil.engine.setup import Bench, make_bench, make_benches
+from gfm_hil.engine.setup import ONE_CONVERTER, Bench, make_bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
 from gfm_hil.recording.columns import ColumnLike
 from gfm_hil.recording.log import Outcome
@@ -59,12 +59,11 @@ def run_scenario(
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
             folder is then left as it was.
     """
-    check_free(folder, scenario.ticks, scenario.has_inner)
-    # here, so that two processes do not compile the same at a time
-    bench = compiled_bench(scenario, notice, ("plant",) if controller_command else ROLES)
+    if scenario.parts:
+        raise UserError(ONE_CONVERTER)
     own = str(folder.absolute())
     command = tuple(word.replace("{folder}", own) for word in controller_command)
-    return _run(scenario, folder, [bench], progress, notice, report, command)[""]
+    return _run(scenario, folder, progress, notice, report, command)[""]
 
 
 def external_command(model: str, ports: Path | None) -> list[str]:
@@ -95,24 +94,21 @@ def run_network(
     Raises:
         UserError: the folder is in use, or there is no operating point.
     """
-    check_free(folder, scenario.ticks * len(scenario.parts), scenario.has_inner)
-    runs = _run(scenario, folder, compiled_benches(scenario, notice), progress, notice, report)
+    runs = _run(scenario, folder, progress, notice, report)
     return _network(scenario, runs, folder, report)
 
 
 def _run(
     scenario: Scenario,
     folder: Path,
-    benches: Sequence[Bench],
     progress: Progress,
     notice: Notice,
     report: Report | None,
     controller_command: tuple[str, ...] = (),
 ) -> dict[str, Run]:
     """Run both sides of each converter, and complete their run folders."""
-    places = _places(scenario, folder)
-    outside: dict[str, Outcome] = {}
-    with _in_use(folder, places.values()):
+
+    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Ended:
         try:
             with Interrupt() as interrupt:
                 try:
@@ -123,45 +119,51 @@ def _run(
                 except OSError as problem:
                     raise UserError(f"{folder}: {problem.strerror}") from None
                 if scenario.in_process:
-                    began = _run_here(benches, [*places.values()], progress, interrupt)
-                else:
-                    both = Processes(
-                        scenario, folder, progress, notice, interrupt, controller_command
-                    )
-                    began, outside = both.run()
+                    return _run_here(benches, [*places.values()], progress, interrupt), {}
+                return Processes(
+                    scenario, folder, progress, notice, interrupt, controller_command
+                ).run()
         except UserError:
             for place in places.values():
                 remove_parts(place)
             shutil.rmtree(folder)
             raise
-        return _finish(benches, places, time.monotonic() - began, report, outside)
+
+    roles: Sequence[Role] = ("plant",) if controller_command else ROLES
+    return _recorded(scenario, folder, roles, notice, report, work)
 
 
-@contextmanager
-def _in_use(folder: Path, places: Iterable[Path]) -> Iterator[None]:
-    """Make the folders of a run's converters, and keep them in use; see ``in_use``."""
+#: when the first tick ran (``time.monotonic``), and by converter how its run ended as seen from
+#: outside the sides
+_Ended = tuple[float, Mapping[str, Outcome]]
+
+
+def _recorded(
+    scenario: Scenario,
+    folder: Path,
+    roles: Sequence[Role],
+    notice: Notice,
+    report: Report | None,
+    work: Callable[[Sequence[Bench], Mapping[str, Path]], _Ended],
+) -> dict[str, Run]:
+    """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
+    places = _places(scenario, folder)
+    check_free(folder, scenario.ticks * len(places), scenario.has_inner)
+    # here, so that two processes do not compile the same at a time
+    benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:
-        for place in places:
+        for place in places.values():
             place.mkdir(parents=True, exist_ok=True)
             stack.enter_context(in_use(place))
         stack.enter_context(cut_short(folder))
-        yield
-
-
-def _finish(
-    benches: Sequence[Bench],
-    places: Mapping[str, Path],
-    wall_s: float,
-    report: Report | None,
-    outside: Mapping[str, Outcome],
-) -> dict[str, Run]:
-    """Complete the run folder of each converter."""
-    return {
-        name: finish(
-            bench.scenario, place, bench.controller.labels, wall_s, report, outside.get(name)
-        )
-        for bench, (name, place) in zip(benches, places.items(), strict=True)
-    }
+        began, outside = work(benches, places)
+        wall_s = time.monotonic() - began
+        return {
+            name: finish(
+                bench.scenario, place, bench.controller.labels, wall_s, report, outside.get(name)
+            )
+            for bench, (name, place) in zip(benches, places.items(), strict=True)
+        }
 
 
 def _network(
@@ -180,7 +182,7 @@ def run_side(
     endpoints: Mapping[str, str],
     notice: Notice = lambda text: None,
     report: Report | None = None,
-    external: ControllerProtocol | PilController | None = None,
+    external: ExternalController | None = None,
 ) -> Run | NetworkRun:
     """Run one side alone, whose peer another process or machine runs, and leave a run folder of
     what it recorded, or one for each converter of a network.
@@ -194,16 +196,13 @@ def run_side(
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied.
     """
-    places = _places(scenario, folder)
-    check_free(folder, scenario.ticks * len(places), scenario.has_inner)
-    if scenario.parts:
-        benches = compiled_benches(scenario, notice, (role,))
-    else:
-        benches = [compiled_bench(scenario, notice, (role,))]
-    with _in_use(folder, places.values()):
+
+    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Ended:
         began = time.monotonic()
         run_role(role, scenario, folder, endpoints, notice, external)
-        runs = _finish(benches, places, time.monotonic() - began, report, {})
+        return began, {}
+
+    runs = _recorded(scenario, folder, (role,), notice, report, work)
     return _network(scenario, runs, folder, report) if scenario.parts else runs[""]
 
 
@@ -212,7 +211,7 @@ def run_part(
     scenario: Scenario,
     folder: Path,
     endpoints: Mapping[str, str],
-    external: ControllerProtocol | PilController | None,
+    external: ExternalController | None,
 ) -> None:
     """Run one side in the folder of a run that another process has started and completes."""
     with ExitStack() as stack:
@@ -267,11 +266,8 @@ def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> 
 
 
 def run_network_in_memory(scenario: Scenario) -> NetworkRun:
-    """Run a scenario with a network in this process and leave nothing on the disk.
-
-    Raises:
-        UserError: the scenario has no operating point.
-    """
+    """Run a scenario with a network in this process and leave nothing on the disk. Raises
+    UserError: the scenario has no operating point."""
     benches = make_benches(scenario)
     runs = _in_memory(benches, [_room(bench) for bench in benches])
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))

@@ -1,7 +1,5 @@
 """summary.json: how a run ended and what it showed."""
 
-from __future__ import annotations
-
 import math
 import platform
 from collections.abc import Mapping, Sequence

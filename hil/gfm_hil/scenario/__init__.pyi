@@ -1,10 +1,15 @@
 from .loading import (
     SCENARIO_FOLDERS,
+    check_scenario,
     find_file,
     find_scenario,
     load_scenario,
     look_beside,
+    plant_of,
+    scenario_toml,
     shipped_scenarios,
+    toml_text,
+    write_scenario,
 )
 from .schema import (
     INPROC,
@@ -15,8 +20,6 @@ from .schema import (
     References,
     Scenario,
 )
-from .trial import check_scenario, plant_of
-from .writing import scenario_toml, toml_text, write_scenario
 
 __all__ = [
     "INPROC",

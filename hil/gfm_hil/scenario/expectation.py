@@ -4,8 +4,6 @@ The reason of an end begins with its name, from the lists of the plant and the c
 after the colon (quantity, value, threshold, time) is for the reader.
 """
 
-from __future__ import annotations
-
 from gfm_plant.names import (
     CONTROLLER,
     CONTROLLER_GONE,

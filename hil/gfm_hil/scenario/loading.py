@@ -1,18 +1,23 @@
-"""Finds, reads and overrides a scenario's file."""
-
-from __future__ import annotations
+"""A scenario's file: found, read, overridden, checked whole, and written."""
 
 import contextlib
 import copy
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from gfm_hil.core.errors import UserError
+from pydantic import ValidationError
+
+from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.files import write_text
+from gfm_hil.scenario.events.base import PlantEvent
 from gfm_hil.scenario.schema import INPROC, Scenario
-from gfm_hil.scenario.trial import check_scenario
+from gfm_plant import ConverterParameters, Network, load_converter, make_network, make_plant
+from gfm_runtime import LawError, discretise, load_law
 from gfm_runtime.errors import allowed, meant, printable
+from gfm_runtime.inner_file import named_inner
 from gfm_runtime.toml_file import read_toml
 
 SCENARIO_FOLDERS = (
@@ -22,20 +27,14 @@ SCENARIO_FOLDERS = (
 
 
 def find_scenario(name: str) -> Path:
-    """The file of a scenario: a path, or the name of a shipped one (with or without .toml).
-
-    Raises:
-        UserError: neither exists.
-    """
+    """The file of a scenario: a path, or the name of a shipped one (with or without .toml). Raises
+    UserError: neither exists."""
     return find_file("scenario", name, "*.toml")
 
 
 def find_file(kind: str, name: str, pattern: str) -> Path:
-    """The file at that path, or the shipped file of that name; ``kind`` is for the message.
-
-    Raises:
-        UserError: neither exists.
-    """
+    """The file at that path, or the shipped file of that name; ``kind`` is for the message. Raises
+    UserError: neither exists."""
     given, shipped = Path(name), _shipped(pattern)
     try:
         is_file, exists = given.is_file(), given.exists()
@@ -108,9 +107,7 @@ def load_scenario(
         link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
     if in_process or chosen is not None:  # one link for all
-        network = content.get("network")
-        members = network.get("converters") if isinstance(network, dict) else None
-        for member in members.values() if isinstance(members, dict) else ():
+        for member in _inside(content, "network", "converters").values():
             if isinstance(member, dict):
                 member.pop("link", None)
     for key, value in (implied | overrides).items():
@@ -134,14 +131,9 @@ def _of_converter(
     options: Mapping[str, str],
 ) -> tuple[dict[str, Any], Mapping[str, str]]:
     """Overrides and their names as for ``load_scenario``, with ``law`` and ``inner`` where they
-    reach the converters of a network.
-
-    Raises:
-        UserError: there is no such converter; none is named, and one has its own law or stage.
-    """
-    network = content.get("network")
-    members = network.get("converters") if isinstance(network, dict) else None
-    members = members if isinstance(members, dict) else {}
+    reach the converters of a network. Raises UserError: there is no such converter; none is named,
+    and one has its own law or stage."""
+    members = _inside(content, "network", "converters")
     if converter is not None and converter not in members:
         allowed = f"must be one of {[*members]}" if members else "the scenario has no network"
         option = options.get("converter", "converter")
@@ -198,13 +190,167 @@ def _files(content: Any) -> Iterator[tuple[Any, Any]]:
             elif key in table:
                 yield table, key
 
-    def inside(table: Any, key: str) -> Any:
-        return table.get(key) if isinstance(table, dict) else None
-
-    members = inside(inside(content, "network"), "converters")
-    for one in (content, *(members.values() if isinstance(members, dict) else ())):
+    for one in (content, *_inside(content, "network", "converters").values()):
         yield from within(one, "law", "inner", "ready_laws", "compare")
-        yield from within(inside(one, "plant"), "converter")
-    events = inside(content, "events")
+        yield from within(_inside(one, "plant"), "converter")
+    events = content.get("events") if isinstance(content, dict) else None
     for event in events if isinstance(events, list) else ():
         yield from within(event, "file", "law")
+
+
+def _inside(table: Any, *keys: str) -> dict[str, Any]:
+    """The table at a path of content that nobody has checked; an empty one if there is none."""
+    for key in keys:
+        table = table.get(key) if isinstance(table, dict) else None
+    return table if isinstance(table, dict) else {}
+
+
+def check_scenario(
+    content: dict[str, Any],
+    where: str,
+    overrides: Mapping[tuple[str, ...], str] = MappingProxyType({}),
+) -> Scenario:
+    """The scenario of a dict, with its laws and its plant tried out.
+
+    Args:
+        content: plain data.
+        where: the file it comes from.
+        overrides: what does not come from there, by its path: an option with its value.
+
+    Raises:
+        UserError: as ``load_scenario``.
+    """
+
+    def source(path: tuple[str | int, ...]) -> str:
+        """Where the value at a path comes from; a table may come from several places."""
+        for part, option in overrides.items():
+            if path[: len(part)] == part:
+                return option
+        inside = [option for part, option in overrides.items() if part[: len(path)] == path]
+        return " with ".join([where, ", ".join(inside)] if inside else [where])
+
+    try:
+        scenario = Scenario.model_validate(content)
+    except ValidationError as problem:
+        raise UserError("\n".join(lines(problem, Scenario, source, content))) from None
+    wrong: list[str] = []
+    if stage := _stage_mistakes(scenario.inner):
+        ours = "" if ("inner",) in overrides else f"{where}: "
+        raise UserError("\n".join(ours + line for line in stage))
+    for member in [scenario.of(name) for name in scenario.converters]:
+        key = "inner" if _stage_mistakes(member.inner) else "law"
+        at = f"{where}: network.converters.{member.converter}.{key}: "
+        wrong += [at + line for law in member.laws() for line in _law_mistakes(law, member)]
+    for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
+        ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
+        wrong += [ours + line for line in _law_mistakes(law, scenario)]
+    try:
+        _try_plant(scenario)
+    except UserError as problem:
+        wrong.append(f"{source(('plant',))}: {problem}")
+    if wrong:
+        raise UserError("\n".join(map(printable, wrong)))
+    return scenario
+
+
+def _stage_mistakes(name: str | None) -> Sequence[str]:
+    """What is wrong with an inner stage, if one is named."""
+    try:
+        if name is not None:
+            named_inner(name)
+    except LawError as problem:
+        return problem.lines
+    return ()
+
+
+def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
+    """What is wrong with a law, read or at the scenario's sampling time."""
+    try:
+        stages = load_law(law, scenario.inner).laws
+    except LawError as problem:
+        return problem.lines
+    try:
+        for stage in stages:
+            discretise(stage, scenario.T_s)
+    except LawError as problem:
+        return problem.within(f"law {law}").lines
+    return ()
+
+
+def plant_of(scenario: Scenario) -> Network:
+    """The plant of a scenario: one converter, or those of its network. Raises ValueError: as
+    ``make_plant`` and ``make_network``."""
+    if scenario.network is None:
+        options = scenario.plant
+        options = options.with_seed(scenario.seed) if scenario.seed else options
+        return make_plant(options, scenario.T_s)
+    converters = {}
+    for name, member in scenario.network.converters.items():
+        options = scenario.of(name).plant
+        if scenario.seed:
+            options = options.with_seed(scenario.seed)
+        converters[name] = (options, member.node)
+    return make_network(converters, scenario.T_s, scenario.plant.grid, scenario.network)
+
+
+def _try_plant(scenario: Scenario) -> None:
+    """Build the plant and try those of its events that not every plant can carry out."""
+    plants = {"plant.": scenario.plant} | {
+        f"network.converters.{name}.plant.": scenario.of(name).plant for name in scenario.converters
+    }
+    for of, options in plants.items():
+        place = f"{of}converter = {options.converter!r}"
+        if not options.converter.endswith(".toml"):
+            try:
+                load_converter(options.converter)
+            except ValueError as problem:  # names key and value itself
+                raise UserError(f"{of}{problem}") from None
+            continue
+        try:
+            ConverterParameters.model_validate(read_toml(options.converter))
+        except ValidationError as problem:
+            wrong = lines(problem, ConverterParameters)
+            raise UserError("; ".join(f"{place}: {line}" for line in wrong)) from None
+        except ValueError as problem:
+            raise UserError(f"{place}: {problem}") from None
+    try:
+        plant = plant_of(scenario)
+    except ValueError as problem:
+        raise UserError(str(problem)) from None
+    for k, event in enumerate(scenario.events):
+        if isinstance(event, PlantEvent):
+            try:
+                event.try_on(plant)
+            except (UserError, ValueError) as problem:
+                raise UserError(f"events.{k}: {problem}") from None
+
+
+def scenario_toml(scenario: Scenario) -> str:
+    """The resolved scenario as TOML; ``load_scenario`` reads it back to an equal one."""
+    return toml_text(scenario.model_dump(mode="json", exclude_none=True))
+
+
+def toml_text(content: dict[str, Any]) -> str:
+    """Nested tables, lists of tables and plain values as TOML."""
+    import tomlkit  # here: few commands write
+
+    return tomlkit.dumps(content)
+
+
+def write_scenario(folder: Path, scenario: Scenario) -> None:
+    """Write ``scenario.toml`` into a run folder, with the files of its events in ``profiles``.
+    Raises OSError: a file cannot be read or written."""
+    events, taken = [], dict[str, str]()
+    for k, event in enumerate(scenario.events):
+        if (file := getattr(event, "file", None)) is not None:
+            name = Path(file).name
+            name = f"{k}-{name}" if taken.get(name, file) != file else name
+            taken[name] = file
+            copy = folder / "profiles" / name
+            copy.parent.mkdir(exist_ok=True)
+            if not (copy.exists() and copy.samefile(file)):
+                shutil.copyfile(file, copy)
+            event = event.model_copy(update={"file": f"profiles/{name}"})
+        events.append(event)
+    written = scenario.model_copy(update={"events": events})
+    write_text(folder / "scenario.toml", scenario_toml(written))

@@ -132,11 +132,7 @@ def network_loop(
 
 def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> ClosedLoop:
     """The sampled loop of a checked scenario under another law, of one converter if there is a
-    network.
-
-    Raises:
-        NoEquilibrium: there is no operating point.
-    """
+    network. Raises NoEquilibrium: there is no operating point."""
     if converter is not None:
         return _linearised(scenario, {converter: law}).converter(converter)
     return ClosedLoop.of(law, scenario.plant, scenario.references.vector(), T_s=scenario.T_s)

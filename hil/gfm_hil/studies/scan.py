@@ -239,32 +239,20 @@ class FrequencyScan:
 
 @dataclass(frozen=True)
 class _Band:
-    """The tones of a decade.
+    """The tones of a decade."""
 
-    Attributes:
-        hz: tones, multiples of the window's inverse.
-        every: ticks from one line of the profile to the next.
-        window: ticks, a multiple of ``every``.
-    """
-
-    hz: Vector
-    every: int
-    window: int
+    hz: Vector  # tones, multiples of the window's inverse
+    every: int  # ticks from one line of the profile to the next
+    window: int  # ticks, a multiple of ``every``
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is injected.
+    """What is injected."""
 
-    Attributes:
-        bands: one after the other.
-        settle: ticks before each window.
-        amplitude: of each tone, p.u.
-    """
-
-    bands: Sequence[_Band]
-    settle: Sequence[int]
-    amplitude: float
+    bands: Sequence[_Band]  # one after the other
+    settle: Sequence[int]  # ticks before each window
+    amplitude: float  # of each tone, p.u.
 
     @property
     def hz(self) -> Vector:
@@ -374,11 +362,7 @@ def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float
 def _bands(
     start_hz: float, stop_hz: float, points: int, T_s: float, window_s: float
 ) -> list[_Band]:
-    """The tones by decade.
-
-    Raises:
-        UserError: a value that cannot be.
-    """
+    """The tones by decade. Raises UserError: a value that cannot be."""
     top = 0.45 / T_s
     if not 0.01 <= start_hz < stop_hz <= top:
         raise UserError(
@@ -456,11 +440,8 @@ def _omega_b(scenario: Scenario) -> float:
 def _inject(
     scenario: Scenario, plan: _Plan, axis: str, external: tuple[str, ...]
 ) -> tuple[_Spectra, dict[str, Any]]:
-    """The spectra of a run with the injection along one axis, and its summary.
-
-    Raises:
-        UserError: the run did not complete.
-    """
+    """The spectra of a run with the injection along one axis, and its summary. Raises UserError:
+    the run did not complete."""
     grid, T_s = scenario.plant.grid, scenario.T_s
     starts, events = plan.starts(), []
     with tempfile.TemporaryDirectory(prefix="gfmhil-scan-") as place:
@@ -502,27 +483,19 @@ def _inject(
 
 @dataclass(frozen=True)
 class _Spectra:
-    """Fourier coefficients of one run in the dq frame, at the plan's tones; p.u.
+    """Fourier coefficients of one run in the dq frame, at the plan's tones; p.u."""
 
-    Attributes:
-        v, i_o, v_g: shape (K, 2): voltage of the capacitor, current to the grid, grid's voltage.
-        rest: means of v, i_o and v_g as complex numbers d + jq.
-        ends: largest difference between the ends of a window over the largest deviation in it.
-    """
-
+    # v, i_o, v_g: shape (K, 2): voltage of the capacitor, current to the grid, grid's voltage
     v: Response
     i_o: Response
     v_g: Response
-    rest: tuple[complex, complex, complex]
-    ends: float
+    rest: tuple[complex, complex, complex]  # means of v, i_o and v_g as complex numbers d + jq
+    ends: float  # largest difference between the ends of a window over the largest deviation in it
 
     @classmethod
     def of(cls, run: Run, plan: _Plan) -> _Spectra:
-        """Those of a run.
-
-        Raises:
-            UserError: the circuit's states do not follow the commands: a limit acts.
-        """
+        """Those of a run. Raises UserError: the circuit's states do not follow the commands: a
+        limit acts."""
         path = _Path.of(run)
         parts, ends = [], 0.0
         for first, settle, band in zip(plan.starts(), plan.settle, plan.bands, strict=False):
@@ -544,24 +517,17 @@ class _Path:
     """A run as a path of the circuit: its states at the ticks and its sources in between.
 
     All space vectors are in the frame that turns steadily with the grid. A source is a phasor at
-    the beginning of each stretch of a period, and the speed at which it turns, rad/s.
+    the beginning of each stretch of a period, and the speed at which it turns, rad/s."""
 
-    Attributes:
-        T_s: s.
-        w: (i_f, v, i_o) at each tick, shape (N, 3).
-        v_g: grid's voltage at each tick, shape (N,).
-        delta: angle of the converter's frame, shape (N,), rad.
-        stretches: of a period: its begin and length, s, and the bridge's and the grid's phasors and
-            speeds, shape (N, 2) each.
-        rates, states, modes, drive: of the circuit, see ``gfm_plant.circuit.Modes``, the rates in
-            that frame and the drive of bridge and grid alone.
-    """
-
-    T_s: float
-    w: Response
-    v_g: Response
-    delta: Vector
+    T_s: float  # s
+    w: Response  # (i_f, v, i_o) at each tick, shape (N, 3)
+    v_g: Response  # grid's voltage at each tick, shape (N,)
+    delta: Vector  # angle of the converter's frame, shape (N,), rad
+    # of a period: its begin and length, s, and the bridge's and the grid's phasors and speeds,
+    # shape (N, 2) each
     stretches: list[tuple[float, float, Response, Vector]]
+    # rates, states, modes, drive: of the circuit, see ``gfm_plant.circuit.Modes``, the rates in
+    # that frame and the drive of bridge and grid alone
     rates: Response
     states: Response
     modes: Response
@@ -604,11 +570,8 @@ class _Path:
         return float(self.delta[window].mean())
 
     def check(self, window: slice) -> None:
-        """Compare each state with what the circuit makes of the one before.
-
-        Raises:
-            UserError: they differ: a limit of the bridge acts.
-        """
+        """Compare each state with what the circuit makes of the one before. Raises UserError: they
+        differ: a limit of the bridge acts."""
         z = self.w[window] @ self.modes.T
         for _, length, at, speeds in self.stretches:
             z = z * np.exp(self.rates * length)

@@ -118,11 +118,7 @@ def save_figures(of: FrequencyScan, folder: Path, grids: Sequence[tuple[float, f
     from matplotlib import pyplot
 
     matplotlib.use("Agg")
-    for name, draw in (
-        ("admittance", admittance),
-        ("passivity", passivity),
-        ("nfp", nfp),
-    ):
+    for name, draw in (("admittance", admittance), ("passivity", passivity), ("nfp", nfp)):
         draw(of)
         _keep(folder / f"{name}.png")
     for scr, x_over_r in grids:

@@ -172,11 +172,8 @@ def _set_up() -> None:
 
 @contextlib.contextmanager
 def pool_of(workers: int) -> Iterator[Executor | None]:
-    """``processes``, or None for 1 worker, which works here.
-
-    Raises:
-        UserError: so many processes cannot be.
-    """
+    """``processes``, or None for 1 worker, which works here. Raises UserError: so many processes
+    cannot be."""
     check_workers(workers)
     if workers == 1:
         yield None

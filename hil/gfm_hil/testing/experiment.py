@@ -11,8 +11,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.run import checks
 from gfm_hil.run.modes import acting, free_from
-from gfm_hil.testing.setting import beside
-from gfm_hil.testing.steps import Steps
+from gfm_hil.testing.steps import Steps, beside
 
 _NEAR = 0.02  # s that a figure shows on each side of a moment
 
@@ -25,13 +24,9 @@ class Experiment(Steps):
     """
 
     def assert_settles(
-        self,
-        signal: str,
-        to: float,
-        within: float,
-        tolerance: float = 0.02,
+        self, signal: str, to: float, within: float, tolerance: float = 0.02,
         since: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """From ``within`` s after the last step (or ``since``, s) to the end, the signal is
         ``to`` ± ``tolerance``."""
         __tracebackhide__ = True
@@ -39,11 +34,7 @@ class Experiment(Steps):
         self._judge(w.name, "settles", checks.settles(w, to, within, tolerance))
 
     def assert_overshoot_below(
-        self,
-        signal: str,
-        percent: float,
-        to: float | None = None,
-        since: float | None = None,
+        self, signal: str, percent: float, to: float | None = None, since: float | None = None
     ) -> None:
         """After the last step the signal exceeds ``to`` (by default its final value) by at most
         ``percent`` of its step."""
@@ -52,13 +43,9 @@ class Experiment(Steps):
         self._judge(w.name, "overshoot", checks.overshoot(w, percent, to))
 
     def assert_within_envelope(
-        self,
-        signal: str,
-        low: float | None = None,
-        high: float | None = None,
-        csv: str | Path | None = None,
-        since: float | None = None,
-    ) -> None:
+        self, signal: str, low: float | None = None, high: float | None = None,
+        csv: str | Path | None = None, since: float | None = None,
+    ) -> None:  # fmt: skip
         """After the last step the signal stays between two numbers, or between two curves of a
         file with the columns t (s after the step), low, high."""
         __tracebackhide__ = True
@@ -66,12 +53,11 @@ class Experiment(Steps):
         if (csv is None) == (low is None and high is None):
             raise UserError(f"low = {low}, high = {high}, csv = {csv}: give limits or a file")
         if csv is not None:
-            lower, upper = checks.read_envelope(Path(beside(self._near, str(csv))), w.t - w.since)
+            limits = checks.read_envelope(Path(beside(self._near, str(csv))), w.t - w.since)
         else:
-            lower, upper = (
-                np.full(len(w.t), np.nan if limit is None else limit) for limit in (low, high)
-            )
-        self._judge(w.name, "envelope", checks.envelope(w, lower, upper))
+            constant = (np.full(len(w.t), np.nan if x is None else x) for x in (low, high))
+            limits = next(constant), next(constant)
+        self._judge(w.name, "envelope", checks.envelope(w, *limits))
 
     def assert_damped(
         self, min_ratio: float, signal: str = "p", since: float | None = None
@@ -144,7 +130,7 @@ class Experiment(Steps):
         self.assert_no_trip()
         signals, T_s = self.signals, self.setting.scenario.T_s
         if since is None:
-            events = self._plan.events(self._ran)
+            events = self._events(self._ran)
             first = events[-1].at(T_s) if events else 0
         else:
             first = round(since / T_s)
@@ -161,27 +147,25 @@ class Experiment(Steps):
             self._fail(finding.text, signal, what, finding)
 
     def _fail(
-        self,
-        text: str,
-        signal: str,
-        what: str,
-        finding: checks.Violation | None = None,
+        self, text: str, signal: str, what: str, finding: checks.Violation | None = None,
         around: tuple[float, float] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Draw the figure of a failure and fail with its path."""
         __tracebackhide__ = True
         run, T_s = self.result, self.setting.scenario.T_s
-        steps = [(e.at(T_s) * T_s, e.label()) for e in self._plan.events(self._ran)]
+        steps = [(e.at(T_s) * T_s, e.label()) for e in self._events(self._ran)]
         done = "; ".join(f"{label} at {t:g} s" for t, label in steps) or "none"
         link, mode = run.summary["link"], run.summary["mode"]
         lines = [text, f"run: {' → '.join(run.summary['laws'])} over {link}, {mode}; steps: {done}"]
         if len(run.signals["tick"]):
             # takes half a second to import, and only failures need it
-            from gfm_hil.testing.picture import draw, draw_times
+            from gfm_hil.results.figures import draw_timing
+            from gfm_hil.testing.picture import draw
 
             figure = run.file(f"{what}_{signal}.png")
-            if what == "miss":
-                draw_times(figure, run, self.setting.scenario)
+            if what == "miss":  # when it was late, as in its report
+                timing = draw_timing(figure.parent, run.scenario, run.timing, run.summary)
+                timing.path.rename(figure)
             else:
                 draw(figure, text, signal, self.signals, steps, finding, around)
             self._notice(figure)

@@ -13,10 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import unit_of
-from gfm_hil.recording.run import Run
-from gfm_hil.results.figures import COLOURS, draw_panel, draw_timing
+from gfm_hil.results.figures import COLOURS, draw_panel
 from gfm_hil.run.checks import Violation
-from gfm_hil.scenario import Scenario
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
 _CONTEXT = ("p", "f_hz", "V", "i", "v_dc")  # the first four that are not the signal itself
@@ -24,14 +22,10 @@ _FOLLOWS = {"p": "ref_P_ref", "q": "ref_Q_ref", "V": "ref_V_ref", "v_dc": "ref_V
 
 
 def draw(
-    path: Path,
-    text: str,
-    signal: str,
-    signals: Mapping[str, NDArray[Any]],
-    steps: Sequence[tuple[float, str]],
-    finding: Violation | None,
+    path: Path, text: str, signal: str, signals: Mapping[str, NDArray[Any]],
+    steps: Sequence[tuple[float, str]], finding: Violation | None,
     around: tuple[float, float] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw one failure.
 
     Args:
@@ -76,11 +70,6 @@ def draw(
         rows[place].set_xlabel("t [s]", fontsize=9)
     figure.suptitle("\n".join(textwrap.wrap(text, 125)), fontsize=9.5, x=0.01, ha="left")
     figure.savefig(path, dpi=110)
-
-
-def draw_times(path: Path, run: Run, scenario: Scenario) -> None:
-    """Draw when a run in real time was late, as in its report."""
-    draw_timing(path.parent, scenario, run.timing, run.summary).path.rename(path)
 
 
 def _curve(axes: Axes, name: str, signals: Mapping[str, NDArray[Any]]) -> None:

@@ -1,4 +1,4 @@
-"""An experiment's steps as calls, collected until a result is needed, and its results.
+"""The setting of a test, its steps as calls, collected until a result is needed, and its results.
 
 The steps make a scenario that runs as a whole. So a test is exact: each step belongs to a tick, on
 every link and in real time too, and the scenario file repeats the test's run.
@@ -6,7 +6,8 @@ every link and in real time too, and the scenario file repeats the test's run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,67 +18,86 @@ from pydantic import TypeAdapter, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.recording.run import Run, Signals
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario import Scenario, check_scenario
+from gfm_hil.scenario import INPROC, Scenario, check_scenario, load_scenario
 from gfm_hil.scenario.events import AnyEvent
-from gfm_hil.testing.setting import Setting, Unfit, beside, make_setting
 from gfm_runtime.signals import REF_NAMES
 
+_PLAIN = "pref_step"  # used for its grid and converter; its step is dropped
 _EVENT: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 _REFERENCES = {name.lower(): name for name in REF_NAMES}
 
 
-class StepPlan:
-    """Events and duration of a test, in addition to a scenario's own events."""
+class Unfit(UserError):
+    """The test cannot run over the link of the command line."""
 
-    def __init__(self, base: Scenario) -> None:
-        self.base = base
-        self.tick = 0  # of the next step
-        self._steps: list[Any] = []
 
-    def step(self, kind: str, /, **fields: Any) -> None:
-        """Add an event at the present tick, after the ticks planned so far.
+@dataclass(frozen=True)
+class Setting:
+    """One test's bench before its steps."""
 
-        Raises:
-            UserError: a scenario cannot have such an event.
-        """
-        given = {name: value for name, value in fields.items() if value is not None}
-        try:
-            event = _EVENT.validate_python({"type": kind, "tick": self.tick, **given})
-        except ValidationError as problem:
-            raise UserError(
-                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, AnyEvent))
-            ) from None
-        self._steps.append(event)
-        try:
-            self.scenario(self.tick + 1)  # checks laws, lines and breaker
-        except UserError:
-            self._steps.pop()
-            raise
+    scenario: Scenario  # checked, with its own events
+    # program and arguments of the user's controller process, or empty; ``{endpoint}`` and
+    # ``{scenario}`` in it are replaced
+    controller_command: tuple[str, ...]
 
-    def run(self, seconds: float | None) -> None:
-        """Continue for a time, rounded to whole ticks; without one, to the base scenario's end."""
-        T_s = self.base.T_s
-        ticks = self.base.ticks - self.tick if seconds is None else round(seconds / T_s)
-        if ticks < 1:
-            raise UserError(f"seconds = {seconds}: must be at least one tick of {T_s:g} s")
-        self.tick += ticks
+    @property
+    def realtime(self) -> bool:
+        """Whether the run is in real time."""
+        return self.scenario.mode == "realtime"
 
-    def events(self, ticks: int) -> list[Any]:
-        """The events of the first ``ticks`` ticks in order; within a tick the scenario's first."""
-        T_s = self.base.T_s
-        every = [*self.base.sorted_events(), *self._steps]
-        return sorted((e for e in every if e.at(T_s) < ticks), key=lambda e: e.at(T_s))
 
-    def scenario(self, ticks: int) -> Scenario:
-        """The first ``ticks`` ticks as a scenario.
+def beside(near: Path, name: str) -> str:
+    """The path of a file beside the test, or the name unchanged: a path or a catalogue name."""
+    found = near / name
+    return str(found) if found.is_file() else name
 
-        Raises:
-            UserError: a step is impossible, for example its law does not exist.
-        """
-        content = self.base.model_dump(exclude_none=True)
-        content["duration"] = ticks * self.base.T_s
-        content["events"] = [e.model_dump(exclude_none=True) for e in self.events(ticks)]
-        return check_scenario(content, self.base.title)
+
+def make_setting(
+    near: Path,
+    scenario: str | None = None,
+    *,
+    law: str | None = None,
+    link: str | None = None,
+    mode: str | None = None,
+    controller_command: Sequence[str] = (),
+    link_wanted: str | None = None,
+    **changed: Any,
+) -> Setting:
+    """Read and check the setting of a test.
+
+    Args:
+        near: folder of the test, searched first for scenario and law files.
+        scenario: shipped name or file; by default the paper's grid and converter, without events.
+        law, link, mode: by default the scenario's law, in process, lockstep.
+        controller_command: of the user's controller; the link is then zmq by default.
+        link_wanted: link of the command line; replaces the test's link.
+        changed: any other key of a scenario by its path with ``__`` for the dot, for example
+            ``references__P_ref=0.2`` or ``events=[]``.
+
+    Raises:
+        UserError: one line per mistake. ``Unfit`` if only ``link_wanted`` does not fit the test.
+    """
+    chosen = link or ("zmq" if controller_command else INPROC)
+    if controller_command and chosen == INPROC:
+        raise UserError("link = 'inproc': a controller_command is a process, which needs a link")
+    if link_wanted not in (None, chosen):
+        if controller_command:
+            raise Unfit(f"the controller of this test is a process that talks {chosen}")
+        if link_wanted == INPROC and mode == "realtime":
+            raise Unfit("this test is about real time, which a run in process has not")
+        if chosen != INPROC:  # they belong to the test's link
+            changed = {k: v for k, v in changed.items() if not k.startswith("link__")}
+        chosen = str(link_wanted)
+    if scenario is None:
+        changed = {"events": [], "title": "on the paper's grid", **changed}
+    loaded = load_scenario(
+        beside(near, scenario or _PLAIN),
+        law=None if law is None else beside(near, law),
+        link__type=chosen,
+        mode=mode or "lockstep",
+        **changed,
+    )
+    return Setting(loaded, tuple(map(str, controller_command)))
 
 
 class Steps:
@@ -124,7 +144,8 @@ class Steps:
             if self._skip is None:
                 raise
             self._skip(f"--gfmhil-link {self._link_wanted}: {problem}")
-        self._plan = StepPlan(self._setting.scenario)
+        self._steps: list[Any] = []  # events besides the scenario's own
+        self._tick = 0  # of the next step
         self._run: Run | None = None
         self._ran = 0  # planned ticks of ``_run``
 
@@ -133,7 +154,7 @@ class Steps:
     def set(self, ramp_s: float = 0.0, **references: float) -> None:
         """New references: ``p_ref=1.0``, or spread over ``ramp_s`` seconds."""
         known = {_REFERENCES.get(k.lower(), k): float(v) for k, v in references.items()}
-        self._planned.step("reference", ramp_s=float(ramp_s), **known)
+        self._step("reference", ramp_s=float(ramp_s), **known)
 
     def grid(
         self,
@@ -147,31 +168,31 @@ class Steps:
         if (f_hz is None) == (V_g is None):
             raise UserError(f"f_hz = {f_hz}, V_g = {V_g}: give one of them")
         if V_g is None:
-            self._planned.step("grid-frequency", f_hz=f_hz, rate=rate, duration=duration)
+            self._step("grid-frequency", f_hz=f_hz, rate=rate, duration=duration)
         else:
-            self._planned.step("grid-voltage", V_g=V_g, rate=rate, duration=duration)
+            self._step("grid-voltage", V_g=V_g, rate=rate, duration=duration)
 
     def grid_profile(self, file: str) -> None:
         """The grid's frequency and voltage follow a CSV file from here on: t [s], and f_hz or
         omega_g [p.u.], V_g [p.u.], or both."""
-        self._planned.step("grid-profile", file=beside(self._near, file))
+        self._step("grid-profile", file=beside(self._near, file))
 
     def phase_jump(self, degrees: float) -> None:
         """The grid's angle jumps ahead."""
-        self._planned.step("grid-phase-jump", degrees=degrees)
+        self._step("grid-phase-jump", degrees=degrees)
 
     def grid_impedance(self, L_g: float, R_g: float | None = None) -> None:
         """The line gets ``L_g`` and ``R_g`` times its nominal elements; without ``R_g`` both get
         the factor ``L_g``: the same line, longer or shorter."""
-        self._planned.step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
+        self._step("grid-impedance", L_g=L_g, R_g=L_g if R_g is None else R_g)
 
     def scr(self, scr: float, x_over_r: float) -> None:
         """The line becomes one of that short-circuit ratio, with that X/R."""
-        self._planned.step("grid-impedance", scr=scr, x_over_r=x_over_r)
+        self._step("grid-impedance", scr=scr, x_over_r=x_over_r)
 
     def grid_load(self, change: float) -> None:
         """The load of a finite grid changes, p.u. of the grid's rating."""
-        self._planned.step("grid-load", change=change)
+        self._step("grid-load", change=change)
 
     def grid_unbalance(
         self,
@@ -181,7 +202,7 @@ class Steps:
     ) -> None:
         """The grid's phases a, b, c keep a part of their voltage and jump in angle, for
         ``duration`` [s] or until another such step."""
-        self._planned.step(
+        self._step(
             "grid-unbalance", retained=list(retained), degrees=list(degrees), duration=duration
         )
 
@@ -196,38 +217,74 @@ class Steps:
         """A fault through ``R`` [p.u.], at 0 (filter) to 1 (grid) of the line, for ``duration`` [s]
         or until ``clear_fault``; ``kind`` is "3ph", "LG", "LL" or "LLG", and ``more`` are the other
         keys of the event."""
-        self._planned.step("fault", position=position, R=R, duration=duration, kind=kind, **more)
+        self._step("fault", position=position, R=R, duration=duration, kind=kind, **more)
 
     def clear_fault(self) -> None:
         """The fault is cleared."""
-        self._planned.step("fault-clear")
+        self._step("fault-clear")
 
     def breaker(self, closed: bool) -> None:
         """The grid breaker opens onto the local load, or closes."""
-        self._planned.step("grid-breaker", closed=closed)
+        self._step("grid-breaker", closed=closed)
 
     def switch(self, law: str) -> None:
         """Change to another law, of the catalogue or a file, without a bump."""
-        plan = self._planned
         if self.setting.controller_command:
             raise UserError(f"law = {law!r}: the user's controller has its own laws")
-        plan.step("law", law=beside(self._near, law))
+        self._step("law", law=beside(self._near, law))
 
     def gains(self, **values: float) -> None:
         """New gains of the active law, by the names in its file, without a bump: ``D_p=0.02``."""
         if self.setting.controller_command:
             raise UserError("gains: the user's controller has its own gains")
-        self._planned.step("gains", values={name: float(v) for name, v in values.items()})
+        self._step("gains", values={name: float(v) for name, v in values.items()})
 
     def reset(self) -> None:
         """Return from a trip or the safe state to the start; needs ``after_trip="wait"``."""
         if self.setting.controller_command:
             raise UserError("reset: gfmhil cannot reset the user's controller")
-        self._planned.step("reset")
+        self._step("reset")
 
     def run(self, seconds: float | None = None) -> None:
         """Continue for a time [s]; without one, to the scenario's end."""
-        self._planned.run(seconds)
+        base = self.setting.scenario
+        ticks = base.ticks - self._tick if seconds is None else round(seconds / base.T_s)
+        if ticks < 1:
+            raise UserError(f"seconds = {seconds}: must be at least one tick of {base.T_s:g} s")
+        self._tick += ticks
+
+    def _step(self, kind: str, /, **fields: Any) -> None:
+        """Add an event at the present tick. Raises UserError: a scenario cannot have such an
+        event."""
+        _ = self.setting  # starts the experiment
+        given = {name: value for name, value in fields.items() if value is not None}
+        try:
+            event = _EVENT.validate_python({"type": kind, "tick": self._tick, **given})
+        except ValidationError as problem:
+            raise UserError(
+                "; ".join(line.removeprefix(f"{kind}.") for line in lines(problem, AnyEvent))
+            ) from None
+        self._steps.append(event)
+        try:
+            self._scenario(self._tick + 1)  # checks laws, lines and breaker
+        except UserError:
+            self._steps.pop()
+            raise
+
+    def _events(self, ticks: int) -> list[Any]:
+        """The events of the first ``ticks`` ticks in order; within a tick the scenario's first."""
+        base = self.setting.scenario
+        every = [*base.sorted_events(), *self._steps]
+        return sorted((e for e in every if e.at(base.T_s) < ticks), key=lambda e: e.at(base.T_s))
+
+    def _scenario(self, ticks: int) -> Scenario:
+        """The first ``ticks`` ticks as a scenario. Raises UserError: a step is impossible, for
+        example its law does not exist."""
+        base = self.setting.scenario
+        content = base.model_dump(exclude_none=True)
+        content["duration"] = ticks * base.T_s
+        content["events"] = [e.model_dump(exclude_none=True) for e in self._events(ticks)]
+        return check_scenario(content, base.title)
 
     # results
 
@@ -240,19 +297,15 @@ class Steps:
         return self._setting
 
     @property
-    def _planned(self) -> StepPlan:
-        _ = self.setting  # starts the experiment
-        return self._plan
-
-    @property
     def time(self) -> float:
         """Simulated time of the next step, s."""
-        return self._planned.tick * self.setting.scenario.T_s
+        T_s = self.setting.scenario.T_s
+        return self._tick * T_s
 
     @property
     def pending(self) -> bool:
         """Whether planned ticks were never run."""
-        return self._setting is not None and self._plan.tick > self._ran
+        return self._setting is not None and self._tick > self._ran
 
     @property
     def signals(self) -> Signals:
@@ -276,20 +329,20 @@ class Steps:
         Raises:
             UserError: there is nothing to run, or the run cannot be repeated.
         """
-        plan, before = self._planned, self._run
-        if before is not None and self._ran == plan.tick:
+        setting, before = self.setting, self._run
+        if before is not None and self._ran == self._tick:
             return before
-        if plan.tick == 0:
+        if self._tick == 0:
             raise UserError("nothing has been run: call run(seconds) before asking for results")
-        if before is not None and self.setting.realtime:
+        if before is not None and setting.realtime:
             raise UserError(
                 "in real time a run cannot be repeated: make all steps before asking for results, "
                 "or begin anew with start()"
             )
         run = run_scenario(
-            plan.scenario(plan.tick),
+            self._scenario(self._tick),
             self._new_folder(),
-            controller_command=self.setting.controller_command,
+            controller_command=setting.controller_command,
         )
         if run.summary["reason"] == "stopped by the operator":
             raise KeyboardInterrupt
@@ -298,7 +351,7 @@ class Steps:
                 "the same steps gave another run: a controller that does not repeat itself must be "
                 f"asked for results only at the end ({before.folder}, {run.folder})"
             )
-        self._run, self._ran = run, plan.tick
+        self._run, self._ran = run, self._tick
         return run
 
 

@@ -1,9 +1,115 @@
 """Contenders of ``gfmhil bench latency``: links of the bench, their limits in C, other packages.
 
-A contender is one file of this folder and its name in ``registry.FILES``.
+A contender is one file of this folder and its name in ``FILES``. It is plain data that goes to the
+two processes, each of which opens its end.
 """
 
-from gfm_hil.bench.contenders.base import FRAME, Contender, free_port, memory_folder, messages
-from gfm_hil.bench.contenders.registry import contenders_of
+from __future__ import annotations
 
-__all__ = ["FRAME", "Contender", "contenders_of", "free_port", "memory_folder", "messages"]
+import socket
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.c_code import NoCompiler, compile_c
+from gfm_hil.bench.pingpong import Messages, PingPong, frames, over_link, plain
+from gfm_hil.core.roles import Role
+from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.frame import wire_dtype
+from gfm_runtime.signals import NY
+
+FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
+#: files of this folder, in the order of the tables. Each has a function ``contenders(links,
+#: place)`` that yields what it adds to these links; place is a folder in memory with a short path.
+FILES = ("udp", "shm", "iceoryx2", "zmq")
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One way to send a message there and back."""
+
+    name: str  # in tables, unique
+    link: str  # name of the link, or of the transport of C or of another package
+    endpoint: str  # where both sides meet
+    # opens one end that sends these messages; a function of a module. The controller opens its
+    # end first
+    end: Callable[[Contender, Role, Messages], PingPong]
+    peer: str = "ours"  # ``ours``, ``C`` or the name of another package
+    options: dict[str, Any] = field(default_factory=dict)  # of the link
+    # name of the contender in C that it is compared with; its own name for one in C
+    limit: str = ""
+    source: Path | None = None  # C source of a limit
+    library: Path | None = None  # ``source``, compiled
+
+    def open(self, role: Role, payload: int) -> PingPong:
+        """Open one end, for requests of ``payload`` bytes. Raises UserError: it cannot be opened
+        here."""
+        return self.end(self, role, messages(role, payload))
+
+
+def contenders_of(links: Sequence[str], place: Path) -> tuple[list[Contender], list[str]]:
+    """The contenders, each after its limit, and remarks: without a C compiler there are no limits.
+
+    Args:
+        links: names of links.
+        place: an empty folder in memory with a short path.
+    """
+    files = [import_module(f"{__name__}.{name}") for name in FILES]
+    every: list[Contender] = [one for file in files for one in file.contenders(links, place)]
+    try:
+        libraries = {
+            source: compile_c(source, place, f"{source.stem}_pingpong")
+            for source in dict.fromkeys(c.source for c in every if c.source is not None)
+        }
+    except NoCompiler as problem:
+        without = [replace(c, limit="") for c in every if c.source is None]
+        return without, [f"{problem}: no limits in C, no ratios"]
+    return [replace(c, library=libraries[c.source]) if c.source else c for c in every], []
+
+
+def messages(role: Role, payload: int) -> Messages:
+    """The messages of a side: the bench's frames if the payload has their size."""
+    if payload == FRAME:
+        return frames("y" if role == "plant" else "u")
+    return plain(payload)
+
+
+def of_link(name: str, link: str, endpoint: str, limit: str, **options: Any) -> Contender:
+    """A link of the bench with these options."""
+    return Contender(name, link, endpoint, _open_link, options=options, limit=limit)
+
+
+def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(open_link(c.link, role, c.endpoint, c.options), own)
+
+
+def limit(
+    name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong]
+) -> Contender:
+    """A limit in C, of the source beside a Python file; ``end`` opens one by ``pingpong.in_c``."""
+    source = Path(file).with_suffix(".c")
+    return Contender(name, source.stem, endpoint, end, "C", limit=name, source=source)
+
+
+def fresh(link: str, place: Path) -> str:
+    """A new endpoint of a link."""
+    folder = place / link
+    folder.mkdir()
+    return link_kind(link).fresh(folder)
+
+
+def free_port() -> int:
+    """A port of the loopback interface that is free for TCP, and most likely for UDP."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def memory_folder(stack: ExitStack) -> Path:
+    """A folder with a short path that goes with the stack; in memory if /dev/shm exists."""
+    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-", dir=place)))

@@ -9,8 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import shm
-from gfm_hil.bench.contenders.base import Contender
+from gfm_hil.bench.contenders import Contender, shm
 from gfm_hil.bench.pingpong import LONGEST, Messages, PingPong, over_link
 from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
@@ -19,8 +18,7 @@ _ROOM = 64  # messages, as in the links
 
 
 def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    """Its Python binding, which does not install flatbuffers by itself."""
-    if "shm" in links and find_spec("iceoryx2") and find_spec("flatbuffers"):
+    if "shm" in links and find_spec("iceoryx2") and find_spec("flatbuffers"):  # which it needs
         name = f"gfmhil-{secrets.token_hex(8)}"
         yield Contender("iceoryx2", "iceoryx2", name, _open, "iceoryx2", limit=shm.LIMIT)
 
@@ -30,12 +28,7 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
 
 
 class Iceoryx2:
-    """One end over its publish-subscribe, driven from Python.
-
-    Args:
-        role: of the bench.
-        name: of the two services, unique on this machine.
-    """
+    """One end over two services of its publish-subscribe, driven from Python, as a link is."""
 
     port: Port | None = None
 
@@ -60,21 +53,17 @@ class Iceoryx2:
         self._keep: list[Any] = [node, out, into]
 
     def send(self, message: bytes) -> bool:
-        """Publish a message."""
         sample = self._publisher.loan_slice_uninit(len(message))
         ctypes.memmove(sample.payload().as_ptr(), message, len(message))
         return bool(sample.assume_init().send())
 
     def receive(self) -> bytes | None:
-        """The next message, or None."""
-        sample = self._subscriber.receive()
-        if sample is None:
+        if (sample := self._subscriber.receive()) is None:
             return None
         payload = sample.payload()
         return ctypes.string_at(payload.as_ptr(), payload.len())
 
     def close(self) -> None:
-        """Free the shared memory."""
         self._publisher.delete()
         self._subscriber.delete()
         self._keep.clear()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.bench.contenders.base import Contender, fresh, limit, of_link
+from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 
@@ -17,7 +17,6 @@ LIMIT = "C shm"
 
 
 def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    """The link and its limit."""
     if "shm" in links:
         yield limit(LIMIT, __file__, str(place / "slots"), _open)
         yield of_link("shm", "shm", fresh("shm", place), LIMIT)

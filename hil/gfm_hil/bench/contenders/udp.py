@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gfm_hil.bench.contenders.base import Contender, free_port, fresh, limit, of_link
-from gfm_hil.bench.contenders.registry import FILES
+from gfm_hil.bench.contenders import FILES, Contender, free_port, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 
@@ -16,7 +15,6 @@ LIMIT = "C udp"
 
 
 def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    """The links and their limit."""
     others = [link for link in links if link not in FILES or link == "udp"]
     if others:
         yield limit(LIMIT, __file__, f"{free_port()},{free_port()}", _open)

@@ -6,16 +6,14 @@ import ctypes
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
-from gfm_hil.bench.contenders.base import Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.contenders import Contender, free_port, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 
 
 def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    """The link's transports, each after its limit."""
     if "zmq" not in links:
         return
     ipc, tcp = fresh("zmq", place), "tcp://127.0.0.1"
@@ -27,11 +25,8 @@ def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    """A socket with the link's options, of the library that pyzmq has loaded.
-
-    Raises:
-        UserError: its functions cannot be found.
-    """
+    """A socket with the link's options, of the library that pyzmq has loaded. Raises UserError: its
+    functions cannot be found."""
     import zmq
     from zmq.backend.cython import _zmq
 
@@ -39,7 +34,7 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
 
     libzmq = ctypes.CDLL(_zmq.__file__)  # resolves the library that it is linked to
     try:
-        call = [_address(libzmq[name]) for name in ("zmq_send", "zmq_recv")]
+        functions = libzmq.zmq_send, libzmq.zmq_recv
     except AttributeError:
         raise UserError("pyzmq hides its libzmq: nothing for C to call") from None
     keep = ExitStack()
@@ -49,8 +44,5 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
         end.bind(c.endpoint)
     else:
         end.connect(c.endpoint)
+    call = [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in functions]
     return in_c(c.library, [end.underlying, *call], own.shape[1], keep)
-
-
-def _address(function: Any) -> int:
-    return ctypes.cast(function, ctypes.c_void_p).value or 0

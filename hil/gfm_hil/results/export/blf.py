@@ -63,11 +63,8 @@ def can_options(run: Run) -> CanOptions:
 
 
 def can_frames(run: Run, options: CanOptions) -> Iterator[Timed]:
-    """The frames of both sides in the order of their times.
-
-    Raises:
-        UserError: a side did not record, or the DBC is not to be had.
-    """
+    """The frames of both sides in the order of their times. Raises UserError: a side did not
+    record, or the DBC is not to be had."""
     if not {"y_p", "state"} <= set(run.recorded):
         raise UserError(f"{run.folder}: holds the recording of one side; frames need both")
     try:

@@ -17,21 +17,14 @@ from gfm_hil.recording.waveforms import three_phase
 
 @dataclass(frozen=True)
 class Format:
-    """A format.
+    """A format."""
 
-    Attributes:
-        text: what it is.
-        writer: function that writes a run to a file, as module:name in this package.
-        needs: package that this takes.
-        beside: ending of a second file that the first is read by, and the function of its text.
-        columns: it holds the columns of the recording.
-    """
-
-    text: str
-    writer: str
-    needs: str = ""
+    text: str  # what it is
+    writer: str  # function that writes a run to a file, as module:name in this package
+    needs: str = ""  # package that this takes
+    # ending of a second file that the first is read by, and the function of its text
     beside: tuple[str, str] | None = None
-    columns: bool = True
+    columns: bool = True  # it holds the columns of the recording
 
 
 FORMATS = {
@@ -47,11 +40,8 @@ FORMATS = {
 
 
 def check_format(name: str) -> None:
-    """See that a format is there and can be written here.
-
-    Raises:
-        UserError: it is none, or its package is not installed.
-    """
+    """See that a format is there and can be written here. Raises UserError: it is none, or its
+    package is not installed."""
     if name not in FORMATS:
         raise UserError(f"--format {name}: must be one of {', '.join(FORMATS)}")
     needs = FORMATS[name].needs

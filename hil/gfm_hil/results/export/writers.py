@@ -94,11 +94,7 @@ def write_parquet(run: Run, file: Path) -> None:
     # columns of smoothly changing numbers: bytes of one place beside each other compress well
     schema = pa.schema(fields, metadata=about)
     with parquet.ParquetWriter(
-        file,
-        schema,
-        compression="zstd",
-        use_dictionary=False,
-        column_encoding="BYTE_STREAM_SPLIT",
+        file, schema, compression="zstd", use_dictionary=False, column_encoding="BYTE_STREAM_SPLIT"
     ) as writer:
         for _, block in run.blocks(_ROWS):
             writer.write_table(pa.table(list(block.values()), schema=schema))

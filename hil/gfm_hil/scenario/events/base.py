@@ -16,6 +16,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.core.schema import StrictSchema
 
 if TYPE_CHECKING:
+    from gfm_hil.scenario.events.grid_profile import ProfilePoint
     from gfm_hil.scenario.schema import Scenario
     from gfm_plant import Network
     from gfm_runtime.assembly import Controller
@@ -91,18 +92,12 @@ class Event(StrictSchema):
         return []
 
     def check_now(self, target: EventTarget) -> None:
-        """Check, off the loop, that an operator's event can be carried out now.
-
-        Raises:
-            ValueError: why not.
-        """
+        """Check, off the loop, that an operator's event can be carried out now. Raises ValueError:
+        why not."""
 
     def carry_out(self, target: EventTarget) -> None:
-        """Carry it out between two ticks.
-
-        Raises:
-            ValueError: it is not possible; nothing has changed.
-        """
+        """Carry it out between two ticks. Raises ValueError: it is not possible; nothing has
+        changed."""
         raise NotImplementedError
 
 
@@ -112,22 +107,16 @@ class PlantEvent(Event):
     side: ClassVar[Role] = "plant"
 
     def apply(self, plant: Network) -> None:
-        """Change the plant's records, between two ticks.
-
-        Raises:
-            ValueError: it is not possible; nothing has changed.
-        """
+        """Change the plant's records, between two ticks. Raises ValueError: it is not possible;
+        nothing has changed."""
         raise NotImplementedError
 
     def try_on(self, plant: Network) -> None:
-        """Try the event of a scenario on its plant before the run.
-
-        Raises:
-            UserError, ValueError: it is not possible.
-        """
+        """Try the event of a scenario on its plant before the run. Raises UserError, ValueError: it
+        is not possible."""
         self.apply(plant)
 
-    def course(self, plant: Network) -> Iterator[tuple[int, CoursePoint]]:
+    def course(self, plant: Network) -> Iterator[tuple[int, ProfilePoint]]:
         """What follows, each with its tick after the event."""
         return iter(())
 
@@ -137,10 +126,3 @@ class PlantEvent(Event):
     def carry_out(self, target: EventTarget) -> None:
         if target.place == 0:  # a network's plant is one, and changes once
             self.apply(target.plant)
-
-
-class CoursePoint(Protocol):
-    """A point of the course that an event lets the grid follow; the log does not name it."""
-
-    def apply(self, plant: Network) -> None:
-        """Change the plant's records, between two ticks."""

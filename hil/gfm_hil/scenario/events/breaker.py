@@ -1,14 +1,17 @@
-"""The breaker of a line or load of a network, and the synchro-check that lets a breaker close."""
+"""The breakers of the grid and of a network, and the synchro-check that lets one close."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
+
+if TYPE_CHECKING:
+    from gfm_hil.scenario.schema import Scenario
 
 
 class SynchroCheck(StrictSchema):
@@ -89,4 +92,18 @@ class LineBreaker(Switch):
         gfm_plant.line_breaker(plant, self.name, self.closed)
 
 
-EVENT = LineBreaker
+class GridBreaker(Switch):
+    """The grid breaker opens onto the local load, or closes again."""
+
+    type: Literal["grid-breaker"] = Field(description="kind of event")
+    closed: bool = Field(description="false opens it onto the local load")
+
+    def label(self) -> str:
+        return "grid breaker " + ("closes" if self.closed else "opens") + self.when()
+
+    def misfits(self, scenario: Scenario) -> list[str]:
+        alone = scenario.plant.grid.load_R is None and not scenario.network
+        return ["the breaker needs plant.grid.load_R and load_L"] if alone else []
+
+    def switch(self, plant: gfm_plant.Network) -> None:
+        gfm_plant.breaker(plant, self.closed)

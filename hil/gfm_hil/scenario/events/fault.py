@@ -1,4 +1,4 @@
-"""A fault."""
+"""A fault, and its end."""
 
 from __future__ import annotations
 
@@ -94,4 +94,13 @@ class Fault(PlantEvent):
         )  # fmt: skip
 
 
-EVENT = Fault
+class FaultClear(PlantEvent):
+    """The fault is cleared."""
+
+    type: Literal["fault-clear"] = Field(description="kind of event")
+
+    def label(self) -> str:
+        return "fault cleared"
+
+    def apply(self, plant: gfm_plant.Network) -> None:
+        gfm_plant.clear_fault(plant)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
@@ -17,12 +17,9 @@ from gfm_hil.scenario.events.reset import Reset
 from gfm_runtime.errors import LawError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from gfm_hil.controllers.external import Retuned
     from gfm_hil.scenario.schema import Scenario
     from gfm_runtime.assembly import Controller
-
-    Retuned = tuple[gfm_runtime.DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
 
 class GainChange(Event):
@@ -49,9 +46,6 @@ class GainChange(Event):
         c.retune(*ready_gains(c, self.values), {**c.gains, **self.values})
 
 
-EVENT = GainChange
-
-
 @lru_cache(maxsize=64)
 def retuned(
     name: str, gains: tuple[tuple[str, float], ...], T_s: float, omega_b: float, inner: str | None
@@ -60,10 +54,8 @@ def retuned(
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
     results are cached: the command server's check prepares what the loop then uses. ``omega_b`` is
-    that of the converter, rad/s, for an inner stage.
-
-    Raises:
-        ValueError: a scheduled law, a name that its file does not have, or no such law.
+    that of the converter, rad/s, for an inner stage. Raises ValueError: a scheduled law, a name
+    that its file does not have, or no such law.
     """
     try:
         file = gfm_runtime.law_file(name)
@@ -78,11 +70,8 @@ def retuned(
 
 
 def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
-    """The law selected last with new gains, on top of earlier changes.
-
-    Raises:
-        ValueError: as ``retuned``.
-    """
+    """The law selected last with new gains, on top of earlier changes. Raises ValueError: as
+    ``retuned``."""
     gains = {**controller.gains, **values}
     name = controller.asked
     inner = controller.sets[name].inner
@@ -91,11 +80,7 @@ def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
 
 def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
     """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
-    ``retuned``.
-
-    Raises:
-        UserError: a change that is not possible.
-    """
+    ``retuned``. Raises UserError: a change that is not possible."""
     found: list[Retuned] = []
     name, gains = scenario.law, dict[str, float]()
     for event in scenario.sorted_events():

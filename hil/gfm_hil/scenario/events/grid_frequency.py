@@ -23,6 +23,3 @@ class GridFrequency(PlantEvent):
     def apply(self, plant: gfm_plant.Network) -> None:
         f_n = nominal_hz(plant)
         gfm_plant.grid_frequency(plant, self.f_hz / f_n, self.rate / f_n if self.rate else None)
-
-
-EVENT = GridFrequency

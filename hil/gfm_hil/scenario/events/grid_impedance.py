@@ -42,11 +42,8 @@ class GridImpedance(PlantEvent):
         return self
 
     def factors(self, plant: gfm_plant.Network) -> tuple[float, float]:
-        """Of the line's nominal L and R.
-
-        Raises:
-            ValueError: the converter's line has no resistance that a factor could change.
-        """
+        """Of the line's nominal L and R. Raises ValueError: the converter's line has no resistance
+        that a factor could change."""
         if self.L_g is not None and self.R_g is not None:
             return self.L_g, self.R_g
         from gfm_plant.options import Grid
@@ -71,6 +68,3 @@ class GridImpedance(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_impedance(plant, *self.factors(plant))
-
-
-EVENT = GridImpedance

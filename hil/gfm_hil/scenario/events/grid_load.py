@@ -21,6 +21,3 @@ class GridLoad(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_load(plant, self.change)
-
-
-EVENT = GridLoad

@@ -61,9 +61,6 @@ class GridProfile(PlantEvent):
         raise ValueError("grid-profile: must be in the scenario, which reads it at the start")
 
 
-EVENT = GridProfile
-
-
 class ProfilePoint(NamedTuple):
     """What the plant does from a tick of a course on: go to these values, in a line.
 
@@ -77,11 +74,8 @@ class ProfilePoint(NamedTuple):
     ticks: int
 
     def apply(self, plant: gfm_plant.Network) -> None:
-        """Carry it out on the plant's records, between two ticks.
-
-        Raises:
-            ValueError: the grid is finite and has its own frequency.
-        """
+        """Carry it out on the plant's records, between two ticks. Raises ValueError: the grid is
+        finite and has its own frequency."""
         if self.omega_g is not None:
             gfm_plant.grid_frequency(
                 plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g")

@@ -51,6 +51,3 @@ class GridUnbalance(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_unbalance(plant, self.factors(), self.duration)
-
-
-EVENT = GridUnbalance

@@ -29,6 +29,3 @@ class GridVoltage(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_voltage(plant, self.V_g, self.rate, self.duration)
-
-
-EVENT = GridVoltage

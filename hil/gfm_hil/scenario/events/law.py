@@ -1,7 +1,5 @@
 """Change to another law."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -36,6 +34,3 @@ class LawChange(Event):
 
     def carry_out(self, target: EventTarget) -> None:
         target.controller.select(self.law)
-
-
-EVENT = LawChange

@@ -21,6 +21,3 @@ class PhaseJump(PlantEvent):
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.phase_jump(plant, self.degrees)
-
-
-EVENT = PhaseJump

@@ -57,6 +57,3 @@ class Reference(Event):
     def carry_out(self, target: EventTarget) -> None:
         for name, value in self.values().items():
             target.controller.set(name, value, self.ramp_s)
-
-
-EVENT = Reference

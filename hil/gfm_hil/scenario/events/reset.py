@@ -34,6 +34,3 @@ class Reset(Event):
 
     def carry_out(self, target: EventTarget) -> None:
         target.reset_controller()
-
-
-EVENT = Reset

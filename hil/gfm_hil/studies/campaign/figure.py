@@ -12,8 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from gfm_hil.results.figures import dress
-from gfm_hil.studies.campaign.axes import Axis
-from gfm_hil.studies.campaign.result import VERDICTS, verdict
+from gfm_hil.studies.campaign.result import VERDICTS, Axis, verdict
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Record
 

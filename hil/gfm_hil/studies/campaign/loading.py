@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.scenario import check_scenario, find_file, load_scenario, toml_text
-from gfm_hil.studies.campaign.draw import Distribution
-from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
+from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, Distribution, put
 from gfm_plant import make_plant
 from gfm_runtime import law_titles
 from gfm_runtime.errors import printable
@@ -31,11 +30,8 @@ Tell = Callable[[int, int], None]
 
 
 def find_campaign(name: str) -> Path:
-    """The file of a campaign: a path, or the name of a shipped one.
-
-    Raises:
-        UserError: neither exists.
-    """
+    """The file of a campaign: a path, or the name of a shipped one. Raises UserError: neither
+    exists."""
     return find_file("campaign", name, "campaigns/*.toml")
 
 

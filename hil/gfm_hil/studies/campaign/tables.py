@@ -13,8 +13,7 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import EVENT_COLUMNS
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.scenario.expectation import reason_name
-from gfm_hil.studies.campaign.axes import Axis
-from gfm_hil.studies.campaign.result import VERDICTS, CampaignResult
+from gfm_hil.studies.campaign.result import VERDICTS, Axis, CampaignResult
 from gfm_hil.studies.campaign.worker import Record
 
 _STYLES = {"stable": "good", "oscillating": "warn"}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compiled_bench
+from gfm_hil.engine.compiling import compiled_benches
 from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
 from gfm_hil.run.runner import run_in_memory
@@ -29,17 +29,13 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     scenario, _ = campaign.scenario(0, campaign.file.laws[0])
     try:
-        compiled_bench(scenario, notice)
+        compiled_benches(scenario, notice)
     except UserError:  # no steady state: the workers will compile
         return
 
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
-    """The records of some runs.
-
-    Raises:
-        RunFailed: an error that is not the run's own.
-    """
+    """The records of some runs. Raises RunFailed: an error that is not the run's own."""
     room: dict[bool, tuple[Kept, Kept]] = {}
     records = []
     for run, law in jobs:

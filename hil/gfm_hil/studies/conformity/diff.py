@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
@@ -36,22 +36,14 @@ class _Read(BaseModel):
 
 
 class ClauseResult(_Read):
-    """What results.json says of a clause; a part without clauses is one without words.
+    """What results.json says of a clause; a part without clauses is one without words."""
 
-    Attributes:
-        clause, kind: its words and its criterion.
-        verdict: pass, fail, cannot judge or informative.
-        value: measured, in ``unit``, or None.
-        unit: of the value.
-        text: one sentence.
-    """
-
-    clause: str
+    clause: str  # clause, kind: its words and its criterion
     kind: str
-    verdict: Outcome
-    value: float | None
-    unit: str
-    text: str
+    verdict: Outcome  # pass, fail, cannot judge or informative
+    value: float | None  # measured, in ``unit``, or None
+    unit: str  # of the value
+    text: str  # one sentence
 
 
 class _Part(_Read):
@@ -67,39 +59,26 @@ class _Test(_Read):
 
 
 class Results(_Read):
-    """What results.json holds, as far as it is compared.
+    """What results.json holds, as far as it is compared."""
 
-    Attributes:
-        version: of gfmhil.
-        inner: stage of every law, or None.
-        under_test: the converter under test.
-        laws: tests by law and id.
-    """
-
-    version: str
-    inner: str | None
-    under_test: dict[str, Any]
-    laws: dict[str, dict[str, _Test]]
+    version: str  # of gfmhil
+    inner: str | None  # stage of every law, or None
+    under_test: dict[str, Any]  # the converter under test
+    laws: dict[str, dict[str, _Test]]  # tests by law and id
 
 
 @dataclass(frozen=True)
 class ChangedClause:
-    """A clause that is not what it was.
+    """A clause that is not what it was."""
 
-    Attributes:
-        change: worse or better: of its verdict; moved: its value; new, gone: in one report only.
-        law, test, part: where it is.
-        old, new: what the reports say; None where it is missing.
-        counts: whether the new report is worse for it.
-    """
-
+    # worse or better: of its verdict; moved: its value; new, gone: in one report only
     change: Change
-    law: str
+    law: str  # law, test, part: where it is
     test: str
     part: str
-    old: ClauseResult | None
+    old: ClauseResult | None  # old, new: what the reports say; None where it is missing
     new: ClauseResult | None
-    counts: bool
+    counts: bool  # whether the new report is worse for it
 
     @property
     def clause(self) -> ClauseResult:
@@ -111,37 +90,24 @@ class ChangedClause:
     @property
     def value(self) -> str:
         """The measured values, ``old → new``."""
-        both = [_value(x) for x in (self.old, self.new)]
-        return " → ".join(both) if both[0] != both[1] else both[0]
+        each = [x and x.value is not None and f"{shown(x.value)} {x.unit}".rstrip()
+                for x in (self.old, self.new)]  # fmt: skip
+        return " → ".join(dict.fromkeys(x or "–" for x in each))
 
     @property
     def verdict(self) -> str:
         """The verdicts, ``old → new``."""
-        both = [x.verdict if x else "–" for x in (self.old, self.new)]
-        return " → ".join(both) if both[0] != both[1] else both[0]
-
-    def plain(self) -> dict[str, Any]:
-        """As data for JSON."""
-        of = {"change": self.change, "counts": self.counts, "law": self.law, "test": self.test}
-        both = {n: x.model_dump() if x else None for n, x in (("old", self.old), ("new", self.new))}
-        return {**of, "part": self.part, **both}
+        return " → ".join(dict.fromkeys(x.verdict if x else "–" for x in (self.old, self.new)))
 
 
 @dataclass(frozen=True)
 class ReportDiff:
-    """Two reports beside each other.
+    """Two reports beside each other."""
 
-    Attributes:
-        rows: what changed, the worst first.
-        notes: what differs in how the reports were made, one sentence each.
-        same: how many clauses are what they were.
-        share: by which part of the larger a value had to move.
-    """
-
-    rows: list[ChangedClause]
-    notes: list[str]
-    same: int
-    share: float
+    rows: list[ChangedClause]  # what changed, the worst first
+    notes: list[str]  # what differs in how the reports were made, one sentence each
+    same: int  # how many clauses are what they were
+    share: float  # by which part of the larger a value had to move
 
     @property
     def worse(self) -> bool:
@@ -157,13 +123,7 @@ class ReportDiff:
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
-        return {
-            "worse": self.worse,
-            "share": self.share,
-            "same": self.same,
-            "notes": self.notes,
-            "rows": [row.plain() for row in self.rows],
-        }
+        return {"worse": self.worse, **TypeAdapter(ReportDiff).dump_python(self)}
 
     def page(self, old: str, new: str) -> str:
         """As an HTML page; the arguments are the reports' names."""
@@ -173,11 +133,8 @@ class ReportDiff:
 
 
 def read_results(path: str | Path) -> Results:
-    """A report's results.json, or that in a report's folder.
-
-    Raises:
-        UserError: it cannot be read, or is none.
-    """
+    """A report's results.json, or that in a report's folder. Raises UserError: it cannot be read,
+    or is none."""
     file = Path(path)
     file = file / "results.json" if file.is_dir() else file
     try:
@@ -275,7 +232,3 @@ def _notes(old: Results, new: Results) -> Iterator[str]:
         yield "The converter under test is another one."
     if len(old.laws) == len(new.laws) == 1 and [*old.laws] != [*new.laws]:
         yield f"The law was {next(iter(old.laws))} and is {next(iter(new.laws))}."
-
-
-def _value(of: ClauseResult | None) -> str:
-    return "–" if of is None or of.value is None else f"{shown(of.value)} {of.unit}".rstrip()

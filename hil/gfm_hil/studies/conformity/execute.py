@@ -5,15 +5,15 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compile_external, compiled_bench, compiled_benches
+from gfm_hil.engine.compiling import compile_external, compiled_benches
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import (
     Notice,
@@ -24,19 +24,11 @@ from gfm_hil.run.runner import (
 )
 from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
+from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.judge import cannot, judge
-from gfm_hil.studies.conformity.model import TestPart
-from gfm_hil.studies.conformity.sets import Case, scenario_of
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
-from gfm_hil.studies.workers import (
-    RunFailed,
-    Watch,
-    WorkerLost,
-    pool_of,
-    run_tasks,
-)
+from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 
@@ -46,24 +38,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ControllerUnderTest:
-    """A model as the controller, in place of a law.
+    """A model as the controller, in place of a law."""
 
-    Attributes:
-        model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, or ``pil:TARGET`` for the law itself as
-            firmware on a processor.
-        ports: file of the map of its ports.
-    """
-
+    # ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, or ``pil:TARGET`` for the law itself as firmware
+    # on a processor
     model: str
-    ports: Path | None = None
+    ports: Path | None = None  # file of the map of its ports
+
+    @property
+    def command(self) -> list[str]:
+        """The program that steps it."""
+        return external_command(self.model, self.ports)
 
     @property
     def name(self) -> str:
-        """What reports call it: its kind and the name of its file, or of its target.
-
-        Raises:
-            UserError: there is no such file.
-        """
+        """What reports call it: its kind and the name of its file, or of its target. Raises
+        UserError: there is no such file."""
         if self.model.startswith(PIL):
             return self.model
         kind, path = controller_file(self.model)
@@ -72,29 +62,20 @@ class ControllerUnderTest:
 
 @dataclass(frozen=True)
 class Job:
-    """A part of a test under a law.
+    """A part of a test under a law."""
 
-    Attributes:
-        law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
-            whose operating point a run begins.
-        case, part: what to run.
-        inner: stage of every law; the law's own if None.
-        under: the converter under test.
-        converters: folder for converter files, which lasts while jobs run.
-        folder: where the scenario and the figure go; None writes neither.
-        figures: whether to draw one.
-        external: the model that computes u in place of the law, or None.
-    """
-
+    # law, file: its name, and what a scenario calls it. Of a model: its name, and the law at
+    # whose operating point a run begins
     law: str
     file: str
-    case: Case
+    case: Case  # case, part: what to run
     part: TestPart
-    inner: str | None
-    under: UnderTest
-    converters: Path
-    folder: Path | None
-    figures: bool
+    inner: str | None  # stage of every law; the law's own if None
+    under: UnderTest  # the converter under test
+    converters: Path  # folder for converter files, which lasts while jobs run
+    folder: Path | None  # where the scenario and the figure go; None writes neither
+    figures: bool  # whether to draw one
+    # the model that computes u in place of the law, or None
     external: ControllerUnderTest | None = None
 
     @property
@@ -105,24 +86,27 @@ class Job:
 
 @dataclass(frozen=True)
 class PartResult:
-    """What became of a part of a test under a law.
+    """What became of a part of a test under a law."""
 
-    Attributes:
-        law, test, part: names; the part of a test without parts is empty.
-        status, reason: how the run ended; ``none`` if it did not take place.
-        verdicts: one a clause and time.
-        again: the command that repeats the run; empty if no scenario was written.
-        figure: if one was drawn.
-    """
-
-    law: str
+    law: str  # law, test, part: names; the part of a test without parts is empty
     test: str
     part: str
-    status: str
+    status: str  # status, reason: how the run ended; ``none`` if it did not take place
     reason: str
-    verdicts: list[Verdict]
-    again: str = ""
-    figure: Picture | None = None
+    verdicts: list[Verdict]  # one a clause and time
+    again: str = ""  # the command that repeats the run; empty if no scenario was written
+    figure: Picture | None = None  # if one was drawn
+
+    def plain(self) -> dict[str, Any]:
+        """As data for JSON."""
+        return {
+            "part": self.part,
+            "verdict": self.verdict,
+            "status": self.status,
+            "reason": self.reason,
+            "cause": self.cause and {"clause": self.cause.clause, "text": self.cause.text},
+            "clauses": [v.plain() for v in self.verdicts],
+        }
 
     @property
     def verdict(self) -> Outcome:
@@ -149,11 +133,8 @@ class PartResult:
 
 
 def external_controller(model: str | None, ports: str | Path | None) -> ControllerUnderTest | None:
-    """The model that a user names, checked as far as that goes without loading it.
-
-    Raises:
-        UserError: there is no such file, the map is none, or there is a map but no model.
-    """
+    """The model that a user names, checked as far as that goes without loading it. Raises
+    UserError: there is no such file, the map is none, or there is a map but no model."""
     if model is None:
         if ports is not None:
             raise UserError(f"map {ports}: is of a controller; name it too")
@@ -243,31 +224,25 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
 
 def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
-    seen: set[tuple[bool, int, bool]] = set()
+    seen = set[tuple[bool, int, bool]]()
     for job in jobs:
-        if job.part.cannot is not None:
-            continue
-        try:
+        with suppress(UserError):  # which the verdict will say
+            if job.part.cannot is not None:
+                continue
             scenario = _scenario(job)
             kind = scenario.has_inner, len(scenario.converters), job.external is not None
             if kind in seen:
                 continue
             if job.external is not None:
-                compiled_bench(scenario, notice, ("plant",))
+                compiled_benches(scenario, notice, ("plant",))
                 compile_external(scenario, notice)
             else:
-                (compiled_bench if scenario.network is None else compiled_benches)(scenario, notice)
+                compiled_benches(scenario, notice)
             seen.add(kind)
-        except UserError:  # which the verdict will say
-            continue
 
 
 def _scenario(job: Job) -> Scenario:
-    """The scenario of a job.
-
-    Raises:
-        UserError: it cannot be run.
-    """
+    """The scenario of a job. Raises UserError: it cannot be run."""
     found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
     if job.external is None:
         return found
@@ -277,11 +252,8 @@ def _scenario(job: Job) -> Scenario:
 
 
 def run_part(job: Job) -> PartResult:
-    """Run, judge and draw a part; what cannot be run cannot be judged.
-
-    Raises:
-        RunFailed: an error of the program; the message names law and test.
-    """
+    """Run, judge and draw a part; what cannot be run cannot be judged. Raises RunFailed: an error
+    of the program; the message names law and test."""
     try:
         return _run_part(job)
     except Exception as problem:
@@ -295,84 +267,63 @@ def _run_part(job: Job) -> PartResult:
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
         return PartResult(*names, "none", reason, cannot(criteria, reason))
+    external, plot = job.external, criteria[0] if isinstance(criteria[0], Nfp) else None
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
-            if isinstance(criteria[0], Nfp):
-                return _scan(job, criteria[0], scenario)
-            run, others = _run(job, scenario, stack)
+            if plot is not None:
+                found = plot.scan(scenario, external.command if external else ())
+            else:
+                run, others = _run(job, scenario, stack)
         except UserError as problem:
             text = str(problem).replace("\n", "; ").replace(job.file, job.law)
             reason = f"Cannot be judged: there is no such run: {text}"
             return PartResult(*names, "none", reason, cannot(criteria, reason))
-        under = job.under
-        if job.external is None:  # a controller that is not ours runs over a link alone
-            for criterion in criteria:
-                under = criterion.declared(under, scenario)
-        verdicts = judge(run, criteria, under, others)
-        again, figure = "", None
+        if plot is not None:
+            status, reason, verdicts = "completed", "", plot.judge_scan(found)
+        else:
+            under = job.under
+            if external is None:  # a controller that is not ours runs over a link alone
+                for criterion in criteria:
+                    under = criterion.declared(under, scenario)
+            status, reason = run.status, str(run.summary["reason"])
+            verdicts = judge(run, criteria, under, others)
+        again, figure = list[str](), None
         if job.folder is not None:
-            place = _place(job.folder, job, scenario)
-            again = _again(place, job.external)
-            if job.figures and run.ticks:
-                from gfm_hil.studies.conformity.figure import draw_part  # half a second to import
+            place = job.folder / "runs" / slug(job.law) / slug(job.name)
+            place.mkdir(parents=True, exist_ok=True)
+            write_scenario(place, scenario)
+            again = _again(str(place / "scenario.toml"), plot, external)
+            if job.figures and (plot is not None or run.ticks):
+                # half a second to import
+                from gfm_hil.studies.conformity.figure import draw_part, draw_plot
 
-                figure = draw_part(place / "figure.png", _title(job, scenario), run, verdicts)
-        reason = str(run.summary["reason"])
-        return PartResult(*names, run.status, reason, verdicts, again, figure)
-
-
-def _scan(job: Job, asked: Nfp, scenario: Scenario) -> PartResult:
-    """Measure, judge and draw a network-frequency-perturbation plot."""
-    external = job.external
-    found = asked.scan(
-        scenario, external_command(external.model, external.ports) if external else ()
-    )
-    verdicts = asked.judge_scan(found)
-    again, figure = "", None
-    if job.folder is not None:
-        place = _place(job.folder, job, scenario)
-        if external is None:
-            again = shlex.join(asked.again(str(place / "scenario.toml")))
-        if job.figures:
-            from gfm_hil.studies.conformity.figure import draw_plot
-
-            title = _title(job, scenario)
-            figure = draw_plot(place / "figure.png", title, found, asked, verdicts)
-    return PartResult(job.law, job.case.id, job.part.name, "completed", "", verdicts, again, figure)
+                path = place / "figure.png"
+                title = f"{job.law} · {job.name} · {scenario.title}"
+                if plot is not None:
+                    figure = draw_plot(path, title, found, plot, verdicts)
+                else:
+                    figure = draw_part(path, title, run, verdicts)
+        return PartResult(*names, status, reason, verdicts, shlex.join(again), figure)
 
 
-def _title(job: Job, scenario: Scenario) -> str:
-    return f"{job.law} · {job.name} · {scenario.title}"
-
-
-def _place(folder: Path, job: Job, scenario: Scenario) -> Path:
-    """The folder of a part, with its scenario."""
-    place = folder / "runs" / slug(job.law) / slug(job.name)
-    place.mkdir(parents=True, exist_ok=True)
-    write_scenario(place, scenario)
-    return place
-
-
-def _again(place: Path, external: ControllerUnderTest | None) -> str:
-    """The command that repeats the run of the scenario in a folder."""
-    words = ["gfmhil", "run", str(place / "scenario.toml")]
+def _again(scenario: str, plot: Nfp | None, external: ControllerUnderTest | None) -> list[str]:
+    """The command that repeats the run of a scenario file; none for the plot of a model."""
+    if plot is not None:
+        return plot.again(scenario) if external is None else []
+    words = ["gfmhil", "run", scenario]
     if external is not None:
         words += ["--controller", external.model]
         words += ["--map", str(external.ports)] if external.ports else []
-    return shlex.join(words)
+    return words
 
 
 def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[str, Run]]:
-    """The run that is judged, and those of the other converters.
-
-    Args:
-        stack: keeps what a run of a model is read from.
-    """
+    """The run that is judged, and those of the other converters; the stack keeps the folder from
+    which a run of a model is read."""
     if job.external is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        command = external_command(job.external.model, job.external.ports)
-        run = run_scenario(scenario, folder, controller_command=command)
+        run = run_scenario(scenario, folder, controller_command=job.external.command)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         return run, {}

@@ -58,9 +58,7 @@ def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> 
     rows[0].legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
     rows[-1].set_xlim(0, run.scenario.duration)
     rows[-1].set_xlabel("t [s]", fontsize=9)
-    headline(figure, title, 10)
-    _save(figure, path)
-    return Picture(path, panels(figure))
+    return _finish(figure, path, title)
 
 
 def draw_plot(
@@ -69,6 +67,10 @@ def draw_plot(
     """Draw the network-frequency-perturbation plot with the limits of its bands."""
     figure = Figure(figsize=(7.6, 5.6), layout="constrained")
     asked.draw_limits(nfp(found, figure), verdicts, VERDICT_COLOURS)
+    return _finish(figure, path, title)
+
+
+def _finish(figure: Figure, path: Path, title: str) -> Picture:
     headline(figure, title, 10)
     _save(figure, path)
     return Picture(path, panels(figure))
@@ -79,9 +81,9 @@ def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
     for v in verdicts:
         colour = VERDICT_COLOURS[v.verdict]
         if v.curve is not None:
-            t, edges = v.curve[0], v.curve[1:]
-            axes.fill_between(t, edges[0], edges[1], color=colour, alpha=0.12, lw=0)
-            for edge in edges:
+            t, low, high = v.curve
+            axes.fill_between(t, low, high, color=colour, alpha=0.12, lw=0)
+            for edge in (low, high):
                 axes.plot(t, edge, color=colour, lw=1.2, ls=(0, (3, 1.5)))
         elif v.limited is not None:
             for limit in (v.low, v.high):
@@ -98,10 +100,7 @@ def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
 
 
 def draw_matrix(
-    path: Path,
-    laws: Sequence[str],
-    tests: Sequence[str],
-    cells: Mapping[tuple[str, str], str],
+    path: Path, laws: Sequence[str], tests: Sequence[str], cells: Mapping[tuple[str, str], str]
 ) -> None:
     """Draw laws × tests, each cell with the colour and the sign of its verdict."""
     size = 3.0 + 0.3 * len(tests), 3.2 + 0.3 * len(laws)

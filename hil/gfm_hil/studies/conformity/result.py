@@ -18,10 +18,9 @@ from gfm_hil.recording.columns import printed
 from gfm_hil.results.page import render
 from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
+from gfm_hil.studies.conformity.criteria.base import UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
-from gfm_hil.studies.conformity.model import KNOWN
-from gfm_hil.studies.conformity.sets import Case
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.sets import KNOWN, Case
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     FAIL,
@@ -33,6 +32,8 @@ from gfm_hil.studies.conformity.verdict import (
     worst,
 )
 
+#: attributes of a suite of JUnit that count verdicts, and, without the s, elements that tell them
+_COUNTED: dict[Outcome, str] = {FAIL: "failures", CANNOT: "errors", INFORMATIVE: "skipped"}
 #: characters that XML cannot hold, not even escaped
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -89,52 +90,33 @@ class Conformity:
         """One line for each part that does not pass, with law, test, verdict and why."""
         return [
             f"{f.law}, {'/'.join(x for x in (f.test, f.part) if x)}: {f.verdict}: {f.words}"
-            for law in self.laws
-            for case in self.cases
-            for f in self.of(law, case.id)
+            for key in self.matrix
+            for f in self.of(*key)
             if f.verdict not in (PASS, INFORMATIVE)
         ]
 
     def plain(self) -> dict[str, Any]:
         """The content of results.json."""
-        tests = {
-            case.id: {
-                "title": case.test.title,
-                "source": case.test.source.model_dump(),
-                "f_n": case.test.f_n,
-            }
-            for case in self.cases
-        }
-        laws: dict[str, Any] = {}
-        for law in self.laws:
-            laws[law] = {
-                case.id: {
-                    "verdict": self.matrix[law, case.id],
-                    "parts": [
-                        {
-                            "part": f.part,
-                            "verdict": f.verdict,
-                            "status": f.status,
-                            "reason": f.reason,
-                            "cause": f.cause and {"clause": f.cause.clause, "text": f.cause.text},
-                            "clauses": [v.plain() for v in f.verdicts],
-                        }
-                        for f in self.of(law, case.id)
-                    ],
+        about = {"title", "source", "f_n"}
+        content = {
+            "version": version("gfmhil"),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "inner": self.inner,
+            "under_test": self.under.model_dump(mode="json", exclude_unset=True),
+            "passed": self.passed,
+            "tests": {case.id: case.test.model_dump(include=about) for case in self.cases},
+            "laws": {
+                law: {
+                    case.id: {
+                        "verdict": self.matrix[law, case.id],
+                        "parts": [part.plain() for part in self.of(law, case.id)],
+                    }
+                    for case in self.cases
                 }
-                for case in self.cases
-            }
-        return finite(
-            {
-                "version": version("gfmhil"),
-                "date": datetime.now(UTC).isoformat(timespec="seconds"),
-                "inner": self.inner,
-                "under_test": self.under.model_dump(mode="json", exclude_unset=True),
-                "passed": self.passed,
-                "tests": tests,
-                "laws": laws,
-            }
-        )
+                for law in self.laws
+            },
+        }
+        return finite(content)
 
     def write(self, folder: Path) -> None:
         """Write report.html, results.json and junit.xml, and with several laws a report for each
@@ -148,15 +130,14 @@ class Conformity:
             write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
             write_text(folder / "junit.xml", self._junit())
             if len(self.laws) == 1:
-                write_text(folder / "report.html", self._law_page(self.laws[0]))
+                write_text(folder / "report.html", self._page(self.laws[0]))
                 return
             from gfm_hil.studies.conformity.figure import draw_matrix
 
             draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
             for law in self.laws:
-                write_text(folder / f"report-{slug(law)}.html", self._law_page(law))
-            page = self._page("conformity_matrix.html", "Conformity of laws")
-            write_text(folder / "report.html", page)
+                write_text(folder / f"report-{slug(law)}.html", self._page(law))
+            write_text(folder / "report.html", self._page(None))
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
@@ -164,35 +145,36 @@ class Conformity:
         """One suite a law and test, one case a clause; what cannot be judged is an error, what is
         informative is skipped."""
         top = ElementTree.Element("testsuites", name="gfmhil conform")
-        for law in self.laws:
-            for case in self.cases:
-                parts = self.of(law, case.id)
-                verdicts = [(f, v) for f in parts for v in f.verdicts]
-                bare = [f for f in parts if not f.verdicts]
-                outcomes = [v.verdict for _, v in verdicts] + [f.verdict for f in bare]
-                suite = ElementTree.SubElement(
-                    top, "testsuite", name=f"{law}: {case.id}", tests=str(len(outcomes)),
-                    failures=str(outcomes.count("fail")),
-                    errors=str(outcomes.count("cannot judge")),
-                    skipped=str(outcomes.count("informative")),
-                )  # fmt: skip
-                for f, v in verdicts:
-                    _case(suite, law, f, f"{v.clause} [{v.kind} from {v.start:g} s]", v.verdict,
-                          v.text)  # fmt: skip
-                for f in bare:
-                    _case(suite, law, f, f.part, f.verdict, f.reason)
+        for law, test in self.matrix:
+            parts = self.of(law, test)
+            told = [
+                (f, f"{v.clause} [{v.kind} from {v.start:g} s]", v.verdict, v.text)
+                for f in parts
+                for v in f.verdicts
+            ]
+            told += [(f, f.part, f.verdict, f.reason) for f in parts if not f.verdicts]
+            outcomes = [verdict for *_, verdict, _ in told]
+            count = {tag: str(outcomes.count(verdict)) for verdict, tag in _COUNTED.items()}
+            attributes = {"name": f"{law}: {test}", "tests": str(len(told)), **count}
+            suite = ElementTree.SubElement(top, "testsuite", attributes)
+            for f, name, verdict, text in told:
+                place = ".".join(x for x in (law, f.test, f.part) if x)
+                entry = ElementTree.SubElement(suite, "testcase", classname=place, name=name)
+                if verdict in _COUNTED:
+                    kind = {"type": CANNOT} if verdict == CANNOT else {}
+                    tag = _COUNTED[verdict].removesuffix("s")
+                    ElementTree.SubElement(entry, tag, {"message": text, **kind})
         ElementTree.indent(top)
         text = ElementTree.tostring(top, encoding="unicode", xml_declaration=True)
         return _NOT_XML.sub("\ufffd", text) + "\n"
 
-    def _law_page(self, law: str) -> str:
-        return self._page("conformity.html", f"{law}: conformity", law=law)
-
-    def _page(self, template: str, title: str, **more: Any) -> str:
-        """A page about all of it, or of one law."""
+    def _page(self, law: str | None) -> str:
+        """A page about a law, or about all of them."""
+        template = "conformity_matrix.html" if law is None else "conformity.html"
+        title = "Conformity of laws" if law is None else f"{law}: conformity"
         return render(
-            template, title=title, found=self, slug=slug, known=KNOWN, signs=SIGNS, row=_row,
-            version=version("gfmhil"), date=datetime.now(UTC).date(), **more,
+            template, title=title, found=self, law=law, slug=slug, known=KNOWN, signs=SIGNS,
+            row=_row, version=version("gfmhil"), date=datetime.now(UTC).date(),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -206,14 +188,3 @@ def _row(v: Verdict) -> list[str]:
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
     return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text]
-
-
-def _case(suite: Any, law: str, f: PartResult, name: str, verdict: str, text: str) -> None:
-    place = ".".join(x for x in (law, f.test, f.part) if x)
-    entry = ElementTree.SubElement(suite, "testcase", classname=place, name=name)
-    if verdict == FAIL:
-        ElementTree.SubElement(entry, "failure", message=text)
-    elif verdict == CANNOT:
-        ElementTree.SubElement(entry, "error", message=text, type=CANNOT)
-    elif verdict == INFORMATIVE:
-        ElementTree.SubElement(entry, "skipped", message=text)

@@ -21,36 +21,23 @@ SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?", INFORMATIVE: "i"}
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of one clause at one time.
+    """What became of one clause at one time."""
 
-    Attributes:
-        clause: what is asked.
-        kind: of the criterion.
-        signal: that was judged; may be empty.
-        start, stop: of the window, s.
-        verdict: pass, fail, cannot judge or informative.
-        value: measured, in ``unit``; None if there is none.
-        unit: of the value.
-        limit: of the value, with its unit.
-        text: one sentence.
-        low, high: limits of the signal itself between ``limited`` s, for the figure.
-        limited: from when to when they hold, s.
-        curve: t, s, and limits that change with it, shape (K,) each, for the figure.
-    """
-
-    clause: str
-    kind: str
-    signal: str
-    start: float
+    clause: str  # what is asked
+    kind: str  # of the criterion
+    signal: str  # that was judged; may be empty
+    start: float  # start, stop: of the window, s
     stop: float
-    verdict: Outcome
-    value: float | None
-    unit: str
-    limit: str
-    text: str
+    verdict: Outcome  # pass, fail, cannot judge or informative
+    value: float | None  # measured, in ``unit``; None if there is none
+    unit: str  # of the value
+    limit: str  # of the value, with its unit
+    text: str  # one sentence
+    # low, high: limits of the signal itself between ``limited`` s, for the figure
     low: float | None = None
     high: float | None = None
-    limited: tuple[float, float] | None = None
+    limited: tuple[float, float] | None = None  # from when to when they hold, s
+    # t, s, and limits that change with it, shape (K,) each, for the figure
     curve: tuple[Vector, Vector, Vector] | None = None
 
     def plain(self) -> dict[str, Any]:

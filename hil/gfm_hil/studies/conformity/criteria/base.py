@@ -7,7 +7,7 @@ frequency (``run.cycles``); only how fast p rises, and the angle, are of every t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -21,10 +21,27 @@ from gfm_hil.run import checks
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
-from gfm_hil.studies.conformity.under_test import UnderTest
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
+from gfm_hil.studies.envelopes import Unit
+from gfm_plant import Plant
 
 Vector = NDArray[np.float64]
+
+
+class UnderTest(StrictSchema):
+    """The converter under test: its plant, and what its owner declares."""
+
+    plant: Plant = Field(description="converter and instruments, without a grid")
+    droop: float = Field(
+        gt=0,
+        allow_inf_nan=True,
+        description="declared: frequency over power in the steady state, p.u./p.u.; inf: none",
+    )
+    P_max: float = Field(description="declared: most power in the steady state, p.u.")
+    P_min: float = Field(description="declared: least power in the steady state, p.u.")
+    unit: Unit | None = Field(
+        None, description="declared, for in_envelope; measured by a small phase jump if none"
+    )
 
 
 class Clause(StrictSchema):
@@ -90,12 +107,7 @@ class Moment:
     """
 
     def __init__(
-        self,
-        run: Run,
-        under: UnderTest,
-        others: Mapping[str, Run],
-        clause: Clause,
-        at: float,
+        self, run: Run, under: UnderTest, others: Mapping[str, Run], clause: Clause, at: float
     ) -> None:
         self.run, self.under, self.others, self.clause = run, under, others, clause
         self.T_s = run.scenario.T_s
@@ -188,3 +200,32 @@ class Moment:
         """p, the sign of "up" or "down", and how far its one-cycle means go there, p.u."""
         w, sign = self.window("p"), 1.0 if direction == "up" else -1.0
         return w, sign, float(np.max(sign * (w.x - w.before)))
+
+
+def judge(
+    run: Run, criteria: Sequence[Clause], under: UnderTest, others: Mapping[str, Run] | None = None
+) -> list[Verdict]:
+    """The verdicts of all criteria, each at each of its times.
+
+    Args:
+        run: of the converter under test; it may have ended early.
+        criteria: of the test and of its part.
+        under: what the owner of the converter declares.
+        others: the runs of the other converters of a network, which must not trip either.
+    """
+    T_s, events = run.scenario.T_s, run.scenario.events
+    first = min((e.at(T_s) * T_s for e in events), default=0.0)
+    return [
+        Moment(run, under, others or {}, criterion, at).verdict()
+        for criterion in criteria
+        for at in criterion.at or [first]
+    ]
+
+
+def cannot(criteria: Sequence[Clause], reason: str) -> list[Verdict]:
+    """Verdicts on a run that did not take place, or none of a part without criteria."""
+    return [
+        Verdict(c.clause, c.kind, getattr(c, "signal", ""), at, at, CANNOT, None, "", "", reason)
+        for c in criteria
+        for at in c.at or [0.0]
+    ]

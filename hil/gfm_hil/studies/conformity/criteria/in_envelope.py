@@ -16,8 +16,7 @@ from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.grid_frequency import GridFrequency
 from gfm_hil.scenario.events.grid_impedance import GridImpedance
 from gfm_hil.scenario.events.phase_jump import PhaseJump
-from gfm_hil.studies.conformity.criteria.base import Moment, Vector, Windowed
-from gfm_hil.studies.conformity.under_test import UnderTest
+from gfm_hil.studies.conformity.criteria.base import Moment, UnderTest, Vector, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 from gfm_hil.studies.envelopes import Envelope, Unit, measure_unit, phase_jump, rocof, scr_jump
 

@@ -13,14 +13,7 @@ from pydantic import Field, model_validator
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.conformity.criteria.base import Clause
-from gfm_hil.studies.conformity.verdict import (
-    CANNOT,
-    FAIL,
-    INFORMATIVE,
-    PASS,
-    Outcome,
-    Verdict,
-)
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 
 if TYPE_CHECKING:
@@ -74,11 +67,7 @@ class Nfp(Clause):
         return self
 
     def scan(self, scenario: Scenario, controller_command: Sequence[str]) -> FrequencyScan:
-        """Measure the plot.
-
-        Raises:
-            UserError: as ``measure_admittance``.
-        """
+        """Measure the plot. Raises UserError: as ``measure_admittance``."""
         return measure_admittance(
             scenario, start_hz=self.from_hz, stop_hz=self.to_hz, points=self.points,
             controller_command=controller_command,
