@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.inproc_loop import InprocLoop
+from gfm_hil.bench.loop import InprocLoop
 from gfm_hil.bench.rounds import ratios, seconds, spread, spread_text, take_turns
 from gfm_hil.realtime.environment import environment
 

@@ -38,13 +38,14 @@ _MOST_WORKERS = 8  # more would compile the same functions once more each
 #: Files that take longest in the other tiers, the longest first. Workers begin with them, and then
 #: with those of most tests: one that begins last leaves all processors but one idle.
 _LONGEST = (
-    "hil/test_network_links.py", "hil/test_scope_crowd.py", "hil/test_faults.py",
-    "hil/test_recover.py", "hil/test_identification.py", "hil/test_testing.py",
-    "hil/test_telemetry.py", "hil/test_e2e_loops.py", "hil/test_scope_browser.py",
-    "hil/test_campaign.py", "runtime/test_firmware_c.py", "hil/test_pil.py",
-    "runtime/test_firmware_targets.py", "runtime/test_firmware_fixed.py", "hil/test_models.py",
-    "hil/test_network.py", "runtime/test_firmware.py", "hil/test_conformity.py",
-    "hil/test_inner_links.py", "plant/test_network.py", "hil/test_network_design.py",
+    "hil/engine/test_network_links.py", "hil/ports/test_scope_crowd.py", "hil/links/test_faults.py",
+    "hil/recording/test_recover.py", "hil/studies/test_identification.py",
+    "hil/api/test_testing.py", "hil/ports/test_telemetry.py", "hil/engine/test_e2e_loops.py",
+    "hil/ports/test_scope_browser.py", "hil/studies/test_campaign.py", "runtime/test_firmware_c.py",
+    "hil/controllers/test_pil.py", "runtime/test_firmware_targets.py",
+    "runtime/test_firmware_fixed.py", "hil/controllers/test_controllers.py",
+    "hil/run/test_network.py", "runtime/test_firmware.py", "hil/studies/test_conformity.py",
+    "hil/links/test_inner_links.py", "plant/test_network.py", "hil/cli/test_network_design.py",
 )  # fmt: skip
 _TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.ports.modbus.device import Device
-from gfm_hil.ports.modbus.droops import LawDroops
 from gfm_hil.ports.modbus.image import SunSpecPoint, definition
-from gfm_hil.ports.modbus.run_state import RunState, Slack
+from gfm_hil.ports.modbus.measures import RunState, Slack
+from gfm_hil.ports.modbus.points import LawDroops
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario import load_scenario
 from gfm_runtime import law_names

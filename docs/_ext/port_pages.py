@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gfm_hil.core.terminal import markdown
 from gfm_hil.ports import PORTS, make_port
-from gfm_hil.ports.streams.metrics import METRICS
+from gfm_hil.ports.streams.port import METRICS
 from gfm_hil.recording.columns import TABLE
 from gfm_hil.results.export import FORMATS
 
@@ -36,5 +36,5 @@ def columns() -> str:
 
 def metrics() -> str:
     """A row a metric."""
-    rows = [(f"`{n}`", f"`{m.label}`" if m.label else "–", m.text) for n, m in METRICS.items()]
+    rows = [(f"`{n}`", f"`{m}`" if m else "–", text) for n, (m, text) in METRICS.items()]
     return markdown(("metric", "label", ""), rows)

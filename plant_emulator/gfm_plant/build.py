@@ -246,6 +246,7 @@ def _pack_converter_circuit(
         name, node,
         elements["L_f"] * ratio, elements["R_f"] * ratio, elements["C_f"] / ratio,
         elements["L_g"] * ratio, elements["R_g"] * ratio,
+        "end" if options.lcl is not None and options.lcl.earthed else "",
     )  # fmt: skip
 
 

@@ -195,6 +195,11 @@ class SecondInductor(Options):
 
     L: Positive = Field(description="p.u. of the converter")
     R: NonNegative = Field(0.0, description="p.u. of the converter")
+    earthed: bool = Field(
+        False,
+        description="it is a transformer with a delta on the converter's side and an earthed star "
+        "point at the point of connection: a path to ground for a zero sequence there",
+    )
 
 
 class Trip(Options):
@@ -279,8 +284,9 @@ class Plant(Options):
     )
     lcl: SecondInductor | None = Field(
         None,
-        description="second inductor of the filter; the line, and grid.scr, then begin behind it, "
-        "at the point of connection, which in a network is the node; none: an LC filter",
+        description="second inductor of the filter, or the converter's own transformer; the line, "
+        "and grid.scr, then begin behind it, at the point of connection, which in a network is the "
+        "node; none: an LC filter",
     )
     grid: Grid = Field(Grid(), description="grid simulator at the start")
     sensors: Sensors = Field(

@@ -39,6 +39,7 @@ class ConverterCircuit:
     Attributes:
         node: where its line ends.
         L_f, R_f, C_f, L_g, R_g: elements of Eq. (1)-(6), p.u. of the network.
+        earthed: of the line, as of a `Branch`.
     """
 
     name: str
@@ -48,6 +49,7 @@ class ConverterCircuit:
     C_f: float
     L_g: float
     R_g: float
+    earthed: str = ""
 
     @property
     def terminal(self) -> str:
@@ -227,7 +229,9 @@ class Wiring:
     @property
     def units_lines(self) -> tuple[Branch, ...]:
         """The lines from the converters to their nodes."""
-        return tuple(Branch(u.line, u.terminal, u.node, u.L_g, u.R_g) for u in self.units)
+        return tuple(
+            Branch(u.line, u.terminal, u.node, u.L_g, u.R_g, u.earthed) for u in self.units
+        )
 
     @property
     def fed_branches(self) -> tuple[Branch, ...]:

@@ -168,14 +168,11 @@ PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
         ('type = "virtual-stator"', "mimo-gfm-practical", {"sensors": {"bandwidth_hz": 300.0}}),
         ('type = "virtual-stator"', "droop-3", {"delay": {"samples": 0}}),
         (PLL, "vsg-2", {}),
-        (
-            PLL,
-            "vsg-5",
-            {"delay": {"fraction": 0.7}, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}},
-        ),
+        (PLL, "vsg-5",
+         {"delay": {"fraction": 0.7}, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}),
         (PLL, "vsg-5", {"dc_source": {"mode": "regulated"}, "delay": {"samples": 0}}),
     ],
-)
+)  # fmt: skip
 def test_a_step_is_that_of_the_nonlinear_bench(stage, law, plant, tmp_path):
     # 1e-4 p.u. of P_ref: nonlinear terms are of the order of 1e-8
     size, ticks = 1e-4, 1500

@@ -56,10 +56,10 @@ def test_none_to_be_found():
     assert none.value.values[0] == pytest.approx(10.0, rel=1e-3)
 
 
-def paper(law: str, seed: int = 0, start: dict[str, float] | None = None) -> Tuned:
+def paper(law: str, seed: int = 0, start: dict[str, float] | None = None, **short: int) -> Tuned:
     file = law_file(law)
     problem = PaperProblem(file, free_gains(file, start or PAPER_START.get(law)))
-    found = tune_paper(problem, seed)
+    found = tune_paper(problem, seed, **short)
     assert all(g.low <= v <= g.high for g, v in zip(problem.gains, found.values, strict=True))
     assert found.cost == max(c.norm for c in problem.channels(found.values))
     return found
@@ -78,7 +78,8 @@ def test_vsg_2_is_no_worse_than_printed():
 
 
 def test_the_same_for_a_seed():
-    np.testing.assert_array_equal(paper("droop-5", 3).values, paper("droop-5", 3).values)
+    one, again = (paper("droop-5", 3, evaluations=400, starts=1).values for _ in range(2))
+    np.testing.assert_array_equal(one, again)
 
 
 def test_unstable_start_is_stabilised_first():

@@ -5,8 +5,10 @@ import io
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
@@ -17,10 +19,16 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.ports.scope.recording import open_recording
-from gfm_hil.ports.streams.follow import Follower
+from gfm_hil.ports.streams.port import Follower
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.scenario import SCENARIO_FOLDERS, check_scenario, load_scenario, scenario_toml
+from gfm_hil.scenario import (
+    SCENARIO_FOLDERS,
+    Scenario,
+    check_scenario,
+    load_scenario,
+    scenario_toml,
+)
 from gfm_hil.scenario.events.grid_profile import read_profile
 from gfm_hil.studies.campaign import loading
 from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
@@ -133,51 +141,49 @@ def _shipped(*folders: Path) -> list[str]:
     return [path.read_text("utf-8") for f in folders for path in sorted(f.glob("*.toml"))]
 
 
-@contextlib.contextmanager
-def _scenario(place: Path) -> Iterator[Take]:
-    file, again = place / "scenario.toml", place / "again.toml"
+def reading(
+    name: str,
+    load: Callable[[Path], Any],
+    refusal: type[Exception],
+    check: Callable[[Any], None] = lambda found: None,
+) -> Callable[[Path], AbstractContextManager[Take]]:
+    """Opens the parser of one file: an input is its content, which ``load`` reads or refuses;
+    ``check`` gets what was read."""
 
-    def take(text: bytes) -> None:
-        file.write_bytes(text)
-        try:
-            found = load_scenario(str(file))
-        except UserError as problem:
-            short(str(problem))
-            return
-        again.write_text(scenario_toml(found), "utf-8")
-        assert load_scenario(str(again)) == found
+    @contextlib.contextmanager
+    def open_parser(place: Path) -> Iterator[Take]:
+        def take(content: bytes) -> None:
+            (place / name).write_bytes(content)
+            try:
+                found = load(place / name)
+            except refusal as problem:
+                short(str(problem))
+            else:
+                check(found)
 
-    yield take
+        yield take
 
-
-@contextlib.contextmanager
-def _law(place: Path) -> Iterator[Take]:
-    file = place / "law.toml"
-
-    def take(text: bytes) -> None:
-        file.write_bytes(text)
-        try:
-            for law in load_law(str(file)).laws:
-                found = discretise(law, 1e-4)
-                assert all(np.isfinite(matrix).all() for matrix in (found.A, found.C))
-        except LawError as problem:
-            short(str(problem))
-
-    yield take
+    return open_parser
 
 
-@contextlib.contextmanager
-def _firmware(place: Path) -> Iterator[Take]:
-    file = place / "report.json"
+def _scenario(file: Path) -> tuple[Path, Scenario]:
+    return file.with_name("again.toml"), load_scenario(str(file))
 
-    def take(text: bytes) -> None:
-        file.write_bytes(text)
-        try:
-            golden(read_report(place).modules, 3)
-        except LawError as problem:
-            short(str(problem))
 
-    yield take
+def _written_again(found: tuple[Path, Scenario]) -> None:
+    again, scenario = found
+    again.write_text(scenario_toml(scenario), "utf-8")
+    assert load_scenario(str(again)) == scenario
+
+
+def _law(file: Path) -> None:
+    for law in load_law(str(file)).laws:
+        found = discretise(law, 1e-4)
+        assert all(np.isfinite(matrix).all() for matrix in (found.A, found.C))
+
+
+def _firmware(file: Path) -> None:
+    golden(read_report(file.parent).modules, 3)
 
 
 def _reports() -> list[str]:
@@ -228,22 +234,11 @@ def _conformity_files() -> st.SearchStrategy[bytes]:
     return texts(_shipped(*folders, *(folder / "miso" for folder in folders)))
 
 
-@contextlib.contextmanager
-def _conformity_results(place: Path) -> Iterator[Take]:
-    """An input is a report's results.json, compared with a good one, either way."""
-    file, good = place / "results.json", Results.model_validate_json(RESULTS)
-
-    def take(text: bytes) -> None:
-        file.write_bytes(text)
-        try:
-            given = read_results(file)
-        except UserError as problem:
-            short(str(problem))
-            return
-        for pair in ((given, good), (good, given)):
-            compare_results(*pair).page("old", "new")
-
-    yield take
+def _compared(found: Results) -> None:
+    """Compare it with a good one, either way."""
+    good = Results.model_validate_json(RESULTS)
+    for pair in ((found, good), (good, found)):
+        compare_results(*pair).page("old", "new")
 
 
 def short(text: str) -> None:
@@ -397,43 +392,35 @@ def _segments() -> st.SearchStrategy[bytes]:
     return head | blobs([whole[:512], whole])
 
 
-@contextlib.contextmanager
-def _profile(folder: Path) -> Iterator[Take]:
-    path = folder / "course.csv"
-
-    def take(message: bytes) -> None:
-        path.write_bytes(message)
-        with contextlib.suppress(UserError):
-            profile = read_profile(str(path), 50.0)
-            ticks = [k for k, _ in profile.points(1e-4)]
-            assert ticks == sorted(ticks)
-
-    yield take
+def _profile(file: Path) -> None:
+    ticks = [k for k, _ in read_profile(str(file), 50.0).points(1e-4)]
+    assert ticks == sorted(ticks)
 
 
-@contextlib.contextmanager
-def _elf(place: Path) -> Iterator[Take]:
-    file = place / "program.elf"
-
-    def take(content: bytes) -> None:
-        file.write_bytes(content)
-        with contextlib.suppress(LawError):
-            text, measured, calibrated = elf_a2l(file)
-            assert text.count("/begin MEASUREMENT") == measured
-            assert text.count("/begin CHARACTERISTIC") == calibrated
-
-    yield take
+def _elf(file: Path) -> None:
+    text, measured, calibrated = elf_a2l(file)
+    assert text.count("/begin MEASUREMENT") == measured
+    assert text.count("/begin CHARACTERISTIC") == calibrated
 
 
+_ELF = (CORPUS / "elf" / "vsg_2_records").read_bytes()
 FILES = (
-    Parser("profile", _profile, lambda: texts([PROFILE])),
-    Parser("scenario", _scenario, lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS])),
-    Parser("law", _law, lambda: texts(_shipped(CATALOGUE))),
-    Parser("firmware", _firmware, lambda: texts(_reports())),
-    Parser("elf", _elf, lambda: blobs([(CORPUS / "elf" / "vsg_2_records").read_bytes()])),
+    Parser("profile", reading("a.csv", _profile, UserError), lambda: texts([PROFILE])),
+    Parser(
+        "scenario",
+        reading("scenario.toml", _scenario, UserError, _written_again),
+        lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS]),
+    ),
+    Parser("law", reading("law.toml", _law, LawError), lambda: texts(_shipped(CATALOGUE))),
+    Parser("firmware", reading("report.json", _firmware, LawError), lambda: texts(_reports())),
+    Parser("elf", reading("program.elf", _elf, LawError), lambda: blobs([_ELF])),
     Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
     Parser("conformity", _conformity, _conformity_files),
-    Parser("conformity_results", _conformity_results, lambda: texts([RESULTS])),
+    Parser(
+        "conformity_results",
+        reading("results.json", read_results, UserError, _compared),
+        lambda: texts([RESULTS]),
+    ),
     Parser("run_folder", _run_folder, _run_files),
     Parser("segment", _segment, _segments),
 )

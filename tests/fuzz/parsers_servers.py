@@ -23,11 +23,11 @@ from gfm_hil.engine.announcement import announcement
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
-from gfm_hil.ports.modbus.connection import Server
 from gfm_hil.ports.modbus.image import BASE, VENDOR
+from gfm_hil.ports.modbus.port import Server
 from gfm_hil.ports.scope import server as scope_server
-from gfm_hil.ports.scope.access import Access
 from gfm_hil.ports.scope.recording import open_recording
+from gfm_hil.ports.scope.session import Access
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario
 

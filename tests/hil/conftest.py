@@ -5,12 +5,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gfm_hil.core.errors import Unfinished
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import Scenario, check_scenario
@@ -49,6 +50,20 @@ def run(make: Make, tmp_path: Path) -> RunIt:
         return run_scenario(make(**content), tmp_path / f"run{next(count)}")
 
     return call
+
+
+@contextmanager
+def unfinished() -> Iterator[list[tuple[Any, ...]]]:
+    """A run in it ends before ``finish``, whose arguments are then in the list."""
+    found: list[tuple[Any, ...]] = []
+
+    def stop(*arguments: Any) -> None:
+        found.append(arguments)
+        raise Unfinished
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Unfinished):
+        patch.setattr("gfm_hil.run.runner.finish", stop)
+        yield found
 
 
 @pytest.fixture

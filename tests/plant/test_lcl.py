@@ -72,3 +72,26 @@ def test_a_scr_is_that_at_the_point_of_connection(rest):
     line = plant.plant.wiring.branches[0]
     assert abs(complex(line.R, line.L)) == pytest.approx(1 / 3)
     assert (line.start, line.end) == ("connection", "far")
+
+
+@pytest.mark.parametrize("kind", ["LG", "LLG"])
+def test_an_earthed_transformer_carries_the_zero_sequence(rest, kind):
+    """Beside the line to the grid; alone in an island, where a fault otherwise has no way."""
+    grid = {"scr": 3.0, "x_over_r": 6.0, **LOAD}
+    own = rest(lcl={**SECOND, "earthed": True}, grid=grid, protection=OFF, dc_source=STIFF)
+    told = rest(lcl=SECOND, grid=grid, protection=OFF, dc_source=STIFF)
+    Z_t, r = complex(SECOND["R"], SECOND["L"]), own.par[0]
+    Z_line = complex(r["R_g"], r["L_g"]) - Z_t
+    at_once: Any = {"kind": kind, "duration": 0.01, "clearing": "instant"}
+    fault(own.plant, 0.0, 0.01, **at_once)
+    fault(told.plant, 0.0, 0.01, Z_0=Z_t * Z_line / (Z_t + Z_line), **at_once)
+    for one in (own, told):
+        one.advance(100)
+    assert own.st["x"][0] == pytest.approx(told.st["x"][0], abs=1e-12)
+    breaker(own.plant, closed=False)
+    breaker(told.plant, closed=False)
+    fault(own.plant, 0.0, 0.01, **at_once)
+    fault(told.plant, 0.0, 0.01, Z_0=Z_t, **at_once)
+    for one in (own, told):
+        one.advance(100)
+    assert own.st["x"][0] == pytest.approx(told.st["x"][0], abs=1e-12)

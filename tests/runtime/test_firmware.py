@@ -4,6 +4,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,12 @@ SOME_STAGED = ("vsg-2 cascaded", "threshold-impedance d", "virtual-stator q", "n
 
 def of(*names: str) -> dict[str, Law]:
     return {name: (LAWS | STAGED)[name] for name in names}
+
+
+@cache
+def texts(laws: tuple[str, ...], real: str, style: Any) -> dict[str, str]:
+    """The files of an export, made once."""
+    return export(of(*laws), T_S, real, style)
 
 
 def columns(rows: Any, real: str, *prefixes: str) -> list[Any]:
@@ -200,7 +207,7 @@ def test_a_literal_is_its_number_to_the_bit(value):
 @pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
 def test_the_code_calls_and_keeps_nothing_of_its_own(laws, real, style):
     """No libm but sqrt and fabs, no malloc, no variable outside of a function."""
-    files = export(of(*laws), T_S, real, style)
+    files = texts(laws, real, style)
     end = "f" if real == "float32" else ""
     for name, text in files.items():
         if not (name.startswith("gfm") and name.endswith(".c")):
@@ -218,7 +225,7 @@ def test_the_code_calls_and_keeps_nothing_of_its_own(laws, real, style):
 
 
 def test_the_header_is_the_signal_table():
-    text = export(of("vsg-1"), T_S, "float32", "unrolled")["gfm_vsg_1.h"]
+    text = texts(SOME, "float32", "unrolled")["gfm_vsg_1.h"]
     for letter, vector in (("REF", "ref"), ("Y", "y"), ("U", "u")):
         found = re.findall(rf"^    GFM_VSG_1_{letter}_(\w+),", text, re.MULTILINE)
         assert found == [s.name.upper() for s in group(vector)]  # type: ignore[arg-type]
@@ -229,7 +236,7 @@ def test_the_header_is_the_signal_table():
 
 @pytest.mark.parametrize("style", STYLES)
 def test_the_same_law_gives_the_same_bytes(style):
-    assert export(of(*SOME), T_S, "float32", style) == export(of(*SOME), T_S, "float32", style)
+    assert export(of(*SOME), T_S, "float32", style) == texts(SOME, "float32", style)
 
 
 def test_a_set_point_of_minus_zero_keeps_its_zeros():
@@ -280,7 +287,7 @@ def test_a_choice_is_made(one, two, three, calls):
 
 
 def test_the_header_of_a_stage_is_the_signal_table():
-    text = export(of("vsg-2 cascaded", "no stage"), T_S, "float32", "unrolled")["gfm_no_stage.h"]
+    text = texts(SOME_STAGED, "float32", "unrolled")["gfm_no_stage.h"]
     for letter, rows in (("Y", carried_rows("y", True)), ("U", command_rows(True))):
         found = re.findall(rf"^    GFM_NO_STAGE_{letter}_(\w+),", text, re.MULTILINE)
         assert found == [s.name.upper() for s in rows]
@@ -305,7 +312,7 @@ def test_the_stage_is_that_of_the_converters_frequency():
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])
 def test_the_report_gives_the_records_back(laws, real, tmp_path):
-    files = export(of(*laws), T_S, real, "records")
+    files = texts(laws, real, "records")
     (tmp_path / "report.json").write_text(files["report.json"], encoding="utf-8")
     found = read_report(tmp_path)
     assert (found.real, found.style) == (real, "records")
@@ -318,7 +325,7 @@ def test_the_report_gives_the_records_back(laws, real, tmp_path):
 
 def test_the_report_counts_the_operations_as_by_hand():
     """matching-2: i_u = P_ref, omega_u = 1 + m v, E_u = V_ref + k v with v = v_dc - V_dcref."""
-    text = export(of("matching-2"), T_S, "float32", "unrolled")["report.json"]
+    text = texts(("matching-2",), "float32", "unrolled")["report.json"]
     found = json.loads(text)["laws"][0]
     assert found["operations"] == {
         "multiplications": 0 + 2 + 2 + 3 + 3,  # rows of u, offsets, trends
@@ -377,7 +384,7 @@ def test_limits_that_are_not_finite_are_refused():
      ("decay", "0x1p+9999", "decay: must be 1 hexadecimal number")],
 )  # fmt: skip
 def test_a_record_that_the_kernel_cannot_hold_is_refused(key, value, why, tmp_path):
-    whole = json.loads(export(of("vsg-2 cascaded"), T_S, "float32", "unrolled")["report.json"])
+    whole = json.loads(texts(("vsg-2 cascaded",), "float32", "unrolled")["report.json"])
     whole["laws"][0]["record"][key] = value
     (tmp_path / "report.json").write_text(json.dumps(whole), encoding="utf-8")
     with pytest.raises(LawError, match=why):

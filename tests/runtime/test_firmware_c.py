@@ -15,6 +15,7 @@ from gfm_runtime.firmware import CHECKED, FIXED, REALS, STYLES, check, export, g
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
+from ..support import firmware
 from ..support.firmware import SOME, STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
@@ -24,8 +25,7 @@ PAGES = Path(__file__).parents[2] / "docs"
 FUSES = pytest.mark.skipif(
     " fma " not in Path("/proc/cpuinfo").read_text(), reason="the processor has no FMA"
 )
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-pedantic",
-          "-Werror", "-ffp-contract=off"]  # fmt: skip
+STRICT = [*firmware.STRICT, "-Wdouble-promotion", "-ffp-contract=off"]
 
 
 @pytest.fixture(scope="module")

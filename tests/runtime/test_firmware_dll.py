@@ -25,7 +25,7 @@ from gfm_runtime.signals import carried, command_rows, group, names
 from gfm_runtime.states import BAD_Y, RUNNING
 from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import T_S, accepted, bench, cc
+from ..support.firmware import STRICT, T_S, accepted, bench, cc
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
@@ -225,9 +225,8 @@ def test_only_the_interface_is_exported(built, tmp_path):
     calls = ("CheckParameters", "FirstCall", "GetInfo", "Initialize", "Iterate", "Outputs",
              "PrintInfo", "Terminate")  # fmt: skip
     assert sorted(line.split()[-1] for line in said.splitlines()) == [f"Model_{n}" for n in calls]
-    strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
     for compiler in ("gcc", "clang"):
-        done = cc(library.parent, *strict, "-fsyntax-only", "model.c", compiler=compiler)
+        done = cc(library.parent, *STRICT, "-fsyntax-only", "model.c", compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -262,9 +261,8 @@ def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built, real):
 def test_a_scheduled_law_is_exported_whole(tmp_path, style, inner):
     command = ["firmware", "export", "mimo-gfm-scheduled", "--inner", inner, "--style", style]
     assert main([*command, "-o", str(tmp_path)]) == 0
-    strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
     for compiler in ("gcc", "clang"):
-        done = cc(tmp_path, *strict, "-c", "gfm_mimo_gfm_scheduled.c", compiler=compiler)
+        done = cc(tmp_path, *STRICT, "-c", "gfm_mimo_gfm_scheduled.c", compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
     done = cc(tmp_path, "-S", ".", "-B", "build", compiler="cmake")
     assert done.returncode == 0 and "gfm_mimo_gfm_scheduled.c" in (

@@ -40,7 +40,7 @@ from gfm_runtime.signals import NU, group
 from gfm_runtime.states import OK
 from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import SOME, T_S, cc, exported
+from ..support.firmware import SOME, STRICT, T_S, cc, exported
 from ..support.laws import LAWS
 
 PAGES = Path(__file__).parents[2] / "docs"
@@ -48,7 +48,6 @@ PAGES = Path(__file__).parents[2] / "docs"
 FAST = ("vsg-2", "psc-dc", "dvoc", "hybrid-angle", "vsg-11")
 EACH_LAW = [pytest.param(name, marks=() if name in FAST else pytest.mark.full) for name in LAWS]
 COMPILERS = [pytest.mark.compilers, pytest.mark.timeout(300)]
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 
 
 def module(name: str) -> Module:

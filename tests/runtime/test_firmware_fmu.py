@@ -17,13 +17,12 @@ from gfm_runtime.firmware import FMI
 from gfm_runtime.signals import carried_rows, command_rows, group
 from gfm_runtime.states import BAD_Y, RUNNING
 
-from ..support.firmware import T_S, accepted, bench, cc
+from ..support.firmware import STRICT, T_S, accepted, bench, cc
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
 
 TICKS = 500
 START = [0.5, 1.0, 1.0, 0.05]
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 
 
 class Unit:

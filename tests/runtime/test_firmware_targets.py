@@ -24,7 +24,7 @@ RISC_V = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize(
+on_processors = pytest.mark.parametrize(
     ("target", "real", "style"),
     [
         ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
@@ -32,6 +32,9 @@ RISC_V = pytest.mark.skipif(
         pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
     ],
 )  # fmt: skip
+
+
+@on_processors
 def test_every_law_has_the_kernels_bits_on_a_processor(tmp_path, target, real, style):
     found = check(exported(tmp_path, real, style), target)
     assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {CHECKED}
@@ -51,14 +54,7 @@ def test_every_law_has_the_kernels_bits_on_a_processor(tmp_path, target, real, s
             assert max(c.law_and_limits[1] for c in found) <= MOST
 
 
-@pytest.mark.parametrize(
-    ("target", "real", "style"),
-    [
-        ("m4f", "float32", "unrolled"), ("m4f", "float32", "records"),
-        ("m7", "float64", "unrolled"),
-        pytest.param("rv64", "float64", "unrolled", marks=RISC_V),
-    ],
-)  # fmt: skip
+@on_processors
 def test_every_stage_has_the_kernels_bits_on_a_processor(tmp_path, target, real, style):
     found = check(exported(tmp_path, real, style, of=STAGED), target)
     assert [c.name for c in found] == list(STAGED) and {c.rows for c in found} == {CHECKED}
@@ -110,15 +106,8 @@ def test_the_table_of_stages_is_what_is_measured(tmp_path):
         (one,) = check(tmp_path, "m4f")
         assert one.instructions is not None
         counted = "{}…{}".format(*one.instructions)
-        row = (
-            stage,
-            "m4f float32, unrolled",
-            counted,
-            one.code,
-            one.constants,
-            one.state,
-            one.stack,
-        )
+        sizes = one.code, one.constants, one.state, one.stack
+        row = (stage, "m4f float32, unrolled", counted, *sizes)
         assert f"| {' | '.join(map(str, row))} |" in table, "make_firmware_tables.py makes it anew"
 
 

@@ -20,6 +20,7 @@ from gfm_runtime.switchover import settle_into
 from .laws import LAWS
 
 T_S = 1e-4
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
 #: one of each error map, one without states, the most states
 SOME = ("vsg-1", "psc-dc", "dvoc", "hybrid-angle", "matching-2", "vsg-12")
 

@@ -7,7 +7,7 @@ from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.modbus.device import TICK_S, Device
-from gfm_hil.ports.modbus.run_state import RunState
+from gfm_hil.ports.modbus.measures import RunState
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario import check_scenario
 from gfm_runtime.states import RUNNING

@@ -16,6 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from selenium import webdriver
+from selenium.webdriver.chrome.options import Options
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import Select
+
 PATIENCE_S = 60.0
 # 1 kHz, so that two processors suffice for both sides and the browser
 RIG = """
@@ -152,10 +159,6 @@ class Browser:
     def __init__(
         self, width: int = 1440, height: int = 900, dark: bool = False, phone: bool = False
     ) -> None:
-        from selenium import webdriver
-        from selenium.webdriver.chrome.options import Options
-        from selenium.webdriver.chrome.service import Service
-
         options = Options()
         options.binary_location = shutil.which("chromium") or ""
         for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
@@ -194,30 +197,20 @@ class Browser:
 
     def click(self, selector: str) -> None:
         """Click like a user: only if the element is visible and nothing covers it."""
-        from selenium.webdriver.common.by import By
-
         self.driver.find_element(By.CSS_SELECTOR, selector).click()
 
     def write(self, selector: str, text: str) -> None:
         """Write text into a field."""
-        from selenium.webdriver.common.by import By
-
         field = self.driver.find_element(By.CSS_SELECTOR, selector)
         field.clear()
         field.send_keys(text)
 
     def choose(self, selector: str, value: str) -> None:
         """Choose from a list."""
-        from selenium.webdriver.common.by import By
-        from selenium.webdriver.support.ui import Select
-
         Select(self.driver.find_element(By.CSS_SELECTOR, selector)).select_by_value(value)
 
     def drag(self, selector: str, start: tuple[int, int], by: tuple[int, int]) -> None:
         """Drag with the pointer, from a place relative to the element's centre."""
-        from selenium.webdriver.common.action_chains import ActionChains
-        from selenium.webdriver.common.by import By
-
         element = self.driver.find_element(By.CSS_SELECTOR, selector)
         moves = ActionChains(self.driver).move_to_element_with_offset(element, *start)
         moves.click_and_hold().move_by_offset(by[0] // 2, by[1] // 2)

@@ -13,7 +13,7 @@ from gfm_hil.links import link_kind
 
 ROOT = Path(__file__).resolve().parents[2]
 INIT = ROOT / "tests" / "uml" / "init.sh"
-TESTS = "tests/hil/can_inside_uml.py"
+TESTS = "tests/hil/links/can_inside_uml.py"
 PACKAGES = ("hil", "runtime", "plant_emulator", "design")
 
 

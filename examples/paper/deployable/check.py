@@ -19,8 +19,8 @@ from gfm_design.margins.delays import longest, overall_delay
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
-from gfm_hil.api.tuned_law import problem_name
-from gfm_hil.cli.design.common import add_inner_option, channels_as_json, chosen_law
+from gfm_hil.api.design import problem_name
+from gfm_hil.cli.design.gains import add_inner_option, channels_as_json, chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_runtime import build_law, discretise

@@ -13,7 +13,7 @@ from typing import Any
 from gfm_design.margins.tolerance import End, Range
 from gfm_design.model.closed_loop import LeastStable
 from gfm_design.norms.performance import WeightedChannel
-from gfm_hil.api.tuned_law import channels_as_json, write_law
+from gfm_hil.api.design import channels_as_json, write_law
 from gfm_hil.results.report import finite
 from gfm_runtime import law_file
 from law_comparison.experiments import EXPERIMENTS, experiment

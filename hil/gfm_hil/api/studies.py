@@ -1,7 +1,5 @@
 """Studies: in memory and silent, or with a folder and watched by a command."""
 
-from __future__ import annotations
-
 import tempfile
 import warnings
 from collections.abc import Sequence

@@ -38,13 +38,9 @@ def missed_ticks(timing: Timing) -> Times:
 
 
 def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> Times:
-    """The cause of each missed tick, as an index into ``CAUSES``; shape of ``missed_ticks``.
-
-    Args:
-        timing: arrays of ``timing.npz``, each (ticks,), ns; of a run in real time.
-        T_ns: sampling time.
-        events: ticks of events.
-    """
+    """The cause of each missed tick of a run in real time, as an index into ``CAUSES``; shape of
+    ``missed_ticks``. Arrays of ``timing.npz``, each (ticks,), and the sampling time in ns; ticks of
+    events."""
     missed = missed_ticks(timing)
     shares = _parts(timing, T_ns)
     there = timing["plant_received"] >= 0

@@ -62,15 +62,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[str, Any]]:
-    """One row per quantity that both results have, B over A.
-
-    Args:
-        a, b: results.
-        by_limit: if both have ratios to the limit in C, compare these instead of times.
-
-    Raises:
-        UserError: they have nothing in common.
-    """
+    """One row per quantity that both results have, B over A; with ``by_limit`` ratios to the limit
+    in C instead of times, where both have them. Raises UserError: they have nothing in common."""
     in_a, in_b = (dict(_samples(content, by_limit)) for content in (a, b))
     rows = [name for name in in_a if name in in_b and in_a[name][0] == in_b[name][0]]
     if not rows:
@@ -89,15 +82,11 @@ def _row(
     reach = 2 / math.comb(len(x) + len(y), len(x)) * rows
     undecided = "noise" if reach < BELIEVED else "too few rounds to tell"
     return {
-        "row": name,
-        "unit": unit,
-        "a": median(x),
-        "b": median(y),
-        "ratio": median(y) / median(x),
-        "rounds": [len(x), len(y)],
-        "p": p,
+        "row": name, "unit": unit,
+        "a": median(x), "b": median(y), "ratio": median(y) / median(x),
+        "rounds": [len(x), len(y)], "p": p,
         "verdict": "real change" if p < BELIEVED else undecided,
-    }
+    }  # fmt: skip
 
 
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
@@ -143,17 +132,11 @@ def _samples(content: dict[str, Any], by_limit: bool) -> Iterator[tuple[str, Sam
 def interleave(
     a: str, b: str, turns: int, what: str, folder: Path, show: ShowProgress
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Run both ``turns`` times, one round each; returns the results and writes them to ``folder``.
+    """Run two gfmhil commands, for example paths in two environments, ``turns`` times, one round
+    each; every second turn begins with B. Returns the results, the first turn's with the rounds of
+    all turns, and writes them to ``folder`` as A.json and B.json.
 
-    Args:
-        a, b: gfmhil commands, for example the path of one in another environment.
-        turns: of each; every second one begins with B.
-        what: kind and options of ``gfmhil bench``.
-        folder: for A.json and B.json: the first turn's result with the rounds of all turns.
-        show: gets the present work and the share done.
-
-    Raises:
-        UserError: there is no such command, or it fails (with its message).
+    Raises UserError: there is no such command or kind of benchmark, or it fails (with its message).
     """
     if turns < 2:
         raise UserError(f"--interleave {turns}: must be at least 2")

@@ -86,13 +86,8 @@ def _row(policy: str, load: str, wait: str, rounds: list[Times]) -> dict[str, An
     gone = [lost(late, PERIOD_NS) for late in rounds]
     count = sum(map(len, gone))
     return {
-        "policy": policy,
-        "load": load,
-        "wait": wait,
-        "period_us": PERIOD_NS / 1e3,
+        "policy": policy, "load": load, "wait": wait, "period_us": PERIOD_NS / 1e3,
         **summary([late.ravel() for late in rounds]),
-        "ticks": ticks,
-        "lost": count,
-        "lost_pct": round(100 * count / ticks, 4),
+        "ticks": ticks, "lost": count, "lost_pct": round(100 * count / ticks, 4),
         "bursts": bursts(gone),
-    }
+    }  # fmt: skip

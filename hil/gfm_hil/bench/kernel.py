@@ -151,12 +151,7 @@ def _rows(
         numba, c = times[f"{n} numba"], times.get(f"{n} C")
         worst, limited = agreement.get(n, (None, None))
         yield {
-            "law": n,
-            "real": real,
-            "states": int(Chain.make(n, real, 0.0).law["n"][0]),
-            "numba_ns": spread(numba),
-            "c_ns": spread(c) if c else None,
-            "ratio": spread(ratios(numba, c)) if c else None,
-            "ulps": worst,
-            "limited": limited,
-        }
+            "law": n, "real": real, "states": int(Chain.make(n, real, 0.0).law["n"][0]),
+            "numba_ns": spread(numba), "c_ns": spread(c) if c else None,
+            "ratio": spread(ratios(numba, c)) if c else None, "ulps": worst, "limited": limited,
+        }  # fmt: skip

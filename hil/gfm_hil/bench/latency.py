@@ -84,17 +84,13 @@ def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) ->
         for k in sorted(cell.rounds.keys() & of_limit.keys())
     ]
     return {
-        "name": c.name,
-        "link": c.link,
-        "peer": c.peer,
+        "name": c.name, "link": c.link, "peer": c.peer,
         "code": "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python"),
-        "mode": cell.mode,
-        "load": cell.load,
-        "policy": options.policies[0],
+        "mode": cell.mode, "load": cell.load, "policy": options.policies[0],
         "payload": options.payload,
         **summary(list(cell.rounds.values())),
         "baseline": c.limit or None,
         "ratio_to_baseline_p50": round(float(np.median(ratios)), 4) if ratios else None,
         "rounds_ratio": [round(ratio, 4) for ratio in ratios],
         "silent_rounds": cell.silent,
-    }
+    }  # fmt: skip

@@ -154,14 +154,8 @@ def _pong_python(link: Any, sent: list[bytes], stop: Numbers) -> None:
 
 
 def in_c(library: Path | None, opened: Sequence[int], size: int, keep: ExitStack) -> PingPong:
-    """One end of a limit in C.
-
-    Args:
-        library: a transport of ``contenders/*.c``, compiled.
-        opened: numbers and addresses that its ``open_end`` takes.
-        size: bytes that this side sends.
-        keep: resources to free at the end.
-    """
+    """One end of a limit in C: a compiled transport, the numbers and addresses that its
+    ``open_end`` takes, how many bytes this side sends, and what to free at the end."""
     assert library is not None
     c = ctypes.CDLL(str(library))  # calls release the interpreter's lock
     number, address = ctypes.c_int64, np.ctypeslib.ndpointer(np.int64, 1)

@@ -23,15 +23,11 @@ ShowProgress = Callable[[str, float], None]  # the present work, and the share d
 def in_turn(
     rivals: Sequence[T], rounds: int, until: float = math.inf
 ) -> Iterator[tuple[int, float, T]]:
-    """Every rival once a round, as (round, share done before it, rival).
+    """Every rival once a round, as (round, share done before it, rival). Every second round has the
+    reverse order, so that no rival always follows the same one.
 
-    Every second round has the reverse order, so that no rival always follows the same one.
-
-    Args:
-        rivals: in the order of the first round.
-        rounds: requested rounds, or as many as will end in time, judged by the rounds so far, at
-            least one: on a busy machine rounds take several times longer.
-        until: time of ``time.monotonic``, s.
+    There are as many rounds as asked, or as will end by ``until`` (``time.monotonic``), judged by
+    the rounds so far, at least one: on a busy machine rounds take several times longer.
     """
     begin = time.monotonic()
     for number in range(rounds):

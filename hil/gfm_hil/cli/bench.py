@@ -1,7 +1,5 @@
 """gfmhil bench: what the links, the clock, the kernel and the loop cost on this machine."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable, Iterable, Iterator
@@ -72,7 +70,6 @@ _SECONDS = {"latency": 0.2, "jitter": 0.3, "loop": 3.0}
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the kinds of benchmark, and the comparison of two results."""
     kinds = command.add_subparsers(dest="kind", required=True, metavar="WHAT")
     for name, (text, options) in _KINDS.items():
         kind = kinds.add_parser(name, help=text)
@@ -107,7 +104,6 @@ def _add_compare(kinds: Any) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry a measuring command out; returns the exit code."""
     from gfm_hil.bench.options import measurements
     from gfm_hil.bench.page import all_tables, write_page
     from gfm_hil.bench.result import new_result, write_result

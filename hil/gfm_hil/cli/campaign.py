@@ -1,7 +1,5 @@
 """gfmhil campaign: one scenario many times with drawn parameters, on all cores or a cluster."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

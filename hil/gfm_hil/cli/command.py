@@ -1,7 +1,5 @@
 """gfmhil command: set-points, laws and grid events for a run that is going on."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence
@@ -50,11 +48,8 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """What is asked for, in the order: reset, references, law, gains, event.
-
-    Raises:
-        UserError: not NAME=VALUE, or not JSON.
-    """
+    """What is asked for, in the order: reset, references, law, gains, event. Raises UserError: not
+    NAME=VALUE, or not JSON."""
     events: list[dict[str, Any]] = []
     if options.reset:
         events.append({"type": "reset"})
@@ -80,11 +75,8 @@ def _events(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _values(texts: list[str], what: str, known: Sequence[str] | None = None) -> dict[str, float]:
-    """Numbers by name from NAME=VALUE.
-
-    Raises:
-        UserError: it is not that, or the name is not known.
-    """
+    """Numbers by name from NAME=VALUE. Raises UserError: it is not that, or the name is not
+    known."""
     values: dict[str, float] = {}
     for text in texts:
         name, _, value = text.partition("=")

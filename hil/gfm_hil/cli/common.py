@@ -1,7 +1,5 @@
 """What several commands share: options, the progress bar, the closing table."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import shlex
@@ -65,11 +63,14 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
         help="override a key of link.options, e.g. curve=keys; may be repeated",
     )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
+
+
+def add_inner(command: argparse.ArgumentParser) -> None:
+    """The option that gives every law an inner stage."""
+    said = "inner stage of every law: a shipped name (gfmhil laws), a file, or none"
+    command.add_argument("--inner", metavar="NAME", help=said)
 
 
 def add_map(command: argparse.ArgumentParser, option: str) -> None:
@@ -101,11 +102,8 @@ def window(text: str) -> list[float]:
 
 
 def endpoints(options: argparse.Namespace) -> dict[str, str]:
-    """The endpoints that --endpoint names, by converter, "" for one without a name.
-
-    Raises:
-        UserError: one is given twice.
-    """
+    """The endpoints that --endpoint names, by converter, "" for one without a name. Raises
+    UserError: one is given twice."""
     found: dict[str, str] = {}
     for text in options.endpoint:
         named = re.fullmatch(r"([A-Za-z_][A-Za-z0-9_-]*)=(.+)", text)
@@ -306,11 +304,7 @@ def exit_code(run: Run | NetworkRun) -> int:
 
 
 def split_laws(text: str) -> list[str]:
-    """Names from a comma-separated list.
-
-    Raises:
-        UserError: an empty one.
-    """
+    """Names from a comma-separated list. Raises UserError: an empty one."""
     names = [name.strip() for name in text.split(",")]
     if not all(names):
         raise UserError(f"--laws {text!r}: names separated by commas, none empty")

@@ -1,7 +1,5 @@
 """gfmhil compare: one scenario under several laws, in one table and one figure."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any
@@ -9,16 +7,7 @@ from typing import Any
 from rich.markup import escape
 
 from gfm_hil.api.runs import compare
-from gfm_hil.cli.common import (
-    add_scenario_options,
-    add_study_options,
-    exit_code,
-    new_folder,
-    resolve,
-    split_laws,
-    watching,
-    why_it_ended,
-)
+from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
@@ -32,32 +21,32 @@ def add(command: argparse.ArgumentParser) -> None:
         "In one process and in lockstep, unless --link, --endpoint, --option or "
         "--mode realtime asks for two."
     )
-    add_scenario_options(command)
+    common.add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
     command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
-    add_study_options(command, "comparison.json")
+    common.add_study_options(command, "comparison.json")
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
     asked = options.link or options.endpoint or options.option or options.mode == "realtime"
-    base = resolve(options, in_process=not asked)
+    base = common.resolve(options, in_process=not asked)
     if base.network is not None:
         raise UserError(f"{options.scenario}: {ONE_CONVERTER}")
-    laws = split_laws(options.laws) if options.laws else base.compare
+    laws = common.split_laws(options.laws) if options.laws else base.compare
     if not laws:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
-    folder = new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
-    with watching("compare", options.quiet) as watch:
+    folder = common.new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
+    with common.watching("compare", options.quiet) as watch:
         found = compare(base, laws, folder, watch=watch)
     if options.json:
         print(json.dumps(found.summaries, indent=2))
     else:
         _print(found.summaries, found.events)
-        for why in filter(None, map(why_it_ended, found.values())):
+        for why in filter(None, map(common.why_it_ended, found.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
-    return max(exit_code(run) for run in found.values())
+    return max(common.exit_code(run) for run in found.values())
 
 
 def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:

@@ -1,7 +1,5 @@
 """gfmhil conform: published tests of grid-forming converters, judged clause by clause."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -11,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 
 from gfm_hil.api.studies import conform
-from gfm_hil.cli.common import add_map, add_study_options, new_folder, watching
+from gfm_hil.cli.common import add_inner, add_map, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import terminal
@@ -61,10 +59,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "first law as firmware on a processor in QEMU",
     )  # fmt: skip
     add_map(command, "--controller")
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument(
         "--against", action="append", metavar="SET",
         help=f"{', '.join(shipped_sets())}, or a path of your own; may be repeated; all: the "
@@ -86,7 +81,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry the command out; returns the exit code."""
     against = options.against or [ALL]
     if options.list:
         cases = load_cases(against)

@@ -1,7 +1,5 @@
 """gfmhil dbc: the DBC file of the CAN link, and what its frames cost on the bus."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -27,7 +25,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Write the file, or show the budget."""
     if options.T_s <= 0:
         raise UserError(f"--T_s {options.T_s:g}: must be more than 0 s")
     if options.budget:

@@ -1,7 +1,5 @@
 """gfmhil deploy: the files that run a side as a service, in a container or on a bus."""
 
-from __future__ import annotations
-
 import argparse
 import shutil
 from pathlib import Path
@@ -26,11 +24,8 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Write the files and list them; returns the exit code.
-
-    Raises:
-        UserError: the folder is not empty or cannot be written.
-    """
+    """Write the files and list them; returns the exit code. Raises UserError: the folder is not
+    empty or cannot be written."""
     source = next((folder for folder in _FOLDERS if folder.is_dir()), None)
     if source is None:
         raise UserError("gfmhil deploy: this installation came without the files of deploy/")

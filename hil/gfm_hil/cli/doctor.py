@@ -1,7 +1,5 @@
 """gfmhil doctor: is this machine fit for real time, and what to do where it is not."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

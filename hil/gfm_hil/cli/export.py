@@ -1,7 +1,5 @@
 """gfmhil export: a finished run as a file that other tools open."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -24,7 +22,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Write the file; returns the exit code."""
     name, file = options.format, options.out
     if name is None:
         name = file.suffix.removeprefix(".") if file is not None else ""

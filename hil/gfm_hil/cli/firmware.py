@@ -1,7 +1,5 @@
 """gfmhil firmware: laws as C99, their golden vectors, and the check on a processor."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -11,7 +9,7 @@ from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 
-from gfm_hil.cli.common import EXIT_OTHERWISE
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
@@ -112,10 +110,7 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
     command.add_argument(
         "--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s (1e-4)"
     )
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage of every law: a shipped name (gfmhil laws), a file, or none",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument(
         "--f_n", type=float, default=50.0, metavar="HZ",
         help="nominal frequency of the converter, for an inner stage (50)",
@@ -123,7 +118,6 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
 
 
 def call_export(options: argparse.Namespace) -> int:
-    """Write the folder; returns the exit code."""
     sets = _sets(options.laws, options.inner)
     scheduled = [one for one in sets if one.schedule is not None]
     if ALL in options.laws and options.real == FIXED and scheduled:
@@ -153,7 +147,6 @@ def call_export(options: argparse.Namespace) -> int:
 
 
 def call_dll(options: argparse.Namespace) -> int:
-    """Write the folder and build the library; returns the exit code."""
     law = load_law(options.law, options.inner)
     files = dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -164,7 +157,6 @@ def call_dll(options: argparse.Namespace) -> int:
 
 
 def call_fmu(options: argparse.Namespace) -> int:
-    """Build the FMU; returns the exit code."""
     law = load_law(options.law, options.inner)
     omega_b = _omega_b(options.f_n)
     packed = fmu(law, options.T_s, options.real, options.fmi, omega_b)
@@ -175,7 +167,6 @@ def call_fmu(options: argparse.Namespace) -> int:
 
 
 def call_a2l(options: argparse.Namespace) -> int:
-    """Write the calibration file; returns the exit code."""
     need("elftools", "pyelftools", "firmware a2l", "calibration")
     text, measured, calibrated = elf_a2l(options.elf)
     write_text(options.out, text)
@@ -190,7 +181,6 @@ def call_a2l(options: argparse.Namespace) -> int:
 
 
 def call_golden(options: argparse.Namespace) -> int:
-    """Write or print the vectors; returns the exit code."""
     laws, omega_b = _laws(_sets(options.laws, options.inner)), _omega_b(options.f_n)
     modules = make_modules(laws, options.T_s, options.real, omega_b)
     text = golden(modules, _ticks(options.ticks)).csv()
@@ -202,7 +192,6 @@ def call_golden(options: argparse.Namespace) -> int:
 
 
 def call_include(_: argparse.Namespace) -> int:
-    """Print the folder of our headers; returns the exit code."""
     print(files("gfm_hil.controllers"))
     return 0
 

@@ -1,7 +1,5 @@
 """gfmhil keys: key pairs for a link between two machines."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -15,7 +13,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Write them and say where each belongs."""
     from gfm_hil.links.zeromq.curve import write_keys
 
     folder = Path(options.out)

@@ -1,7 +1,5 @@
 """gfmhil laws: the catalogue, the inner stages, and one law with its matrices."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import json
@@ -37,7 +35,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """List the catalogue, or its tuned laws, and the inner stages."""
     rows = []
     for name in tuned_names() if options.tuned else law_names():
         laws, file = load_law(name), law_file(name)
@@ -79,7 +76,6 @@ def call(options: argparse.Namespace) -> int:
 
 
 def call_show(options: argparse.Namespace) -> int:
-    """Show one law."""
     laws, file = load_law(options.name), law_file(options.name)
     discrete = [discretise(law, options.T_s) for law in laws.laws]
     if options.json:

@@ -5,8 +5,6 @@ than the one before; 2: wrong input, nothing started; 3: a run ended otherwise, 
 not be completed; 4: no conformity test fails, but one cannot be judged; 130: interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import errno
 import os
@@ -170,11 +168,8 @@ def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Ex
 
 
 def _refuse(problem: Exception) -> int:
-    """Print what the user can mend, one line a mistake; returns the exit code.
-
-    Raises:
-        Exception: the problem itself, if it is a mistake of ours.
-    """
+    """Print what the user can mend, one line a mistake; returns the exit code. Raises Exception:
+    the problem itself, if it is a mistake of ours."""
     from gfm_hil.core.errors import Unfinished, UserError  # these imports take longer than --help
     from gfm_runtime import LawError
     from gfm_runtime.errors import printable

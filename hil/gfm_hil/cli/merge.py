@@ -1,7 +1,5 @@
 """gfmhil merge: one run folder of the two that sides started apart leave."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
@@ -20,7 +18,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Make the folder; returns the exit code of the run."""
     folder = new_folder(options.out, "merged")
     run = merge(options.first, options.second, folder)
     print_run(run, folder)

@@ -1,7 +1,5 @@
 """gfmhil recover: complete the folder of a run that was cut off."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -21,7 +19,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Complete the folder; returns the exit code."""
     run = recover(options.folder)
     if options.json:
         print(json.dumps(run.summary, indent=2))

@@ -1,19 +1,9 @@
 """gfmhil controller and gfmhil plant: one side alone, so that two machines can be used."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 
-from gfm_hil.cli.common import (
-    add_map,
-    add_scenario_options,
-    endpoints,
-    exit_code,
-    new_folder,
-    print_run,
-    resolve,
-)
+from gfm_hil.cli import common
 from gfm_hil.controllers import FORMS, BenchContext, open_controller, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
@@ -27,7 +17,7 @@ from gfm_runtime.errors import meant
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    add_scenario_options(command)
+    common.add_scenario_options(command)
     command.add_argument("--law", help="override law: catalogue name or law file")
     command.add_argument("--converter", help="of a network: the one that this controller controls")
     command.add_argument("-o", "--out", help="run folder; runs/<role>-<time> by default")
@@ -35,17 +25,18 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
     )  # fmt: skip
-    add_map(command, "--model")
+    common.add_map(command, "--model")
     command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
 
 
 def call(options: argparse.Namespace) -> int:
-    """Carry one side out; returns the exit code."""
     role: Role = options.command
-    scenario = _of_one(role, resolve(options, named=True, law=options.law), options.converter)
+    scenario = _of_one(
+        role, common.resolve(options, named=True, law=options.law), options.converter
+    )
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
-    given = _given(scenario, endpoints(options))
+    given = _given(scenario, common.endpoints(options))
     if options.model is not None and role == "plant":
         raise UserError("--model: the plant has no model; start the controller with it")
     external = None
@@ -53,7 +44,7 @@ def call(options: argparse.Namespace) -> int:
         ports = read_map(options.map)
         with one_processor(scenario.mode):
             external = open_controller(options.model, ports, _bench_context(scenario))
-    folder = new_folder(options.out, role)
+    folder = common.new_folder(options.out, role)
     if options.part:  # of `gfmhil run`, which puts the parts together
         run_part(role, scenario, folder, given, external)
         return 0
@@ -64,8 +55,8 @@ def call(options: argparse.Namespace) -> int:
 
     run = run_side(role, scenario, folder, given, notice, write_report, external)
     if not options.quiet:
-        print_run(run, folder)
-    return exit_code(run)
+        common.print_run(run, folder)
+    return common.exit_code(run)
 
 
 def _bench_context(scenario: Scenario) -> BenchContext:
@@ -75,11 +66,8 @@ def _bench_context(scenario: Scenario) -> BenchContext:
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
-    """The scenario of a controller, which has one converter.
-
-    Raises:
-        UserError: --converter is missing, or does not fit.
-    """
+    """The scenario of a controller, which has one converter. Raises UserError: --converter is
+    missing, or does not fit."""
     known = scenario.parts
     if role == "plant" or not known:
         if converter is not None:
@@ -93,11 +81,8 @@ def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
 
 
 def _given(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:
-    """The endpoint of each converter that has one by --endpoint.
-
-    Raises:
-        UserError: one is missing, or is that of no converter.
-    """
+    """The endpoint of each converter that has one by --endpoint. Raises UserError: one is missing,
+    or is that of no converter."""
     known = scenario.parts or [scenario.converter or ""]
     if not scenario.parts and "" in named:
         named = {known[0]: named[""]}

@@ -1,7 +1,5 @@
 """gfmhil run: one scenario, one run folder."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json
@@ -10,16 +8,7 @@ import sys
 
 from gfm_hil.api.runs import run as run_one
 from gfm_hil.api.runs import run_network
-from gfm_hil.cli.common import (
-    add_map,
-    add_scenario_options,
-    exit_code,
-    new_folder,
-    print_run,
-    progress_bar,
-    resolve,
-    window,
-)
+from gfm_hil.cli import common
 from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports import PORTS
@@ -30,7 +19,7 @@ from gfm_hil.scenario import INPROC, find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    add_scenario_options(command)
+    common.add_scenario_options(command)
     command.add_argument(
         "--law",
         help="override law: catalogue name or law file; of a network see --converter",
@@ -45,13 +34,13 @@ def add(command: argparse.ArgumentParser) -> None:
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"
         " or pil:TARGET, the law on a processor in QEMU, see gfmhil firmware check",
     )  # fmt: skip
-    add_map(command, "--controller")
+    common.add_map(command, "--controller")
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.add_argument("--no-figures", action="store_true", help="neither figures nor report")
     command.add_argument(
-        "--waveforms", type=window, metavar="FROM:TO",
+        "--waveforms", type=common.window, metavar="FROM:TO",
         help="override waveforms: the window of the figure of the three phases, s",
     )  # fmt: skip
     for name, entry in PORTS.items():
@@ -64,15 +53,15 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     if options.controller is not None and options.controller.startswith(PIL) and not options.mode:
         options.mode = "lockstep"  # QEMU keeps no time
-    scenario = resolve(options, law=options.law, waveforms=options.waveforms)
-    folder = new_folder(options.out, find_scenario(options.scenario).stem)
+    scenario = common.resolve(options, law=options.law, waveforms=options.waveforms)
+    folder = common.new_folder(options.out, find_scenario(options.scenario).stem)
     figures = not options.no_figures
     with contextlib.ExitStack() as stack:
         run: Run | NetworkRun
         stay: dict[str, subprocess.Popen[str]] = {}
         if scenario.network is not None:
             _check_network(options)
-            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+            with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_network(
                     scenario, folder, figures=figures, progress=progress, notice=notice
                 )
@@ -81,7 +70,7 @@ def call(options: argparse.Namespace) -> int:
                 beside = companion(name, folder, number, scenario.link.type == INPROC)
                 if (process := stack.enter_context(beside)) is not None:
                     stay[name] = process
-            with progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
+            with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_one(
                     scenario, folder=folder, controller=options.controller, ports=options.map,
                     figures=figures, progress=progress, notice=notice,
@@ -89,13 +78,13 @@ def call(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
-            print_run(run, folder, why=True)
+            common.print_run(run, folder, why=True)
         for name, process in stay.items():
             if process.poll() is None and run.status != "interrupted":
                 print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
                 with contextlib.suppress(KeyboardInterrupt):
                     process.wait()
-    return exit_code(run)
+    return common.exit_code(run)
 
 
 def _ports(options: argparse.Namespace) -> dict[str, int]:

@@ -1,7 +1,5 @@
 """gfmhil scan: the dq admittance of a converter with its controller, measured on the bench."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex
@@ -96,11 +94,8 @@ def _grid(text: str) -> tuple[float, float]:
 
 
 def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
-    """The law and the scenario that the command line means.
-
-    Raises:
-        UserError: neither exists, or a scenario is given twice.
-    """
+    """The law and the scenario that the command line means. Raises UserError: neither exists, or a
+    scenario is given twice."""
     is_law = what in law_names()
     if not is_law and what.endswith(".toml") and Path(what).is_file():
         try:

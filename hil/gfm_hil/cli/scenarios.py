@@ -1,7 +1,5 @@
 """gfmhil scenarios: what ships."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,8 +1,6 @@
 """gfmhil schema: what a scenario, law, inner stage, campaign or test file may hold, as JSON
 Schema."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -45,7 +43,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    """Print or write the schema; returns the exit code."""
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         **MODELS[options.kind].json_schema(),

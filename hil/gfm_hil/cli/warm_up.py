@@ -1,7 +1,5 @@
 """gfmhil warm-up: compile all that runs call, so that the first run starts at once."""
 
-from __future__ import annotations
-
 import argparse
 import time
 

@@ -21,17 +21,6 @@ from gfm_runtime.states import REASONS, STATES
 _ANSWER_MS = 6000
 
 
-def _word(folder: Path, what: str, words: Mapping[int, Any], code: float) -> Any:
-    """The meaning of a recorded code.
-
-    Raises:
-        UserError: it has none, so that the recording is damaged.
-    """
-    if code not in words:
-        raise UserError(f"{folder}: damaged: there is no {what} of number {code:g}")
-    return words[int(code)]
-
-
 class Operator:
     """Sends commands to one run in progress and reads its state.
 
@@ -39,13 +28,16 @@ class Operator:
         folder: the run folder.
         through: what passes the commands on, for the log of the run.
 
+    Attributes:
+        run: all that it has recorded.
+
     Raises:
         UserError: no run is in progress there.
     """
 
     def __init__(self, folder: Path, through: str = "python") -> None:
         self._folder, self._local = folder, local(through)
-        self._context = zmq.Context()
+        self._context, self.run = zmq.Context(), LiveRun(folder)
         if not present(folder):
             raise not_running(folder)
 
@@ -101,41 +93,42 @@ class Operator:
             UserError: the recording is damaged.
         """
         found: dict[str, Any] = {}
-        run, folder = LiveRun(self._folder), self._folder
+        run = self.run
         if done := run.done("plant"):
             found |= {**run.row("plant", done - 1), "tick": done - 1, "misses": run.misses}
-            found["trip"] = _word(folder, "trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
+            found["trip"] = self._word("trip", {**TRIP_REASONS, 0: ""}, found["true_trip"])
         if done := run.done("controller"):
             found |= run.row("controller", done - 1)
-            found["state"] = _word(folder, "state", dict(enumerate(STATES)), found["state"])
-            found["reason"] = _word(folder, "reason", dict(enumerate(REASONS)), run.safe_reason)
-            if (server := announced(folder, "controller")) is not None:
-                law = _word(folder, "law", dict(enumerate(server["laws"])), found["law"])
+            found["state"] = self._word("state", dict(enumerate(STATES)), found["state"])
+            found["reason"] = self._word("reason", dict(enumerate(REASONS)), run.safe_reason)
+            if (server := announced(self._folder, "controller")) is not None:
+                law = self._word("law", dict(enumerate(server["laws"])), found["law"])
                 found["active"], found["gains"] = law["name"], law["gains"]
                 found["law_title"] = law["title"]
                 found["laws"], found["T_s"] = server["names"], server["T_s"]
         return found
 
+    def _word(self, what: str, words: Mapping[int, Any], code: float) -> Any:
+        """The meaning of a recorded code; raises UserError for one without."""
+        if code not in words:
+            raise UserError(f"{self._folder}: damaged: there is no {what} of number {code:g}")
+        return words[int(code)]
+
     def _ask(self, role: Role, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
         server = announced(self._folder, role)
         if server is None:
             raise UserError(f"{self._folder}: the {role} is not running")
-        content = {**event, "by": (by or self._local).plain()}
         try:
-            answer = self._exchange(role, server["endpoint"], content)
+            with self._context.socket(zmq.REQ) as socket:
+                socket.set(zmq.LINGER, 0)
+                socket.set(zmq.MAXMSGSIZE, LARGEST)
+                socket.connect(server["endpoint"])
+                socket.send_json({**event, "by": (by or self._local).plain()})
+                if not socket.poll(_ANSWER_MS):
+                    raise UserError(f"{self._folder}: the {role} does not answer")
+                answer: Any = socket.recv_json()
         except zmq.ZMQError as problem:  # for example no descriptor for a socket
             raise UserError(f"{self._folder}: the {role} cannot be asked: {problem}") from None
-        if not answer["ok"]:
+        if not answer.pop("ok"):
             raise UserError(str(answer["error"]))
-        return {key: value for key, value in answer.items() if key != "ok"}
-
-    def _exchange(self, role: Role, endpoint: str, content: dict[str, Any]) -> dict[str, Any]:
-        with self._context.socket(zmq.REQ) as socket:
-            socket.set(zmq.LINGER, 0)
-            socket.set(zmq.MAXMSGSIZE, LARGEST)
-            socket.connect(endpoint)
-            socket.send_json(content)
-            if not socket.poll(_ANSWER_MS):
-                raise UserError(f"{self._folder}: the {role} does not answer")
-            answer: Any = socket.recv_json()
         return dict(answer)

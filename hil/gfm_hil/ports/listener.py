@@ -7,6 +7,7 @@ have a limit of their own, so that any number of them takes no place from those 
 
 from __future__ import annotations
 
+import contextlib
 import resource
 import socket
 import time
@@ -42,6 +43,9 @@ class Listener(socket.socket):
         half_open_s: how long a peer may take to send its first whole message.
         idle_s: how long a peer may be silent after a message.
 
+    Attributes:
+        port: on which it listens.
+
     Raises:
         OSError: the address cannot be bound.
     """
@@ -60,11 +64,7 @@ class Listener(socket.socket):
         except OSError:
             self.close()
             raise
-
-    @property
-    def port(self) -> int:
-        """The port on which it listens."""
-        return int(self.getsockname()[1])
+        self.port = int(self.getsockname()[1])
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept a connection; if too many have not spoken yet, close the oldest of them.
@@ -109,8 +109,5 @@ class Listener(socket.socket):
 
     def _end(self, number: int) -> None:
         """Shut down both directions, so that its server sees EOF and closes the descriptor."""
-        connection = self._peers.pop(number).connection
-        try:
-            connection.shutdown(socket.SHUT_RDWR)
-        except OSError:  # the peer or its server has closed it
-            return
+        with contextlib.suppress(OSError):  # the peer or its server has closed it
+            self._peers.pop(number).connection.shutdown(socket.SHUT_RDWR)

@@ -83,7 +83,7 @@ class BesideRun:
         Raises:
             KeyboardInterrupt: the port is to end.
         """
-        there = present if commands else _recorded
+        there = present if commands else recorded
         while self._patient and not there(self.folder):
             if self.interrupted:
                 raise KeyboardInterrupt
@@ -130,7 +130,8 @@ class BesideRun:
         asyncio.run(until())
 
 
-def _recorded(folder: Path) -> bool:
+def recorded(folder: Path) -> bool:
+    """Whether there is a recording: of a run that has begun to record, or of a finished one."""
     return (folder / "signals.npz").is_file() or begun(folder)
 
 

@@ -17,11 +17,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image  # matplotlib needs it too
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, ColumnLike, Columns, pieces, wave
-from gfm_hil.recording.run import bases, controlled_by, nominal_frequency
+from gfm_hil.recording.run import Run, bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
+from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
 
@@ -462,3 +464,67 @@ def draw_comparison(
     figure = Figure(figsize=SIZE_LAWS, layout="constrained")
     draw_laws(figure, scenario, runs, events)
     _save(figure, path)
+
+
+# Figures for a notebook, drawn with pyplot, which takes longer to import than a run takes.
+
+
+def _pyplot_figure(size: tuple[float, float]) -> Figure:
+    from matplotlib import pyplot
+
+    return pyplot.figure(figsize=size, layout="constrained")
+
+
+def plot(run: Run, *names: str) -> list[Axes]:
+    """Draw signals over time, one a panel; without names the six panels of the report.
+
+    Raises:
+        UserError: a signal that was not recorded.
+    """
+    if not names:
+        return draw_signals(_pyplot_figure(SIZE), run.scenario, run.columns, run.summary)
+    signals = run.signals
+    curves = [(signals["t"], signals[name], COLOURS[0], name) for name in names]
+    figure = _pyplot_figure((8.6, 2.2 * len(names)))
+    axes = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+    for a, curve in zip(axes, curves, strict=True):
+        draw_panel(a, curve[-1], [curve])
+    axes[-1].set_xlabel("t [s]")
+    return axes
+
+
+def plot_waveforms(run: Run, start: float | None = None, stop: float | None = None) -> list[Axes]:
+    """Draw the three phases of the voltages and currents, as the report does.
+
+    Args:
+        start, stop: from when to when, s; the window of the report if not given.
+
+    Raises:
+        UserError: only one of them is given, nothing was recorded between them, or the
+            recording lacks what this needs.
+    """
+    from matplotlib import pyplot
+
+    if (start is None) != (stop is None):
+        raise UserError(f"start = {start}, stop = {stop}: give both or neither")
+    window = None if start is None or stop is None else (start, stop)
+    figure = _pyplot_figure(SIZE_WAVES)
+    axes = draw_waveforms(figure, run.scenario, run.columns, run.summary, window)
+    if not axes:
+        pyplot.close(figure)
+        end = run.summary["duration_s"]
+        raise UserError(f"start = {start}, stop = {stop}: the recording ends at {end:g} s")
+    return axes
+
+
+def plot_network(run: NetworkRun) -> list[Axes]:
+    """p, frequency, q and v_dc of all converters in one figure."""
+    return draw_laws(_pyplot_figure(SIZE_LAWS), run.scenario, run.columns, run.events)
+
+
+def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
+    """p, frequency, q and v_dc of several laws in one figure."""
+    first = next(iter(runs.values()))
+    events = max((one.summary["events"] for one in runs.values()), key=len)
+    columns = {law: one.columns for law, one in runs.items()}
+    return draw_laws(_pyplot_figure(SIZE_LAWS), first.scenario, columns, events)

@@ -42,12 +42,8 @@ def write_page(path: Path, template: str, **values: Any) -> None:
 
 
 def inline(picture: Path | bytes, kind: str = "") -> str:
-    """A picture as the address of an image in a page that needs no other file.
-
-    Args:
-        picture: file, or its content.
-        kind: png or svg+xml of a content.
-    """
+    """A picture, a file or the content of one of a kind (png or svg+xml), as the address of an
+    image in a page that needs no other file."""
     if isinstance(picture, Path):
         kind = {".png": "png", ".svg": "svg+xml"}[picture.suffix]
         picture = picture.read_bytes()

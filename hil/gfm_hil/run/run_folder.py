@@ -151,40 +151,37 @@ class _LinkEnd(BaseModel):
 def in_use(folder: Path) -> Iterator[None]:
     """While this process runs the run of ``folder``, ``recover`` refuses it. Raises UserError:
     another process is just recovering it."""
-    with contextlib.ExitStack() as stack:
-        handle = _open_lock(folder)
-        stack.callback(os.close, handle)
-        try:
-            scratch.lock(handle, fcntl.LOCK_SH)
-        except TimeoutError as problem:
-            raise UserError(f"{folder}: {problem}") from None
+    with _locked(folder, fcntl.LOCK_SH, scratch.PATIENCE_S):
         yield
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Keep others from a folder, and from its parts where those lie elsewhere."""
-    with contextlib.ExitStack() as stack:
-        handle = _open_lock(folder)
-        stack.callback(os.close, handle)
-        try:
-            scratch.lock(handle, fcntl.LOCK_EX, patience_s=0.0)
-        except TimeoutError:
-            raise UserError(f"{folder}: the run is still going on") from None
+    locked = _locked(folder, fcntl.LOCK_EX, 0.0, "the run is still going on")
+    with locked, contextlib.ExitStack() as stack:
         place = place_of(folder)
         if place is not None and place.parent != folder:
             stack.callback(scratch.release, scratch.hold(place))
         yield
 
 
-def _open_lock(folder: Path) -> int:
-    """The file that is locked while a run folder is in use; only our user can open it, so that no
-    other user can keep it locked."""
+@contextlib.contextmanager
+def _locked(folder: Path, operation: int, patience_s: float, why: str = "") -> Iterator[None]:
+    """Lock a file of a run folder that only our user can open, so that no other user can keep it
+    locked; ``why`` says what it means if another process has."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        return os.open(folder / _LOCK, flags, 0o600)
+        handle = os.open(folder / _LOCK, flags, 0o600)
     except OSError as problem:
         raise UserError(f"{folder / _LOCK}: {problem.strerror}") from None
+    with contextlib.ExitStack() as stack:
+        stack.callback(os.close, handle)
+        try:
+            scratch.lock(handle, operation, patience_s)
+        except TimeoutError as problem:
+            raise UserError(f"{folder}: {why or problem}") from None
+        yield
 
 
 @contextlib.contextmanager

@@ -36,15 +36,9 @@ def title_of(loop: ClosedLoop) -> str:
 
 
 def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[ClosedLoop, str]:
-    """The loop of the scenario's first law, and its label.
-
-    Args:
-        converter: of a network, which one; the folder of a converter knows it.
-
-    Raises:
-        NoEquilibrium, UserError: there is no operating point; or there is a network and no
-            converter is named, or one that it does not have.
-    """
+    """The loop of the scenario's first law, and its label; of a network that of the converter that
+    is named, or whose folder it is. Raises NoEquilibrium, UserError: there is no operating point;
+    or no converter is named, or one that the network does not have."""
     if scenario.network is None:
         law, label = initial_law(scenario)
         return ClosedLoop.of(law, scenario.plant, scenario.references.vector()), label

@@ -24,7 +24,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ from gfm_hil.scenario import INPROC, Scenario, load_scenario
 from gfm_hil.studies.linear_loop import scenario_loop
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, make_plant
+from gfm_plant.build import LINE
 from gfm_plant.wiring import GRID_SOURCE
 from gfm_runtime.signals import carried
 
@@ -200,21 +201,18 @@ class FrequencyScan:
 
     def rows(self) -> Iterator[list[Any]]:
         """The head and the lines of admittance.csv."""
-        parts: list[tuple[str, Response]] = [
-            (f"Y_{cell}", self.Y.reshape(-1, 4)[:, k]) for k, cell in enumerate(_CELLS)
-        ]
-        parts.append(("nfp", self.nfp))
-        if self.model is not None and self.nfp_model is not None:
-            flat = self.model.reshape(-1, 4)
-            parts += [(f"model_Y_{cell}", flat[:, k]) for k, cell in enumerate(_CELLS)]
-            parts.append(("model_nfp", self.nfp_model))
-        names = [f"{name}_{part}" for name, _ in parts for part in ("re", "im")]
-        dev = self.deviation
-        yield ["f_hz", *names, "least_eigenvalue", *([] if dev is None else ["deviation"])]
-        p = self.passivity
-        for k, f in enumerate(self.frequency):
-            values = [float(x) for _, column in parts for x in (column[k].real, column[k].imag)]
-            yield [float(f), *values, float(p[k]), *([] if dev is None else [float(dev[k])])]
+        columns = {"f_hz": self.frequency}
+        for of, Y, nfp in (("", self.Y, self.nfp), ("model_", self.model, self.nfp_model)):
+            if Y is not None and nfp is not None:
+                each = zip((*(f"Y_{cell}" for cell in _CELLS), "nfp"), (*Y.reshape(-1, 4).T, nfp),
+                           strict=True)  # fmt: skip
+                for name, x in each:
+                    columns |= {f"{of}{name}_re": x.real, f"{of}{name}_im": x.imag}
+        columns["least_eigenvalue"] = self.passivity
+        if self.deviation is not None:
+            columns["deviation"] = self.deviation
+        yield [*columns]
+        yield from np.column_stack([*columns.values()]).tolist()
 
     def _judged(self, scr: float, x_over_r: float) -> dict[str, Any]:
         found = self.stability(scr, x_over_r)
@@ -244,25 +242,14 @@ class _Band:
     hz: Vector  # tones, multiples of the window's inverse
     every: int  # ticks from one line of the profile to the next
     window: int  # ticks, a multiple of ``every``
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """What is injected."""
-
-    bands: Sequence[_Band]  # one after the other
-    settle: Sequence[int]  # ticks before each window
-    amplitude: float  # of each tone, p.u.
+    start: int = 0  # its first tick: one band follows the other
+    settle: int = 0  # ticks before its window, likewise a multiple
 
     @property
-    def hz(self) -> Vector:
-        """All tones, Hz."""
-        return np.concatenate([band.hz for band in self.bands])
-
-    def starts(self) -> list[int]:
-        """The first tick of each band."""
-        lengths = [s + b.window for s, b in zip(self.settle, self.bands, strict=True)]
-        return [0, *np.cumsum(lengths).astype(int).tolist()]
+    def measured(self) -> slice:
+        """The ticks of its window."""
+        begin = self.start + self.settle
+        return slice(begin, begin + self.window)
 
 
 def measure_admittance(
@@ -312,10 +299,10 @@ def measure_admittance(
         plan = _plan(bands, amplitude, settle_s, scenario)
         sides: list[_Spectra] = []
         for axis in "dq":
-            seconds = plan.starts()[-1] * scenario.T_s
+            seconds = plan[-1].measured.stop * scenario.T_s
             words = f"injection along {axis}: {seconds:.1f} s simulated"
             watch.progress(len(sides), 2, words)
-            spectra, summary = _inject(scenario, plan, axis, external)
+            spectra, summary = _inject(scenario, plan, amplitude, axis, external)
             sides.append(spectra)
             name = controlled_by(summary) if external else name
         settled = max(side.ends for side in sides)
@@ -328,7 +315,8 @@ def measure_admittance(
                 "rounding hides the tones: raise amplitude, and give settle_s"
             )
         settle_s *= 2.0
-    return _found(name, scenario, plan, settle_s, settled, sides, Y_of)
+    hz = np.concatenate([band.hz for band in plan])
+    return _found(name, scenario, hz, amplitude, settle_s, settled, sides, Y_of)
 
 
 def _check(scenario: Scenario, external: bool) -> None:
@@ -390,16 +378,22 @@ def _bands(
     return bands
 
 
-def _plan(bands: Sequence[_Band], amplitude: float, settle_s: float, scenario: Scenario) -> _Plan:
-    """Raises UserError if settling or the injection cannot be so large."""
+def _plan(
+    bands: Sequence[_Band], amplitude: float, settle_s: float, scenario: Scenario
+) -> list[_Band]:
+    """The bands one after the other. Raises UserError: settling or the injection cannot be so
+    large."""
     if not (math.isfinite(settle_s) and settle_s >= 0.0):
         raise UserError(f"settle_s = {settle_s}: must be >= 0 s")
     if not (math.isfinite(amplitude) and amplitude > 0.0):
         raise UserError(f"amplitude = {amplitude}: must be > 0")
-    settle = [math.ceil(settle_s / scenario.T_s / band.every) * band.every for band in bands]
-    plan = _Plan(bands, settle, amplitude)
+    plan, start = list[_Band](), 0
+    for band in bands:
+        settle = math.ceil(settle_s / scenario.T_s / band.every) * band.every
+        plan.append(replace(band, start=start, settle=settle))
+        start = plan[-1].measured.stop
     for axis, name in (("d", "V_g"), ("q", "omega_g")):
-        largest = max(np.abs(_sines(plan, k, axis, scenario)).max() for k in range(len(bands)))
+        largest = max(np.abs(_sines(band, amplitude, axis, scenario)).max() for band in plan)
         if largest > _ROOM[name]:
             raise UserError(
                 f"amplitude = {amplitude:g}: would move {name} by {largest:.3g} p.u., allowed is "
@@ -414,39 +408,38 @@ def _below(value: float) -> float:
     return math.floor(value / digit) * digit
 
 
-def _sines(plan: _Plan, k: int, axis: str, scenario: Scenario) -> Vector:
-    """The injection of band k at the lines of its profile: of V_g, or for q of omega_g, p.u.
+def _sines(band: _Band, amplitude: float, axis: str, scenario: Scenario) -> Vector:
+    """The injection of a band at the lines of its profile: of V_g, or for q of omega_g, p.u.
 
     The phases are those of Schroeder, which keep the sum of the tones low (IEEE Trans. Inf. Theory
     16, 1970).
     """
-    band = plan.bands[k]
-    t = np.arange(0, plan.settle[k] + band.window + 1, band.every) * scenario.T_s
+    t = np.arange(0, band.settle + band.window + 1, band.every) * scenario.T_s
     n, out = len(band.hz), np.zeros(len(t))
-    omega_b = _omega_b(scenario)
+    omega_b = float(make_plant(scenario.plant, scenario.T_s).net[0]["omega_b"])
     for j, hz in enumerate(band.hz):
-        size = plan.amplitude * (2 * np.pi * hz / omega_b if axis == "q" else 1.0)
+        size = amplitude * (2 * np.pi * hz / omega_b if axis == "q" else 1.0)
         out += size * np.cos(2 * np.pi * hz * t - np.pi * j * (j + 1) / n)
-    rise = 0.5 * plan.settle[k] * scenario.T_s  # smoothly, which excites slow modes least
+    rise = 0.5 * band.settle * scenario.T_s  # smoothly, which excites slow modes least
     if rise > 0.0:
         out *= np.sin(0.5 * np.pi * np.minimum(t / rise, 1.0)) ** 2
     return out
 
 
-def _omega_b(scenario: Scenario) -> float:
-    return float(make_plant(scenario.plant, scenario.T_s).net[0]["omega_b"])
-
-
 def _inject(
-    scenario: Scenario, plan: _Plan, axis: str, external: tuple[str, ...]
+    scenario: Scenario,
+    plan: Sequence[_Band],
+    amplitude: float,
+    axis: str,
+    external: tuple[str, ...],
 ) -> tuple[_Spectra, dict[str, Any]]:
     """The spectra of a run with the injection along one axis, and its summary. Raises UserError:
     the run did not complete."""
     grid, T_s = scenario.plant.grid, scenario.T_s
-    starts, events = plan.starts(), []
+    events = []
     with tempfile.TemporaryDirectory(prefix="gfmhil-scan-") as place:
-        for k, band in enumerate(plan.bands):
-            wave = _sines(plan, k, axis, scenario)
+        for band in plan:
+            wave = _sines(band, amplitude, axis, scenario)
             t = np.arange(len(wave)) * band.every * T_s
             omega_g = grid.omega_g + (wave if axis == "q" else 0.0 * wave)
             V_g = grid.V_g + (wave if axis == "d" else 0.0 * wave)
@@ -454,23 +447,23 @@ def _inject(
             for first in range(0, len(lines) - 1, _MOST_LINES):
                 part = lines[first : first + _MOST_LINES + 1].copy()
                 part[:, 0] -= part[0, 0]
-                file = Path(place) / f"{axis}-{k}-{first}.csv"
+                tick = band.start + first * band.every
+                file = Path(place) / f"{axis}-{tick}.csv"
                 np.savetxt(file, part, "%.17g", ",", header="t,omega_g,V_g", comments="")
-                tick = starts[k] + first * band.every
                 events.append({"type": "grid-profile", "tick": tick, "file": str(file)})
         kept = {"law", "inner", "T_s", "seed", "references", "plant", "link", "late_policy"}
         content = scenario.model_dump(mode="json", exclude_none=True, include=kept)
         content |= {
             "title": f"{scenario.title}: injection along {axis}",
-            "duration": (starts[-1] + 1) * T_s,  # with the state at the end of the last window
+            "duration": (plan[-1].measured.stop + 1)
+            * T_s,  # with the state at the end of the last window
             "mode": "lockstep",
             "expect_ripple": 1000.0,  # the injection is one
             "events": events,
         }
         made = load_scenario(content, in_process=not external)
         if external:
-            folder = Path(place) / "run"
-            run = run_scenario(made, folder, controller_command=external)
+            run = run_scenario(made, Path(place) / "run", controller_command=external)
         else:
             run = run_in_memory(made)
         if run.status != "completed":
@@ -493,17 +486,16 @@ class _Spectra:
     ends: float  # largest difference between the ends of a window over the largest deviation in it
 
     @classmethod
-    def of(cls, run: Run, plan: _Plan) -> _Spectra:
+    def of(cls, run: Run, plan: Sequence[_Band]) -> _Spectra:
         """Those of a run. Raises UserError: the circuit's states do not follow the commands: a
         limit acts."""
         path = _Path.of(run)
         parts, ends = [], 0.0
-        for first, settle, band in zip(plan.starts(), plan.settle, plan.bands, strict=False):
-            start = first + settle
-            window = slice(start, start + band.window)
+        for band in plan:
+            window = band.measured
             path.check(window)
             parts.append(path.coefficients(window, band.hz))
-            apart = np.abs(path.w[window.stop] - path.w[start])
+            apart = np.abs(path.w[window.stop] - path.w[window.start])
             swing = np.abs(path.w[window] - path.w[window].mean(axis=0)).max(axis=0)
             ends = max(ends, float((apart / swing).max()))
         turn = np.exp(-1j * path.angle(window))
@@ -562,8 +554,10 @@ class _Path:
         modes, sources = plant.wiring.modes(frozenset(), None)
         drive = modes.drive[:, [sources.index(plant.wiring.units[0].bridge),
                                 sources.index(GRID_SOURCE)]]  # fmt: skip
-        rates = modes.rates - 1j * steady
-        return cls(T_s, w, v_g, delta, stretches, rates, modes.states, modes.modes, drive)
+        rates, by_w = modes.rates - 1j * steady, modes.modes[:, :3].copy()
+        if LINE in plant.wiring.order:  # behind a second inductor, with the same current
+            by_w[:, 2] += modes.modes[:, plant.wiring.order.index(LINE)]
+        return cls(T_s, w, v_g, delta, stretches, rates, modes.states[:3], by_w, drive)
 
     def angle(self, window: slice) -> float:
         """Mean angle of the converter's frame, rad."""
@@ -624,14 +618,15 @@ def _through_dac(signals: Any, name: str, par: Any) -> Vector:
 def _found(
     name: str,
     scenario: Scenario,
-    plan: _Plan,
+    hz: Vector,
+    amplitude: float,
     settle_s: float,
     settled: float,
     sides: Sequence[_Spectra],
     Y_of: Callable[[Vector], Response] | None,
 ) -> FrequencyScan:
     """The result of an injection along d and one along q."""
-    hz, (d, q) = plan.hz, sides
+    d, q = sides
     volts, amps = (np.stack([getattr(d, x), getattr(q, x)], axis=-1) for x in ("v", "i_o"))
     par = make_plant(scenario.plant, scenario.T_s).par[0]
     line = float(par["R_g"]), float(par["L_g"])
@@ -646,7 +641,7 @@ def _found(
         nfp_model = answer / _frequency(q.v_g, hz, q.rest[2], omega[0])
     return FrequencyScan(
         name, scenario, hz, -amps @ np.linalg.inv(volts), model, nfp, nfp_model, line, omega,
-        plan.amplitude, settle_s, settled,
+        amplitude, settle_s, settled,
     )  # fmt: skip
 
 

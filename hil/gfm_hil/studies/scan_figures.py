@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.results.figures import COLOURS, dress, headline
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from gfm_hil.studies.scan import FrequencyScan
+from gfm_hil.studies.scan import FrequencyScan
 
 _GREY = "#888888"
 _CELLS = ("dd", "dq", "qd", "qq")
@@ -118,29 +115,22 @@ def save_figures(of: FrequencyScan, folder: Path, grids: Sequence[tuple[float, f
     from matplotlib import pyplot
 
     matplotlib.use("Agg")
-    for name, draw in (("admittance", admittance), ("passivity", passivity), ("nfp", nfp)):
-        draw(of)
-        _keep(folder / f"{name}.png")
+    figures: dict[str, Callable[..., object]] = {
+        "admittance": admittance, "passivity": passivity, "nfp": nfp
+    }  # fmt: skip
     for scr, x_over_r in grids:
-        nyquist_on_grid(of, scr, x_over_r)
-        _keep(folder / f"nyquist_scr_{scr:g}_xr_{x_over_r:g}.png")
-    pyplot.close("all")
-
-
-def _keep(path: Path) -> None:
-    from matplotlib import pyplot
-
-    pyplot.savefig(path, dpi=110)
-    pyplot.close()
+        name = f"nyquist_scr_{scr:g}_xr_{x_over_r:g}"
+        figures[name] = partial(nyquist_on_grid, scr=scr, x_over_r=x_over_r)
+    for name, draw in figures.items():
+        draw(of)
+        pyplot.savefig(folder / f"{name}.png", dpi=110)
+        pyplot.close()
 
 
 def _bode(
-    gain: Axes,
-    phase: Axes,
-    hz: NDArray[np.float64],
-    measured: NDArray[np.complex128],
+    gain: Axes, phase: Axes, hz: NDArray[np.float64], measured: NDArray[np.complex128],
     model: NDArray[np.complex128] | None,
-) -> None:
+) -> None:  # fmt: skip
     """A curve of the model and the measured points over it."""
     if model is not None:
         gain.loglog(hz, np.abs(model), color=COLOURS[1], lw=1.2, label="linear model")

@@ -74,19 +74,10 @@ def run_tasks(
     keep: Callable[[Result], None],
     stopped: Callable[[], bool],
 ) -> None:
-    """Work on all tasks, or until ``stopped``; those under way then are still finished and kept.
-
-    Args:
-        function, tasks: what to do.
-        pool: where; None: here.
-        workers: how many tasks the pool works on at a time.
-        keep: given every result.
-        stopped: asked after each task, or a few times a second.
-
-    Raises:
-        WorkerLost: a worker died, or the function raised an error; the results of all other
-            finished tasks are kept.
-    """
+    """Work on all tasks, here or at so many a time in a pool, until ``stopped``, which is asked
+    after each or a few times a second; those under way then are still finished. ``keep`` gets every
+    result. Raises WorkerLost: a worker died, or the function raised an error; the results of all
+    other finished tasks are kept."""
     waiting = iter(tasks)
     if pool is None:
         for task in waiting:

@@ -11,12 +11,8 @@ from gfm_hil.studies.conformity.result import Conformity
 
 
 def gate(near: Path, new_folder: Callable[[], Path]) -> Callable[..., Conformity]:
-    """``conform`` for tests.
-
-    Args:
-        near: folder that is searched first for files of laws, sets, stages and converters.
-        new_folder: gives a folder for the report of each call.
-    """
+    """``conform`` for tests: the folder ``near`` is searched first for files of laws, sets, stages
+    and converters, and each call writes its report into a new folder."""
 
     def beside(value: Any) -> Any:
         if isinstance(value, list | tuple):
@@ -25,11 +21,8 @@ def gate(near: Path, new_folder: Callable[[], Path]) -> Callable[..., Conformity
         return str(near / value) if there else value
 
     def call(law: Any, against: Any = "all", **more: Any) -> Conformity:
-        """As ``gfmhil.conform``.
-
-        Raises:
-            AssertionError: a clause fails or cannot be judged; one line a part, and the report.
-        """
+        """As ``gfmhil.conform``. Raises AssertionError: a clause fails or cannot be judged; one
+        line a part, and the report."""
         __tracebackhide__ = True
         folder = new_folder()
         given = {name: beside(value) for name, value in more.items()}

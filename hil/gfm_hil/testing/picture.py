@@ -26,16 +26,9 @@ def draw(
     steps: Sequence[tuple[float, str]], finding: Violation | None,
     around: tuple[float, float] | None = None,
 ) -> None:  # fmt: skip
-    """Draw one failure.
-
-    Args:
-        path: of the picture.
-        text: what failed, for the title.
-        signal, signals: the checked one, and all of them.
-        steps: time in s and a short text each.
-        finding: band and worst point, if the check is about a curve.
-        around: time range [s] of the large panel, all by default.
-    """
+    """Draw one failure: its text as title, the checked signal with its band and worst point, if the
+    check is about a curve, steps as times in s with a short text, and four other signals. The large
+    panel shows the time ``around`` [s], all by default."""
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     rows = figure.subplot_mosaic(
         [["main", "main"], ["a", "b"], ["c", "d"]], height_ratios=[2.2, 1, 1]

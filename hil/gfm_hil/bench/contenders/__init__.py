@@ -52,12 +52,8 @@ class Contender:
 
 
 def contenders_of(links: Sequence[str], place: Path) -> tuple[list[Contender], list[str]]:
-    """The contenders, each after its limit, and remarks: without a C compiler there are no limits.
-
-    Args:
-        links: names of links.
-        place: an empty folder in memory with a short path.
-    """
+    """The contenders of links, each after its limit, and remarks: without a C compiler there are no
+    limits. ``place`` is an empty folder in memory with a short path."""
     files = [import_module(f"{__name__}.{name}") for name in FILES]
     every: list[Contender] = [one for file in files for one in file.contenders(links, place)]
     try:

@@ -1,10 +1,8 @@
 """gfmhil design: one module a command, or several that are alike."""
 
-from __future__ import annotations
-
 import argparse
 
-from gfm_hil.cli.design import gamma, loop, margins, tune
+from gfm_hil.cli.design import gains, loop, margins
 from gfm_hil.core.errors import UserError
 
 #: commands of version 0.1 that are scripts of the repository now; the note goes with version 0.3
@@ -12,9 +10,8 @@ _MOVED = {"compare": "law_comparison", "box": "deployable check", "deploy": "dep
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add the sub-commands."""
     kinds = command.add_subparsers(dest="design", required=True, metavar="WHAT")
-    for module in (gamma, margins, loop, tune):
+    for module in (gains, margins, loop):
         module.add(kinds)
     for name in _MOVED:
         moved = kinds.add_parser(name, add_help=False, prefix_chars="\0")  # any option is a word

@@ -1,7 +1,5 @@
 """gfmhil design bode, nyquist, poles, step: a law's linear loop as a table and a figure."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable
@@ -15,7 +13,7 @@ from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
 from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
-from gfm_hil.cli.design.margin_report import channel_as_json, loops_table, no_margins
+from gfm_hil.cli.design.margins import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
@@ -29,7 +27,6 @@ _LEAST = 0.01  # of a participation that the table shows
 
 
 def add(kinds: Any) -> None:
-    """Add the four commands to the parser."""
     for name, text, find, draw in (
         ("bode", "gain and phase of L, one loop cut, and its margins", _margins, _draw_at(bode)),
         (

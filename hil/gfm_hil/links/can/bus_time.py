@@ -1,8 +1,8 @@
 """Longest times on the bus: of a frame, and of y and u, which must fit the period every × T_s.
 
 They hold for every identifier (11 bits) and content, with stuff bits and the interframe space
-(ISO 11898-1), and they are exact: ``tests/hil/test_can_time.py`` finds the same by enumeration. A
-recessive ESI, which an error-passive node sends, makes no frame longer.
+(ISO 11898-1), and they are exact: ``tests/hil/links/test_can_time.py`` finds the same by
+enumeration. A recessive ESI, which an error-passive node sends, makes no frame longer.
 
 Both vectors share one bus, so that an exchange takes the sum of their frames. On a bus that is
 almost full, an additional frame (a state that changed, see ``vectors``) makes one exchange late.

@@ -9,20 +9,28 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.ports.modbus.connection import CLIENT
-from gfm_hil.ports.modbus.curves import Droop, VoltVar
-from gfm_hil.ports.modbus.droops import LawDroops
+from gfm_hil.core.identity import Identity
+from gfm_hil.core.rate import Rate
 from gfm_hil.ports.modbus.image import VENDOR, Image, SunSpecPoint, Value
-from gfm_hil.ports.modbus.measures import Measures
-from gfm_hil.ports.modbus.operation import Direct, Heartbeat, Operation
-from gfm_hil.ports.modbus.run_state import RunState, Slack
-from gfm_hil.ports.modbus.setpoints import SetPoint
-from gfm_hil.ports.modbus.writes import Effect, PointGroup
+from gfm_hil.ports.modbus.measures import Measures, RunState, Slack
+from gfm_hil.ports.modbus.points import (
+    Direct,
+    Droop,
+    Effect,
+    Heartbeat,
+    LawDroops,
+    Operation,
+    PointGroup,
+    SetPoint,
+    VoltVar,
+)
 from gfm_hil.ports.port import Refusal
 from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
@@ -30,10 +38,22 @@ from gfm_plant import load_converter
 #: carries out a command, or raises UserError
 Command = Callable[[dict[str, Any]], object]
 
-_READ, _WRITE_ONE, _WRITE_MANY = 3, 6, 16
+READ, WRITE_ONE, WRITE_MANY = 3, 6, 16  # function codes
 
 TICK_S = 0.01
 """Of the device's clock: timers and heartbeats expire on its ticks."""
+
+
+@dataclass(frozen=True)
+class Client:
+    """The identity of a client and its rate limit for commands."""
+
+    identity: Identity
+    rate: Rate
+
+
+CLIENT: ContextVar[Client | None] = ContextVar("client", default=None)
+"""The client whose request is being carried out; None if a timer caused the command."""
 
 
 class Device:
@@ -46,6 +66,9 @@ class Device:
         command: sends a command to the run; called in a separate thread.
         heartbeat_ms: timeout of a client's heartbeat, 0: none.
         elapsed_s: time since the device was started, s.
+
+    Attributes:
+        local: the bench commands; clients are refused.
     """
 
     def __init__(
@@ -58,28 +81,21 @@ class Device:
         elapsed_s: Callable[[], float],
     ) -> None:
         self._look, self._command, self._elapsed_s = look, command, elapsed_s
-        self._gains = LawDroops(laws)
-        self._measures = Measures(scenario)
+        gains, self._measures = LawDroops(laws), Measures(scenario)
         rating = load_converter(scenario.plant.converter).bases.S_n
         self._set_points = (
             SetPoint("WSet", "P_ref", rating, absolute=1, percent=(0,)),
             SetPoint("VarSet", "Q_ref", rating, absolute=4, percent=(0, 1, 3)),
         )
         self._heart = Heartbeat(heartbeat_ms)
-        self._functions: tuple[PointGroup, ...] = (
-            *self._set_points,
-            VoltVar(self._gains),
-            Droop(self._gains),
-            self._heart,
-            Operation(),
-            Direct(laws, self._gains),
+        self._groups: tuple[PointGroup, ...] = (
+            *self._set_points, VoltVar(gains), Droop(gains), self._heart, Operation(),
+            Direct(laws, gains),
         )  # fmt: skip
-        self._owner = {path: f for f in self._functions for path in f.writable}
+        self._owner = {path: group for group in self._groups for path in group.writable}
         self.image = Image(self._measures.models(laws))
-        for path, value in self._measures.plate(laws).items():
-            self.image.set(path, value)
+        self._show(self._measures.plate(laws))
         self._lock = asyncio.Lock()
-        self._run: RunState | None = None
         self._was_safe = False
         self._beats, self._seen, self._second = 0, -1, 0
         self._fresh = -1  # the device's tick at the last refresh
@@ -93,25 +109,25 @@ class Device:
 
     def refresh(self) -> None:
         """Update every register to the newest tick."""
-        run = self._look()
-        now = self._elapsed_s()
+        run, now = self._look(), self._elapsed_s()
         self._fresh = int(now / TICK_S)
         if run is None:
             return
         if self._was_safe and not run.safe:  # the run was reset
             self._forget()
-        self._run, self._was_safe = run, run.safe
+        self._was_safe = run.safe
         values = self._measures.now(run, self.slack, self._beats, self._heart.missing, self.local)
-        for function in self._functions:
-            values.update(function.show(run, now))
+        for group in self._groups:
+            values |= group.show(run, now)
+        self._show(values)
+
+    def _show(self, values: dict[str, Value]) -> None:
         for path, value in values.items():
             self.image.set(path, value)
 
     def take(self, local: bool) -> None:
-        """Set who commands: the bench (``local``; clients are then refused) or the clients.
-
-        The clients' commands stay in force, and no timer reverts them any more.
-        """
+        """Set who commands: the bench (``local``) or the clients, whose commands then stay in
+        force and are reverted by no timer."""
         if local and not self.local:
             self._forget()
         self.local = local
@@ -121,7 +137,9 @@ class Device:
         now = self._elapsed_s()
         if int(now) != self._second:
             self._second = int(now)
-            self._count_beat()
+            run = self._look()
+            if run is not None and run.tick != self._seen:  # the device of a stalled run is dead
+                self._beats, self._seen = self._beats + 1, run.tick
         if self._heart.expire(now):
             for set_point in self._set_points:
                 set_point.end(now)
@@ -131,7 +149,7 @@ class Device:
                 if run is None or not set_point.expire(now):  # a client has just written it
                     continue
                 try:
-                    await self._carry_out([set_point.revert(run, now)], run)
+                    await self._carry_out([set_point.revert(run, now)])
                 except UserError as problem:  # retried at the next tick
                     self.image.set(f"{VENDOR}.Refd", str(problem))
                 else:
@@ -144,7 +162,7 @@ class Device:
 
         Raises nothing: a refused request changes nothing; the vendor model shows the reason.
         """
-        if code not in (_READ, _WRITE_ONE, _WRITE_MANY):
+        if code not in (READ, WRITE_ONE, WRITE_MANY):
             return ExcCodes.ILLEGAL_FUNCTION
         if written is None:
             if int(self._elapsed_s() / TICK_S) != self._fresh:
@@ -173,7 +191,7 @@ class Device:
             plans = self._plans(cut, run)
             _count(plans)
             try:
-                await self._carry_out(plans, run)
+                await self._carry_out(plans)
             except UserError as problem:
                 raise Refusal(ExcCodes.DEVICE_FAILURE, str(problem)) from None
         self.refresh()
@@ -181,26 +199,22 @@ class Device:
     def _plans(
         self, cut: Sequence[tuple[SunSpecPoint, Sequence[int]]], run: RunState
     ) -> list[Effect]:
-        by_function: dict[int, tuple[PointGroup, dict[str, Value]]] = {}
+        by_group: dict[PointGroup, dict[str, Value]] = {}
         try:
             for point, part in cut:
                 value = point.decode(part)
                 if value is None:
                     raise ValueError(f"{point.path}: no value")
                 point.check(value)
-                function = self._owner[point.path]
-                by_function.setdefault(id(function), (function, {}))[1][point.path] = value
+                by_group.setdefault(self._owner[point.path], {})[point.path] = value
             now = self._elapsed_s()
-            return [f.plan(values, run, now) for f, values in by_function.values()]
+            return [group.plan(values, run, now) for group, values in by_group.items()]
         except ValueError as problem:
             raise Refusal(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
 
-    async def _carry_out(self, plans: Sequence[Effect], run: RunState) -> None:
-        """Send the run every command, then store the new state.
-
-        Raises:
-            UserError: the run refused one.
-        """
+    async def _carry_out(self, plans: Sequence[Effect]) -> None:
+        """Send the run every command, then store the new state; raises UserError if the run
+        refused one."""
         try:
             for plan in plans:
                 for event in plan.events:
@@ -215,14 +229,8 @@ class Device:
             plan.keep()
 
     def _forget(self) -> None:
-        for function in self._functions:
-            function.forget()
-
-    def _count_beat(self) -> None:
-        """Count DERHb only while the run advances: a device of a stalled run must look dead."""
-        run = self._look()
-        if run is not None and run.tick != self._seen:
-            self._beats, self._seen = self._beats + 1, run.tick
+        for group in self._groups:
+            group.forget()
 
 
 def _count(plans: Sequence[Effect]) -> None:

@@ -94,10 +94,7 @@ class SunSpecPoint:
         return 0, 2**bits - 2
 
     def check(self, value: Value) -> None:
-        """Raise ValueError for a value that its definition does not list.
-
-        It checks only enumerations; any other point may have any number.
-        """
+        """Raise ValueError for a value that the definition of an enumeration does not list."""
         symbols = self.definition.get("symbols")
         if symbols and self.type.startswith("enum"):
             allowed = {s["value"]: s["name"] for s in symbols}
@@ -132,25 +129,21 @@ class Image:
         self.registers += [0xFFFF, 0]
         self._by_address = {p.address: p for p in self.points.values()}
 
-    @property
-    def end(self) -> int:
-        """The first address after the image."""
-        return BASE + len(self.registers)
-
     def set(self, path: str, value: Value) -> None:
         """Write a value to a point's registers."""
         if self._set.get(path, self) == value:  # most values do not change between refreshes
             return
         self._set[path] = value
         point = self.points[path]
-        first = point.address - BASE
-        self.registers[first : first + point.length] = point.encode(value)
+        self.registers[self._place(point)] = point.encode(value)
 
     def get(self, path: str) -> Value:
         """The value that a point's registers hold."""
         point = self.points[path]
-        first = point.address - BASE
-        return point.decode(self.registers[first : first + point.length])
+        return point.decode(self.registers[self._place(point)])
+
+    def _place(self, point: SunSpecPoint) -> slice:
+        return slice(point.address - BASE, point.address - BASE + point.length)
 
     def cut(
         self, address: int, registers: Sequence[int]
@@ -193,7 +186,4 @@ def _walk(group: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _exponent(point: Any, model: Any) -> int:
-    if point.sf is None:
-        return int(point.sf_value or 0)
-    value = model.points[point.sf].value
-    return int(value or 0)
+    return int((point.sf_value if point.sf is None else model.points[point.sf].value) or 0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,9 +49,7 @@ class ScopeChannel:
 
     def about(self) -> dict[str, Any]:
         """The channel as plain data for the page."""
-        content = asdict(self)
-        del content["needs"], content["of"]
-        return content
+        return {key: value for key, value in vars(self).items() if key not in ("needs", "of")}
 
     def read(self, columns: Columns, first: int, last: int) -> NDArray[np.float32]:
         """Values of ticks first … last-1; all NaN if the recording lacks a column."""
@@ -61,12 +59,7 @@ class ScopeChannel:
 
 
 def make_channels(T_s: float, f_b: float) -> tuple[ScopeChannel, ...]:
-    """All channels of a recording.
-
-    Args:
-        T_s: sampling time, s.
-        f_b: base frequency, Hz.
-    """
+    """All channels of a recording with a sampling time T_s, s, and a base frequency, Hz."""
     return (
         *(_column(n, "y", f"y_{n}", f_b) for n in names("y")),
         *(_column(f"u_{n}", "u", f"u_{n}", f_b) for n in names("u")),

@@ -45,9 +45,9 @@ class ScopePort(OperatorPort):
         super().check(options)
 
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
-        from gfm_hil.ports.scope.access import Access
         from gfm_hil.ports.scope.recording import open_recording
         from gfm_hil.ports.scope.server import Scope
+        from gfm_hil.ports.scope.session import Access
 
         run.wait(commands=False)
         access = Access(

@@ -8,9 +8,9 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.announcement import announced, present
+from gfm_hil.ports.port import recorded
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.live import LiveRun
-from gfm_hil.recording.live import begun as recording
 from gfm_hil.recording.log import read_events, read_summary
 from gfm_hil.recording.run import Run, nominal_frequency, read_scenario
 from gfm_hil.scenario import Scenario
@@ -26,7 +26,6 @@ class Recording:
     """Rows of a run as columns by name, and what is known about the run.
 
     Attributes:
-        folder: of the run.
         scenario: the resolved one; a run can be shown without its law files.
         columns: all rows recorded so far.
         laws: the laws by the indices in column ``law``, see ``_law``.
@@ -91,22 +90,11 @@ class Recording:
         """
         try:
             content = read_summary(self.folder, self.capacity)
-        except FileNotFoundError:
-            return self._gone()
+        except FileNotFoundError:  # without one it is over once its command servers have gone
+            there = bool(present(self.folder))
+            self._met |= there
+            return {"status": "over", "reason": ""} if self._met and not there else None
         return {key: str(content[key]) for key in ("status", "reason")}
-
-    def _gone(self) -> dict[str, str] | None:
-        """The end of a run without a summary: its command servers were seen and exist no more."""
-        there = bool(present(self.folder))
-        self._met |= there
-        if self._met and not there:
-            return {"status": "over", "reason": ""}
-        return None
-
-
-def begun(folder: Path) -> bool:
-    """Whether there is a recording: of a run that has begun to record, or of a finished one."""
-    return (folder / "signals.npz").is_file() or recording(folder)
 
 
 def open_recording(folder: Path) -> Recording:
@@ -122,7 +110,7 @@ def open_recording(folder: Path) -> Recording:
         record = Recording(folder, scenario, run.recorded, laws, live=False)
         record._done = record.capacity = run.ticks
         return record
-    if not begun(folder):
+    if not recorded(folder):
         raise UserError(f"{folder}: nothing has been recorded there")
     return Recording(folder, scenario, laws=_laws(scenario))
 

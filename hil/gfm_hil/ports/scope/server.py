@@ -10,6 +10,7 @@ import os
 import socket
 import ssl
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,10 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.scope.access import HEADERS, Access
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
-from gfm_hil.ports.scope.session import SEND_S, Session, in_words
+from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session, in_words
 from gfm_hil.scenario import INPROC
 from gfm_runtime import law_titles
 from gfm_runtime.signals import group
@@ -72,8 +72,7 @@ class Scope:
 
     def __init__(self, record: Recording, access: Access) -> None:
         self.record, self.access = record, access
-        channels = make_channels(record.T_s, record.f_b)
-        self._pyramid = Pyramid(record, channels)
+        self._pyramid = Pyramid(record, make_channels(record.T_s, record.f_b))
         self._sessions: set[Session] = set()
         self._events = record.events()
         self._ended = record.ended()
@@ -88,32 +87,30 @@ class Scope:
         encryption: ssl.SSLContext | None,
         ready: Callable[[int], None],
     ) -> None:
-        """Serve until cancelled.
-
-        Args:
-            host: address to listen at.
-            ports: ports to try, in this order; 0 is any free port.
-            encryption: TLS context for https; None: plain http.
-            ready: called with the port.
+        """Serve until cancelled, by https if there is a TLS context, at the first of the ports that
+        can be bound (0: any free one); ``ready`` is called with it.
 
         Raises:
             UserError: none of the ports can be bound.
         """
         with _listen(host, ports) as listener:
 
-            async def page(connection: ServerConnection) -> None:
-                await self._page(connection, listener)
+            async def reap() -> None:
+                while True:
+                    listener.reap()
+                    await asyncio.sleep(_LOG_S)
 
             async with serve(
-                page, sock=listener, ssl=encryption, process_request=self._answer,
-                compression=None, max_size=_LARGEST, max_queue=8, server_header=None, logger=_LOG,
-                ping_interval=_PING_S, ping_timeout=_PING_S, close_timeout=SEND_S,
+                partial(self._page, listener), sock=listener, ssl=encryption,
+                process_request=self._answer, compression=None, max_size=_LARGEST, max_queue=8,
+                server_header=None, logger=_LOG, ping_interval=_PING_S, ping_timeout=_PING_S,
+                close_timeout=SEND_S,
             ):  # fmt: skip
                 ready(listener.port)
                 await asyncio.gather(
                     supervised("the scope's pictures", self._frames),
                     supervised("the scope's look at events", self._follow_log),
-                    supervised("the scope's connections", lambda: _reap(listener)),
+                    supervised("the scope's connections", reap),
                 )
 
     async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -143,7 +140,7 @@ class Scope:
             return ""
         return f"{_PAGES} pages {'control' if control else 'look'} already"
 
-    async def _page(self, connection: ServerConnection, listener: Listener) -> None:
+    async def _page(self, listener: Listener, connection: ServerConnection) -> None:
         """Serve one page's connection to its end. A page that announces that it will control
         takes no place of the pages that look: until its token is accepted it counts as waiting,
         and the listener drops the oldest waiting connection."""
@@ -194,11 +191,8 @@ class Scope:
             await asyncio.sleep(_LOG_S)
 
     def _happened(self) -> dict[str, Any]:
-        return {
-            "events": self._events[-_EVENTS:],
-            "summary": self._ended,
-            "labels": self.record.laws,
-        }
+        events = self._events[-_EVENTS:]
+        return {"events": events, "summary": self._ended, "labels": self.record.laws}
 
     def _about(self) -> dict[str, Any]:
         """The run's data that a page needs; no file names, only the scenario's title."""
@@ -243,12 +237,6 @@ def _listen(host: str, ports: list[int]) -> Listener:
         except OSError as problem:
             reason = os.strerror(problem.errno) if problem.errno else str(problem)
     raise UserError(f"--host {host} --port {ports[0]}: {reason}")
-
-
-async def _reap(listener: Listener) -> None:
-    while True:
-        listener.reap()
-        await asyncio.sleep(_LOG_S)
 
 
 def _response(status: http.HTTPStatus, kind: str, content: str | bytes) -> Response:

@@ -3,6 +3,6 @@
 A separate process reads the files to which the loop appends, and does not disturb the loop.
 """
 
-from gfm_hil.ports.streams.blocks import BlockReader, TickBlock
+from gfm_hil.ports.streams.messages import BlockReader, TickBlock
 
 __all__ = ["BlockReader", "TickBlock"]

@@ -5,11 +5,152 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import zmq
 
 from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.supervised import attempt
+from gfm_hil.engine.announcement import not_running
 from gfm_hil.ports.port import INTERRUPTED, BesideRun, OperatorPort, check_number, say
-from gfm_hil.ports.streams.follow import Follower
-from gfm_hil.ports.streams.publish import Publisher
+from gfm_hil.ports.streams.messages import ROOM, NewRows, Sampler, block_messages
+from gfm_hil.recording.live import LiveRun, begun
+from gfm_hil.recording.timing import ROUND_TRIP, SLACK, count_misses
+
+_LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
+_LOOK_S = 0.02
+_LINGER_MS = 500  # to send the last messages
+_LONGEST = 256  # bytes of a subscription; ours have 17
+_WAITING = 100  # queued subscription messages per subscriber
+
+#: of Prometheus: label, if any, and meaning of each metric
+METRICS = {
+    "gfmhil_ticks_total": ("role", "ticks recorded"),
+    "gfmhil_misses_total": ("", "ticks without a fresh u at the plant"),
+    "gfmhil_slack_seconds": ("quantile", f"{SLACK.meaning}; in real time"),
+    "gfmhil_round_trip_seconds": ("quantile", ROUND_TRIP.meaning),
+    "gfmhil_state": ("state", "1 for the state of the controller, 0 for others"),
+    "gfmhil_law_info": ("law", "the law in force"),
+    "gfmhil_reason_info": ("reason", "why the controller is in SAFE"),
+    "gfmhil_trip_info": ("trip", "what has tripped"),
+}
+
+
+class Follower:
+    """Reads what a run records from now on.
+
+    Attributes:
+        run: all that it has recorded.
+        over: nothing will be recorded any more.
+
+    Raises:
+        UserError: it is not a run folder, or the run is over.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if (folder / "summary.json").is_file():
+            raise UserError(f"{folder}: the run is over, see gfmhil export")
+        if not begun(folder):
+            raise UserError(f"{not_running(folder)}; --wait waits for one")
+        self.folder, self.run = folder, LiveRun(folder)
+        self.T_s = self.run.T_s
+        self._next = {role: self.run.done(role) for role in ROLES}
+        self.over = False
+
+    def news(self) -> list[NewRows]:
+        """Rows recorded since the last call that returned; afterwards ``over`` says whether these
+        were the last.
+
+        Raises:
+            OSError: the recording cannot be read now; the next call returns its rows.
+        """
+        over = not (self.folder / "parts").is_dir()  # the parts were merged and removed
+        found = []
+        for role, part in self.run.parts.items():
+            first, done = self._next[role], self.run.done(role) - (0 if over else _LAST)
+            if done > first:
+                found.append(NewRows(role, first, part.signals[first:done], part.times[first:done]))
+        self.over = over
+        self._next |= {rows.role: rows.first + len(rows.signals) for rows in found}
+        return found
+
+    def misses_before(self) -> int:
+        """Number of misses before the rows that the next call of ``news`` returns."""
+        return count_misses(self.run.columns, self._next["plant"])
+
+
+class Publisher:
+    """Both sockets, bound; use as a context manager.
+
+    Args:
+        host: address to listen at.
+        samples, blocks: ports, 0: a free one.
+
+    Attributes:
+        samples, blocks: the endpoints.
+
+    Raises:
+        UserError: a port cannot be bound.
+    """
+
+    def __init__(self, host: str, samples: int, blocks: int) -> None:
+        self._context = zmq.Context()
+        try:
+            self._samples = _bind(self._context, host, samples, "--port")
+            self._blocks = _bind(self._context, host, blocks, "--blocks")
+        except UserError:
+            self._context.destroy(linger=0)
+            raise
+        self.samples, self.blocks = (
+            socket.get_string(zmq.LAST_ENDPOINT) for socket in (self._samples, self._blocks)
+        )
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.destroy(linger=_LINGER_MS)
+
+    def follow(self, follower: Follower, rate: float, stopped: Callable[[], bool]) -> int:
+        """Send a run's rows, and ``rate`` samples per second, until it ends or ``stopped()``;
+        returns how many ticks of the plant (without a plant: of the controller) were sent."""
+        sampler = Sampler(follower.T_s, rate, follower.misses_before())
+        count: dict[Role, int] = dict.fromkeys(ROLES, 0)
+        looked = time.monotonic()
+
+        def look() -> None:
+            nonlocal looked
+            before, looked = looked, time.monotonic()
+            for rows in follower.news():
+                count[rows.role] += len(rows.signals)
+                for message in sampler.messages(rows, looked - before):
+                    self._samples.send_multipart(message)
+                for message in block_messages(rows):
+                    self._blocks.send_multipart(message)
+
+        while not follower.over and not stopped():
+            time.sleep(_LOOK_S)
+            attempt("the stream's look at the run", look)
+        return count["plant"] or count["controller"]
+
+
+def _bind(
+    context: zmq.Context[zmq.Socket[bytes]], host: str, port: int, option: str
+) -> zmq.Socket[bytes]:
+    socket = context.socket(zmq.PUB)
+    socket.set(zmq.MAXMSGSIZE, _LONGEST)
+    socket.set(zmq.RCVHWM, _WAITING)
+    socket.set(zmq.SNDHWM, ROOM)
+    where = f"tcp://{f'[{host}]' if ':' in host else host}:{port or '*'}"
+    try:
+        socket.set(zmq.IPV6, int(":" in host))
+        socket.bind(where)
+    except zmq.ZMQError as problem:
+        raise UserError(f"{option} {port}: {where}: {zmq.strerror(problem.errno or 0)}") from None
+    return socket
 
 
 class StreamPort(OperatorPort):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from socketserver import BaseServer, ThreadingMixIn
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
@@ -17,17 +17,15 @@ from prometheus_client.registry import Collector
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.streams.follow import Follower
-from gfm_hil.ports.streams.metrics import METRICS
-from gfm_hil.recording.timing import ROUND_TRIP, SLACK, DurationHistogram
+from gfm_hil.ports.streams.port import METRICS, Follower
+from gfm_hil.recording.live import LiveRun
+from gfm_hil.recording.timing import ROUND_TRIP, SLACK
 from gfm_runtime.states import STATES
 
 _FRESH_S = 0.2  # for so long all scrapes get the same metrics
 _HALF_OPEN, _HALF_OPEN_S = 64, 5.0  # connections that have not asked yet, and how long they may
 _QUEUE = 128  # connections that the kernel keeps until they are accepted
 _WINDOW_S = 10.0  # window of the quantiles, in the run's time
-_SLACK = (0.0, 0.001, 0.01, 0.5)  # low slack is bad
-_ROUND_TRIP = (0.5, 0.99, 0.999, 1.0)  # long round trips are bad
 
 
 class RunCollector(Collector):
@@ -54,43 +52,9 @@ class RunCollector(Collector):
         with self._lock:
             if self.follower is not None and time.monotonic() > self._until:
                 of = self.follower
-                self._found = [*self._counts(of), *self._times(of), *self._words(of)]
+                self._found = [*_counts(of.run), *_times(of.run), *_words(self._seen(of))]
                 self._until = time.monotonic() + _FRESH_S
             yield from self._found
-
-    def _counts(self, follower: Follower) -> Iterator[Metric]:
-        ticks, misses = _metric("gfmhil_ticks_total"), _metric("gfmhil_misses_total")
-        for role in follower.run.parts:
-            ticks.add_metric([role], float(follower.run.done(role)))
-            if role == "plant":
-                misses.add_metric([], float(follower.run.misses))
-        yield ticks
-        yield misses
-
-    def _times(self, follower: Follower) -> Iterator[Metric]:
-        """Quantiles of slack and round trip over the newest ticks; in lockstep no slack."""
-        run, T_s = follower.run, follower.T_s
-        if "plant" not in run.parts:
-            return
-        done = run.done("plant")
-        window = max(0, done - round(_WINDOW_S / T_s)), done
-        slack = SLACK.spread(run.columns, T_s, *window)
-        trips = ROUND_TRIP.spread(run.columns, T_s, *window)
-        yield _quantiles("gfmhil_slack_seconds", slack, _SLACK)
-        yield _quantiles("gfmhil_round_trip_seconds", trips, _ROUND_TRIP)
-
-    def _words(self, follower: Follower) -> Iterator[Metric]:
-        seen = self._seen(follower)
-        if "state" in seen:
-            state = _metric("gfmhil_state")
-            for name in STATES:
-                state.add_metric([name], float(name == seen["state"]))
-            yield state
-        for label, key in (("law", "law_title"), ("reason", "reason"), ("trip", "trip")):
-            if key in seen:
-                metric = _metric(f"gfmhil_{label}_info")
-                metric.add_metric([str(seen[key])], 1.0)
-                yield metric
 
     def _seen(self, follower: Follower) -> dict[str, Any]:
         """The newest tick in words; laws by index if no command server gives their names."""
@@ -105,17 +69,42 @@ class RunCollector(Collector):
         return seen
 
 
-def _metric(name: str) -> CounterMetricFamily | GaugeMetricFamily:
-    about = METRICS[name]
+def _metric(name: str, values: Iterable[tuple[str, float]]) -> Metric:
+    """A metric with its values by what its label says."""
+    label, text = METRICS[name]
     kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
-    return kind(name, about.text, labels=[about.label] if about.label else [])
-
-
-def _quantiles(name: str, found: DurationHistogram, quantiles: tuple[float, ...]) -> Metric:
-    metric = _metric(name)
-    for q in quantiles if found else ():
-        metric.add_metric([f"{q:g}"], found.percentile(100 * q) * 1e-9)
+    metric = kind(name, text, labels=[label] if label else [])
+    for what, value in values:
+        metric.add_metric([what] if label else [], float(value))
     return metric
+
+
+def _counts(run: LiveRun) -> Iterator[Metric]:
+    yield _metric("gfmhil_ticks_total", [(role, run.done(role)) for role in run.parts])
+    yield _metric("gfmhil_misses_total", [("", run.misses)] if "plant" in run.parts else [])
+
+
+def _times(run: LiveRun) -> Iterator[Metric]:
+    """Quantiles of slack and round trip over the newest ticks; in lockstep no slack."""
+    if "plant" not in run.parts:
+        return
+    done = run.done("plant")
+    window = max(0, done - round(_WINDOW_S / run.T_s)), done
+    for name, duration, quantiles in (
+        ("gfmhil_slack_seconds", SLACK, (0.0, 0.001, 0.01, 0.5)),  # low slack is bad
+        ("gfmhil_round_trip_seconds", ROUND_TRIP, (0.5, 0.99, 0.999, 1.0)),  # long ones are bad
+    ):
+        found = duration.spread(run.columns, run.T_s, *window)
+        values = [(f"{q:g}", found.percentile(100 * q) * 1e-9) for q in quantiles if found]
+        yield _metric(name, values)
+
+
+def _words(seen: dict[str, Any]) -> Iterator[Metric]:
+    if "state" in seen:
+        yield _metric("gfmhil_state", [(name, name == seen["state"]) for name in STATES])
+    for label, key in (("law", "law_title"), ("reason", "reason"), ("trip", "trip")):
+        if key in seen:
+            yield _metric(f"gfmhil_{label}_info", [(str(seen[key]), 1.0)])
 
 
 class _Request(WSGIRequestHandler):

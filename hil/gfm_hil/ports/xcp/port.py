@@ -1,19 +1,25 @@
-"""A run as the memory of an XCP slave, as a port."""
+"""A run as the memory of an XCP slave: a port on UDP or a CAN FD bus (ASAM MCD-1 XCP, part 3)."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import select
 import socket
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+import can
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
+from gfm_hil.core.identity import address
 from gfm_hil.ports.port import BesideRun, OperatorPort, say
 from gfm_hil.ports.xcp.memory import Memory
-from gfm_hil.ports.xcp.slave import Slave
-from gfm_hil.ports.xcp.transports import CanFd, Transport, Udp, packed
-from gfm_hil.recording.live import LiveRun
+from gfm_hil.ports.xcp.slave import MOST, Slave
 
 _ANSWER_S = 0.1
 _TIMEOUT_MS = 7000  # T1: a command to the run may take six seconds
@@ -21,6 +27,175 @@ _COMMANDS = (
     "GET_COMM_MODE_INFO", "GET_ID", "SET_MTA", "UPLOAD", "SHORT_UPLOAD", "DOWNLOAD",
     "SHORT_DOWNLOAD",
 )  # fmt: skip
+CAN_IDS = "0x7f0,0x7f1"
+"""Of the master's frames and of the slave's: the lowest priorities, so that a loop's frames on the
+same bus go first."""
+MOST_CAN = 64
+"""Bytes of a frame, and so of a packet; 8 would not hold a command with a number."""
+_LARGEST = 2048  # bytes of a datagram
+_HIGHEST_ID = 0x7FF
+
+
+class Transport(ABC):
+    """Where a slave listens, once it is entered as a context.
+
+    Attributes:
+        most: bytes of a packet.
+    """
+
+    most: int
+
+    @abstractmethod
+    def __enter__(self) -> Self:
+        """Listen; raises UserError if it cannot be opened."""
+
+    @abstractmethod
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+
+    @abstractmethod
+    def words(self) -> str:
+        """What it is, for people."""
+
+    @abstractmethod
+    def if_data(self) -> list[str]:
+        """The lines of the A2L file that tell a tool where to find it."""
+
+    @abstractmethod
+    def answer(self, slave: Slave, seconds: float) -> None:
+        """Let the slave answer what comes in that time; raises UserError if the bus is gone."""
+
+
+class Udp(Transport):
+    """A UDP port at a host; port 0 is any."""
+
+    most = MOST
+
+    def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+
+    def __enter__(self) -> Self:
+        try:
+            found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(*found[:3])
+            self._socket.bind(found[4])
+        except OSError as problem:
+            where = f"--host {self._host} --port {self._port}"
+            raise UserError(f"{where}: {problem.strerror}") from None
+        self._port = self._socket.getsockname()[1]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def words(self) -> str:
+        return f"UDP {address(self._socket.getsockname())}"
+
+    def if_data(self) -> list[str]:
+        return [
+            "  /begin XCP_ON_UDP_IP",
+            f'    0x0100 {self._port} ADDRESS "{self._host}"',
+            "  /end XCP_ON_UDP_IP",
+        ]
+
+    def answer(self, slave: Slave, seconds: float) -> None:
+        line, until = self._socket, time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0 and select.select([line], [], [], left)[0]:
+            datagram, peer = line.recvfrom(_LARGEST)
+            said = slave.take(datagram, peer)
+            if said:
+                with contextlib.suppress(OSError):  # the master is gone
+                    line.sendto(said, peer)
+
+
+class CanFd(Transport):
+    """A CAN FD bus of python-can: a frame is a packet, with zeros behind it up to the next length
+    that a frame can have.
+
+    Args:
+        interface, channel: of python-can.
+        ids: of the master's frames and of the slave's, 11 bits, as ``0x7f0,0x7f1``.
+
+    Raises:
+        UserError: identifiers that cannot be.
+    """
+
+    most = MOST_CAN
+
+    def __init__(self, interface: str, channel: str, ids: str = CAN_IDS) -> None:
+        try:
+            found = [int(part, 0) for part in ids.split(",")]
+        except ValueError:
+            raise UserError(f"--ids {ids}: must be two numbers, as 0x7f0,0x7f1") from None
+        if len(found) != 2 or len({*found}) != 2 or not all(0 <= i <= _HIGHEST_ID for i in found):
+            told = ",".join(f"{i:#x}" for i in found)
+            raise UserError(f"--ids {told}: must be two different ones of 0 to {_HIGHEST_ID:#x}")
+        self._interface, self._channel = interface, channel
+        self._theirs, self._mine = found
+
+    def __enter__(self) -> Self:
+        only = [{"can_id": self._theirs, "can_mask": _HIGHEST_ID, "extended": False}]
+        try:
+            self._bus = can.Bus(
+                interface=self._interface, channel=self._channel, fd=True, can_filters=only
+            )
+        except (can.CanError, OSError, ValueError, ImportError, TypeError) as problem:
+            where = f"--can {self._channel} --interface {self._interface}"
+            raise UserError(f"{where}: cannot be opened: {problem}") from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bus.shutdown()
+
+    def words(self) -> str:
+        return f"CAN FD {self._channel}, {self._theirs:#x} and {self._mine:#x}"
+
+    def if_data(self) -> list[str]:
+        return [
+            "  /begin XCP_ON_CAN",
+            "    0x0100",
+            f"    CAN_ID_MASTER {self._theirs:#x}",
+            f"    CAN_ID_SLAVE {self._mine:#x}",
+            "    BAUDRATE 1000000",
+            "    /begin CAN_FD",
+            f"      MAX_DLC {MOST_CAN}",
+            "      CAN_FD_DATA_TRANSFER_BAUDRATE 8000000",
+            "    /end CAN_FD",
+            "  /end XCP_ON_CAN",
+        ]
+
+    def answer(self, slave: Slave, seconds: float) -> None:
+        bus, until = self._bus, time.monotonic() + seconds
+        try:
+            while (left := until - time.monotonic()) > 0 and (heard := bus.recv(left)) is not None:
+                if heard.arbitration_id != self._theirs or heard.is_error_frame:
+                    continue
+                said = slave.packet(bytes(heard.data), (self._channel, self._theirs))
+                if said:
+                    bus.send(self._frame(said))
+        except (can.CanError, OSError) as problem:
+            raise UserError(f"--can {self._channel}: the bus is gone: {problem}") from None
+
+    def _frame(self, packet: bytes) -> can.Message:
+        size = can.util.dlc2len(can.util.len2dlc(len(packet)))
+        return can.Message(
+            arbitration_id=self._mine, is_extended_id=False, is_fd=True, bitrate_switch=True,
+            data=packet.ljust(size, b"\0"),
+        )  # fmt: skip
+
+
+def packed(line: Transport, timeout_ms: int, commands: Sequence[str]) -> list[str]:
+    """The A2L file's section on XCP: T1 and T2, ms, and the optional commands that there are."""
+    return [
+        "/begin IF_DATA XCP",
+        "  /begin PROTOCOL_LAYER",
+        f"    0x0100 {timeout_ms} {timeout_ms} 0 0 0 0 0 {line.most} {line.most}",
+        "    BYTE_ORDER_MSB_LAST ADDRESS_GRANULARITY_BYTE",
+        *(f"    OPTIONAL_CMD {name}" for name in commands),
+        "  /end PROTOCOL_LAYER",
+        *line.if_data(),
+        "/end IF_DATA",
+    ]
 
 
 class XcpPort(OperatorPort):
@@ -46,8 +221,8 @@ class XcpPort(OperatorPort):
             "--interface", default="socketcan", help="python-can's name of its driver (%(default)s)"
         )
         command.add_argument(
-            "--ids", metavar="MASTER,SLAVE",
-            help="identifiers of the frames on the bus (0x7f0,0x7f1)",
+            "--ids", metavar="MASTER,SLAVE", default=CAN_IDS,
+            help=f"identifiers of the frames on the bus ({CAN_IDS})",
         )  # fmt: skip
         command.add_argument(
             "--write", action="store_true", help="let tools write references, the law and its gains"
@@ -60,11 +235,11 @@ class XcpPort(OperatorPort):
         super().check(options)
         self.line: Transport = Udp(options.host, options.port)
         if options.can is not None:
-            self.line = CanFd(options.interface, options.can, *_identifiers(options.ids))
+            self.line = CanFd(options.interface, options.can, options.ids)
 
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
         run.wait()
-        operator, recorded = run.operator(), LiveRun(run.folder)
+        operator = run.operator()
 
         def now() -> dict[str, Any] | None:
             snapshot = operator.snapshot()
@@ -72,7 +247,7 @@ class XcpPort(OperatorPort):
 
         first = run.first(now)
         memory = Memory(
-            operator, first["laws"], "limited" in first, lambda: recorded.done("controller")
+            operator, first["laws"], "limited" in first, lambda: operator.run.done("controller")
         )
 
         def a2l() -> str:
@@ -88,15 +263,3 @@ class XcpPort(OperatorPort):
             while not run.over():
                 self.line.answer(slave, _ANSWER_S)
         return 0
-
-
-def _identifiers(text: str | None) -> list[list[int]]:
-    """The identifiers as arguments, none if not given.
-
-    Raises:
-        UserError: they are no numbers.
-    """
-    try:
-        return [] if text is None else [[int(part, 0) for part in text.split(",")]]
-    except ValueError:
-        raise UserError(f"--ids {text}: must be two numbers, as 0x7f0,0x7f1") from None

@@ -78,9 +78,9 @@ def can_frames(run: Run, options: CanOptions) -> Iterator[Timed]:
 def _measurements(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
     writer, sender = FrameWriter("y", plan.inner), VectorSender(plan, "y", options.heartbeat)
-    clock = _Clock(run, "plant")
+    begin = _begin(run, "plant")
     for first, last in _pieces(run):
-        rows, times = _vector(run, "y", first, last), clock.times(first, last)
+        rows, times = _vector(run, "y", first, last), _times(run, "plant", begin, first, last)
         tripped = run.recorded["true_trip"][first:last] != 0
         for k, row in enumerate(rows, first):
             state, reason = (SAFE, PLANT_TRIP) if tripped[k - first] else (INIT, 0)
@@ -96,9 +96,13 @@ def _commands(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """
     writer, sender = FrameWriter("u", plan.inner), VectorSender(plan, "u", options.heartbeat)
     n = options.every
-    clock, reasons = _Clock(run, "controller"), _SafeReasons(run)
+    # codes of the reasons for which it was in SAFE; the log has them in words
+    told = [e for e in run.events if "controller" in e.get("role", "") and "reason" in e]
+    ticks, codes = [e["tick"] for e in told], [0, *(_code(e["reason"]) for e in told)]
+    begin = _begin(run, "controller")
     for first, last in _pieces(run):
-        times, state = clock.times(first, last), run.recorded["state"][first:last]
+        times = _times(run, "controller", begin, first, last)
+        state = run.recorded["state"][first:last]
         beyond = last + n  # u[k] may be taken as late as that
         rows, taken = _vector(run, "u", first, beyond), _taken(run, first, beyond)
         for j in np.flatnonzero(~np.isnan(state)).tolist():
@@ -107,7 +111,8 @@ def _commands(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
             known = at < len(rows) and bool(taken[at])
             now = int(state[j])
             values = rows[at] if known else np.zeros(rows.shape[1])
-            message = writer.pack(k, now, reasons.at(k) if now == SAFE else 0, values)
+            reason = codes[bisect_right(ticks, k)] if now == SAFE else 0
+            message = writer.pack(k, now, reason, values)
             if k % n == 0:
                 frames = sender.frames(message)
                 if known:
@@ -131,41 +136,24 @@ def _taken(run: Run, first: int, last: int) -> NDArray[np.bool_]:
     return received[first:last] >= 0
 
 
-class _Clock:
-    """When a side sent its frame of each tick, s from tick 0."""
-
-    def __init__(self, run: Run, role: str) -> None:
-        self._t = run.recorded["t"] if run.summary["mode"] == "lockstep" else None
-        if self._t is None:
-            self._sent, due = run.recorded[f"{role}_sent"], run.recorded[f"{role}_scheduled"]
-            for first, last in _pieces(run):
-                known = np.flatnonzero(due[first:last] >= 0)
-                if len(known):
-                    k = first + int(known[0])
-                    self._begin = int(due[k : k + 1][0]) - round(k * run.summary["T_s"] * 1e9)
-                    break
-
-    def times(self, first: int, last: int) -> NDArray[np.float64]:
-        """The times of ticks [first, last), shape (ticks,)."""
-        if self._t is not None:
-            return self._t[first:last]
-        return (self._sent[first:last] - self._begin) * 1e-9
+def _begin(run: Run, role: str) -> int:
+    """When a side's tick 0 was due, ns; 0 in lockstep."""
+    if run.summary["mode"] != "lockstep":
+        due = run.recorded[f"{role}_scheduled"]
+        for first, last in _pieces(run):
+            known = np.flatnonzero(due[first:last] >= 0)
+            if len(known):
+                k = first + int(known[0])
+                return int(due[k : k + 1][0]) - round(k * run.summary["T_s"] * 1e9)
+    return 0
 
 
-class _SafeReasons:
-    """Codes of the reasons for which the controller was in SAFE; the log has them in words."""
+def _times(run: Run, role: str, begin: int, first: int, last: int) -> NDArray[np.float64]:
+    """When a side sent its frames of ticks [first, last), s from tick 0, shape (ticks,)."""
+    if run.summary["mode"] == "lockstep":
+        return run.recorded["t"][first:last]
+    return (run.recorded[f"{role}_sent"][first:last] - begin) * 1e-9
 
-    def __init__(self, run: Run) -> None:
-        said = [
-            line for line in run.events if "controller" in line.get("role", "") and "reason" in line
-        ]
-        self._ticks = [line["tick"] for line in said]
-        self._codes = [0, *(self._code(line["reason"]) for line in said)]
 
-    @staticmethod
-    def _code(reason: str) -> int:
-        return next((k for k, text in enumerate(REASONS) if text and reason.startswith(text)), 0)
-
-    def at(self, tick: int) -> int:
-        """The code of the reason given last at a tick; 0 for none."""
-        return self._codes[bisect_right(self._ticks, tick)]
+def _code(reason: str) -> int:
+    return next((k for k, text in enumerate(REASONS) if text and reason.startswith(text)), 0)

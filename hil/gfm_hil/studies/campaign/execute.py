@@ -32,16 +32,9 @@ _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
 
 class Store:
-    """``runs.jsonl`` of a campaign's folder: a line about the campaign, then its records.
-
-    Args:
-        folder: of the campaign; made if need be. None keeps the records in memory only.
-        campaign: whose records these are.
-        resume: go on with what is there, if anything.
-
-    Raises:
-        UserError: the folder is in use, or holds the records of another campaign.
-    """
+    """``runs.jsonl`` of a campaign's folder: a line about the campaign, then its records; with
+    ``resume`` it goes on with what is there, without a folder it keeps them in memory only. Raises
+    UserError: the folder is in use, or holds the records of another campaign."""
 
     def __init__(self, folder: Path | None, campaign: Campaign, resume: bool) -> None:
         self._path = None if folder is None else folder / _FILE
@@ -227,13 +220,8 @@ def cluster(address: str, campaign: Campaign) -> Iterator[tuple[Executor, int]]:
 
 
 def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:
-    """Write the run folder of one run, and its record beside as ``record.json``.
-
-    A run without a steady state has nothing but the record.
-
-    Raises:
-        UserError: the folder is in use.
-    """
+    """Write the run folder of one run, and its record beside as ``record.json``; of a run without a
+    steady state the record alone. Raises UserError: the folder is in use."""
     scenario, drawn = campaign.scenario(run, law)
     scenario = scenario.model_copy(update={"title": f"{campaign.file.title}: run {run}"})
     check_empty(folder)

@@ -83,20 +83,15 @@ def record(
     lasted = summary["status"] in ("completed", "oscillating")
     ripple = summary.get("ripple_pu")
     events = [{k: v for k, v in e.items() if k not in _EVENT_KEYS} for e in summary["events"]]
-    return finite(
-        {
-            "run": run,
-            "law": law,
-            "seed": scenario.seed,
-            "drawn": drawn,
-            "status": summary["status"],
-            "reason": summary["reason"],
-            "end_s": None if lasted or not len(p) else len(p) * scenario.T_s,
-            "ripple_pu": max(ripple.values()) if ripple else None,
-            "growth_1_s": max((g for e in events if (g := _growth(e)) is not None), default=None),
-            "events": events,
-        }
-    )
+    made = {
+        "run": run, "law": law, "seed": scenario.seed, "drawn": drawn,
+        "status": summary["status"], "reason": summary["reason"],
+        "end_s": None if lasted or not len(p) else len(p) * scenario.T_s,
+        "ripple_pu": max(ripple.values()) if ripple else None,
+        "growth_1_s": max((g for e in events if (g := _growth(e)) is not None), default=None),
+        "events": events,
+    }  # fmt: skip
+    return finite(made)
 
 
 def _growth(event: dict[str, Any]) -> float | None:

@@ -149,16 +149,9 @@ def read_results(path: str | Path) -> Results:
 
 
 def compare_results(old: Results, new: Results, share: float = SHARE) -> ReportDiff:
-    """Lay two reports beside each other.
-
-    Args:
-        old, new: the reports.
-        share: a value has moved if it changed by more than this part of the larger of both, and
-            by more than 1e-3 in its unit.
-
-    Raises:
-        UserError: the share cannot be one.
-    """
+    """Lay two reports beside each other. A value has moved if it changed by more than the share of
+    the larger of both, and by more than 1e-3 in its unit. Raises UserError: the share cannot be
+    one."""
     if not 0.0 <= share < 1.0:
         raise UserError(f"share = {share:g}: must lie in [0, 1)")
     tests_old, tests_new = _tests(old), _tests(new)

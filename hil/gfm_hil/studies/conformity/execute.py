@@ -165,16 +165,9 @@ def make_jobs(
     figures: bool,
     external: ControllerUnderTest | None = None,
 ) -> list[Job]:
-    """A job for each part of each test under each law, and then under the model.
-
-    Args:
-        laws: files by name. The model begins at the operating point of the first one, or, without
-            laws, of the law that a scenario has by default.
-        cases, inner, under, converters, folder, figures, external: as for ``Job``.
-
-    Raises:
-        UserError: the model measures currents, and its runs have no inner stage.
-    """
+    """A job for each part of each test under each law, and then under the model, which begins at
+    the operating point of the first law or, without laws, of that which a scenario has by default.
+    Raises UserError: the model measures currents, and its runs have no inner stage."""
     each: list[tuple[str, str, ControllerUnderTest | None]] = [(*law, None) for law in laws.items()]
     if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)

@@ -138,15 +138,9 @@ def shipped_sets() -> dict[str, Path]:
 
 
 def load_cases(names: Sequence[str]) -> list[Case]:
-    """The tests of sets, in order, each once.
-
-    Args:
-        names: shipped sets, ``all`` of them, shipped tests such as ``miso/2-rocof``, folders of
-            test files, or test files.
-
-    Raises:
-        UserError: one line per mistake.
-    """
+    """The tests of sets, in order, each once. Names are those of shipped sets, ``all`` of them,
+    shipped tests such as ``miso/2-rocof``, folders of test files, or test files. Raises UserError:
+    one line per mistake."""
     shipped, found = shipped_sets(), dict[Path, Case]()
     for name in names:
         for chosen in shipped if name == ALL else [name]:
@@ -248,17 +242,9 @@ def _checked(path: Path, model: type[BaseModel], content: Any, table: str = "") 
 def scenario_of(
     case: Case, part: TestPart, under: UnderTest, law: str, inner: str | None, converters: Path
 ) -> Scenario:
-    """The scenario of a part, checked.
-
-    Args:
-        case, part: what to run.
-        under: the converter under test.
-        law, inner: of every converter.
-        converters: folder for the files of converters of another frequency or rating.
-
-    Raises:
-        UserError: it cannot be run; one line a mistake.
-    """
+    """The scenario of a part, checked, under a law and inner stage of every converter; the folder
+    is for the files of converters of another frequency or rating. Raises UserError: it cannot be
+    run; one line a mistake."""
     test = case.test
     plant = under.plant.model_dump(mode="json", exclude_unset=True)
     content = _content(case, part, plant)
@@ -311,14 +297,8 @@ def _converter(given: str, f_n: float, rating: float, folder: Path) -> str:
 
 
 def scaled(nominal: ConverterParameters, f_n: float, rating: float) -> ConverterParameters:
-    """The same converter for another nominal frequency and rating: its elements have the same
-    per-unit values, and its DC link stores as much for its rating.
-
-    Args:
-        nominal: the converter.
-        f_n: nominal frequency, Hz.
-        rating: over that of the converter.
-    """
+    """The same converter for another nominal frequency, Hz, and another rating over its own: its
+    elements have the same per-unit values, and its DC link stores as much for its rating."""
     slower = nominal.omega_n / (2 * math.pi * f_n)
     factors = {
         "L_f": slower / rating, "L_g": slower / rating, "R_f": 1 / rating, "R_g": 1 / rating,

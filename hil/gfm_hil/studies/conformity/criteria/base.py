@@ -45,13 +45,7 @@ class UnderTest(StrictSchema):
 
 
 class Clause(StrictSchema):
-    """A clause of a test. Its windows count from each time in ``at``; ``window`` is [from, to].
-
-    Attributes:
-        whole_run: it is about the whole run, whatever its events.
-        of_cut_run: a run that ended early can be judged too.
-        explains: the failure of a clause with a smaller number explains those of others.
-    """
+    """A clause of a test. Its windows count from each time in ``at``; ``window`` is [from, to]."""
 
     kind: str
     clause: str = Field(min_length=1, description="what the source asks, in its own words or short")
@@ -65,9 +59,9 @@ class Clause(StrictSchema):
         "cannot be judged, it is informative and counts for nothing",
     )
 
-    whole_run: ClassVar[bool] = False
-    of_cut_run: ClassVar[bool] = False
-    explains: ClassVar[int] = 2
+    whole_run: ClassVar[bool] = False  # it is about the whole run, whatever its events
+    of_cut_run: ClassVar[bool] = False  # a run that ended early can be judged too
+    explains: ClassVar[int] = 2  # the failure of one with a smaller number explains those of others
 
     def judge(self, m: Moment) -> Verdict:
         """The verdict at one time of a run, whose window was recorded."""
@@ -93,18 +87,9 @@ class Windowed(Clause):
 
 
 class Moment:
-    """One time of a finished run at which a clause is judged.
-
-    Attributes:
-        run: of the converter under test; it may have ended early.
-        under: what the owner of the converter declares.
-        others: the runs of the other converters of a network.
-        clause: that is judged.
-        at, tick: when, s, and its tick.
-        first, last: ticks of the window.
-        width: of a cycle, ticks; not a whole number.
-        T_s, f_n: s, and Hz.
-    """
+    """One time of a finished run at which a clause is judged: ``at`` s and its tick, and the ticks
+    of the window, first to last. The run may have ended early; the others are those of the other
+    converters of a network. ``width`` is that of a cycle in ticks; not a whole number."""
 
     def __init__(
         self, run: Run, under: UnderTest, others: Mapping[str, Run], clause: Clause, at: float
@@ -205,14 +190,8 @@ class Moment:
 def judge(
     run: Run, criteria: Sequence[Clause], under: UnderTest, others: Mapping[str, Run] | None = None
 ) -> list[Verdict]:
-    """The verdicts of all criteria, each at each of its times.
-
-    Args:
-        run: of the converter under test; it may have ended early.
-        criteria: of the test and of its part.
-        under: what the owner of the converter declares.
-        others: the runs of the other converters of a network, which must not trip either.
-    """
+    """The verdicts of all criteria of a test and its part, each at each of its times; the runs of
+    the other converters of a network must not trip either."""
     T_s, events = run.scenario.T_s, run.scenario.events
     first = min((e.at(T_s) * T_s for e in events), default=0.0)
     return [

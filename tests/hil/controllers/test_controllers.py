@@ -1,0 +1,311 @@
+"""Models that are not ours as the controller: real-code DLLs and FMUs, and how they fail."""
+
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.cli import main
+from gfm_hil.controllers import BenchContext, open_controller, read_map
+from gfm_hil.controllers.ports import PortMap, wire
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine import setup
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
+from gfm_hil.scenario import load_scenario
+from gfm_plant import plant_sample
+from gfm_runtime.inner import settle
+from gfm_runtime.states import RUNNING, SAFE
+from gfm_runtime.switchover import settle_into
+
+from ...support.firmware import cc
+from ...support.processes import write
+
+SOURCE = Path(__file__).parents[2] / "support" / "foreign_model.c"
+MAP = """\
+step_s = 2e-4
+blocks = "block"
+inputs.mode = 7
+inputs."dispatch[0]" = { signal = "P_ref", scale = 4000.0 }
+inputs."dispatch[1]" = { signal = "Q_ref", scale = 4000.0 }
+inputs.p = { signal = "p", scale = 4000.0 }
+inputs.q = { signal = "q", scale = 4000.0 }
+outputs.f = { signal = "omega_u", scale = 50.0 }
+outputs.amplitude = { signal = "E_u", scale = 400.0 }
+fixed.i_u = 0.5
+"""
+STEP = {"t": 0.02, "type": "reference", "P_ref": 0.6, "ramp_s": 0.01}
+RIG = {"dc_source": {"mode": "regulated"}}
+FAILS_AT = 100  # step of the model
+
+
+def compiles(test: Any) -> Any:
+    return pytest.mark.apt(pytest.mark.timeout(300)(test))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Our own laws as models, by kind, law and inner stage."""
+    found: dict[Any, str] = {}
+
+    def export(kind: str, law: str, inner: str) -> str:
+        if (kind, law, inner) not in found:
+            folder = tmp_path_factory.mktemp(kind)
+            out = folder / "law.fmu" if kind == "fmu" else folder
+            what = ["firmware", kind, law, "--inner", inner, "--real", "float64", "-o", str(out)]
+            assert main(what) == 0
+            found[kind, law, inner] = f"{kind}:{out if kind == 'fmu' else next(out.glob('*.so'))}"
+        return found[kind, law, inner]
+
+    return export
+
+
+@pytest.fixture(scope="module")
+def foreign(exported: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The library of ``foreign_model.c``."""
+    headers = Path(exported("dll", "vsg-2", "none").removeprefix("dll:")).parent
+    folder = tmp_path_factory.mktemp("foreign")
+    flags = ["-std=gnu99", "-Wall", "-O2", "-shared", "-fPIC", f"-I{headers}"]
+    done = cc(folder, *flags, str(SOURCE), "-o", "droop.so", "-lm")
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "droop.so"
+
+
+def run(tmp_path: Path, model: str, *options: str, **content: Any) -> Run:
+    """A run with a model as the controller, by the command."""
+    link = {"type": "shm", "peer_timeout_s": 20.0}
+    file = write(tmp_path, **{"law": "vsg-2", "link": link, **content})
+    folder = tmp_path / "run"
+    command = ["run", file, "--controller", model, "--out", str(folder), *options]
+    code = main([*command, "--quiet", "--no-figures"])
+    found = Run.load(folder)
+    assert (code == 0) == (found.summary["status"] == "completed")
+    return found
+
+
+@compiles
+@pytest.mark.parametrize(
+    ("kind", "inner"), [("dll", "cascaded"), ("dll", "none"), ("fmu", "cascaded")]
+)
+def test_our_own_model_gives_the_run_of_the_law(exported, kind, inner, tmp_path, monkeypatch):
+    """Bit for bit, with the law settled at the first measurement, as the model settles itself."""
+    content = {"law": "vsg-2", "inner": inner, "events": [STEP]}
+    found = run(tmp_path, exported(kind, "vsg-2", inner), **content)
+    assert (found.summary["controller"], found.summary["laws"]) == (f"{kind} vsg-2", [])
+    scenario = load_scenario(str(tmp_path / "scenario.toml"), link__type="inproc")
+    near = runner.run_in_memory(scenario)
+
+    def settled(scenario: Any) -> Any:
+        bench = setup.make_bench(scenario)
+        c, y = bench.controller, bench.y.copy()
+        plant_sample(bench.plant.copy().records, 0, y)
+        own = bench.u[:3].copy()  # with a stage its E_u begins at e_d: no port says more
+        settle_into(c.laws[0], c.states[0], c.ctl["ref"][0], y[:5], own, np.zeros(3))
+        if bench.inner:
+            settle(c.laws[:1], c.states[:1], own, y, *c.ctl["out"][0, 2:])
+        return bench
+
+    monkeypatch.setattr(runner, "make_bench", settled)
+    equal = runner.run_in_memory(scenario)
+    empty = {"law", "X_est", "E_law", "i_ref_d", "i_ref_q", "limited"}
+    assert np.ptp(equal.columns["true_p"][:]) > 0.01
+    for name, column in equal.columns.items():
+        if name in empty:
+            assert np.isnan(found.columns[name][:]).all(), name
+        else:
+            assert found.columns[name][:].tobytes() == column[:].tobytes(), name
+            if inner == "none":  # else what is left of the start decays with T_off
+                np.testing.assert_allclose(column[:], near.columns[name][:], rtol=0, atol=1e-9)
+
+
+@compiles
+@pytest.mark.parametrize("kind", ["dll", "fmu"])
+def test_a_reset_starts_the_model_anew(exported, kind, tmp_path):
+    """A dip to nothing trips; the run after the reset has the bits of the run from its start."""
+    falls = [{"type": "grid-voltage", "tick": 200, "V_g": 0.0}, {"type": "reset", "tick": 500}]
+    content = {"after_trip": "wait", "events": falls}
+    found = run(tmp_path, exported(kind, "vsg-2", "none"), **content)
+    state, p = found.columns["state"][:], found.columns["true_p"][:]
+    assert set(state[300:500]) == {SAFE} and set(state[502:]) == {RUNNING}
+    for name in ("true_p", "u_i_u", "u_omega_u", "u_E_u"):
+        column = found.columns[name][:]
+        np.testing.assert_array_equal(column[501:700], column[:199], err_msg=name)
+    assert np.ptp(p) > 0.4
+
+
+@compiles
+def test_a_model_of_others_by_its_map(foreign, tmp_path):
+    """Its arithmetic, done again here from what the run recorded, step by step."""
+    (tmp_path / "map.toml").write_text(MAP + "parameters.droop = 2e-4\n")
+    options = ["--map", str(tmp_path / "map.toml")]
+    found = run(tmp_path, f"dll:{foreign}", *options, duration=0.5, plant=RIG, events=[STEP])
+    assert (found.summary["status"], found.summary["controller"]) == (
+        "completed",
+        "dll droop of others",
+    )
+    p, q, ref = (found.columns[name][:] for name in ("y_p", "y_q", "ref_P_ref"))
+    filtered, omega, E = np.nan, [], []
+    for k in range(0, len(p), 2):  # a step is two ticks
+        watts = p[k] * 4000.0
+        filtered = watts if k == 0 else filtered + 0.01 * (watts - filtered)
+        omega += 2 * [(50 + 2e-4 * (float(np.float32(ref[k] * 4000.0)) - filtered)) / 50]
+        E += 2 * [float(np.float32(400 + 0.0005 * (0.0 - q[k] * 4000.0))) / 400]
+    assert found.columns["u_omega_u"][:].tolist() == omega
+    assert found.columns["u_E_u"][:].tolist() == E
+    assert set(found.columns["u_i_u"][:]) == {0.5}
+    assert p[-1] == pytest.approx(0.6, abs=0.02)
+
+
+@compiles
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        (1, "dll droop of others: Model_Outputs failed: the sun is down"),
+        (2, "an output is not finite: omega_u"),
+        (3, "dll droop of others: has not answered for 2 s"),
+        (4, "the controller was ended by SIGSEGV"),
+        (5, "dll droop of others: blocks the bridge: block = 1"),
+    ],
+)
+def test_a_model_that_fails_is_named_and_the_run_is_kept(foreign, tmp_path, what, reason):
+    wrong = f"parameters.at = {FAILS_AT}\nparameters.what = {what}\n"
+    (tmp_path / "map.toml").write_text(MAP + wrong)
+    link = {"type": "shm", "peer_timeout_s": 4.0 if what == 3 else 20.0 - 18.0 * (what == 4)}
+    options = ["--map", str(tmp_path / "map.toml")]
+    found = run(tmp_path, f"dll:{foreign}", *options, plant=RIG, link=link)
+    assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
+    assert found.summary["ticks"] >= 2 * FAILS_AT
+    assert np.isfinite(found.columns["y_p"][: 2 * FAILS_AT]).all()
+    assert np.isfinite(found.columns["u_omega_u"][: 2 * FAILS_AT]).all()
+
+
+@compiles
+@pytest.mark.parametrize(
+    ("event", "map_", "message"),
+    [
+        (STEP, "", "input dispatch[0]: signal 'dispatch[0]' must be one of V_dcref, P_ref"),
+        (STEP, MAP + "parameters.droop = -1.0", "Model_Initialize failed: the droop must be posit"),
+        (STEP, MAP + "parameters.dropo = 1.0",
+         "parameters.dropo in its map: it has droop, at, what"),
+        (STEP, MAP.replace("2e-4", "1.5e-4"),
+         "FixedStepBaseSampleTime = 0.0002 s; leave step_s out"),
+        (STEP, MAP.replace("2e-4", "2e-4\nscale = 1"), "scale = 1: unknown key"),
+        ({"t": 0.02, "type": "law", "law": "vsg-5"}, MAP, "droop of others has a law of its own"),
+    ],
+)  # fmt: skip
+def test_what_a_run_with_a_model_refuses(
+    foreign, tmp_path, event, map_, message,
+    capsys
+):  # fmt: skip
+    (tmp_path / "map.toml").write_text(map_)
+    file = write(tmp_path, law="vsg-2", link={"type": "shm"}, events=[event])
+    command = ["controller", file, "--endpoint", "shm://none", "--model", f"dll:{foreign}"]
+    command += ["--map", str(tmp_path / "map.toml"), "--out", str(tmp_path / "run")]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert message in said and "Traceback" not in said
+
+
+# --- without a compiler ---
+
+
+def test_ports_are_found_by_name_and_by_map():
+    ref, y = np.arange(1.0, 6.0), np.arange(11.0, 16.0)
+    ports = PortMap.model_validate(
+        {
+            "inputs": {"power": {"signal": "p", "scale": 4000.0}, "mode": 7},
+            "outputs": {"w": "omega_u"},
+            "fixed": {"E_u": 1.5},
+        }
+    )
+    inputs, outputs = ["ref.P_ref", "power", "mode", "V"], ["i_u", "w", "spare", "reason"]
+    wiring = wire("model", ports, inputs, outputs, inner=False)
+    assert wiring.inputs(ref, y).tolist() == [2.0, 12.0 * 4000.0, 7.0, 15.0]
+    u = np.zeros(3)
+    wiring.take(np.array([0.25, 1.0625, 9.0, 0.0]), u)
+    assert u.tolist() == [0.25, 1.0625, 1.5]
+    assert wiring.outputs(u, 4).tolist() == [0.25, 1.0625, 0.0, 0.0]
+    assert wiring.blocks == 3
+
+
+@pytest.mark.parametrize(
+    ("ports", "outputs", "message"),
+    [
+        ({}, ["i_u", "E_u"], "omega_u comes from no output; name its port in the map file"),
+        ({"fixed": {"E_u": 1.0}}, ["i_u", "omega_u", "E_u"], "E_u comes twice"),
+        ({"fixed": {"E_q": 1.0}}, ["i_u", "omega_u", "E_u"],
+         "fixed: only a run with an inner stage"),
+        ({"outputs": {"x": "E_u"}}, ["i_u", "omega_u"],
+         "outputs.x in its map: it has i_u, omega_u"),
+        ({"inputs": {"p": "P"}}, ["i_u", "omega_u", "E_u"], "input p: signal 'P' must be one of"),
+        ({"inputs": {"p": {"signal": "p", "scale": 0.0}}}, ["i_u", "omega_u", "E_u"],
+         "input p: scale = 0 must not be 0"),
+        ({"blocks": "x"}, ["i_u", "omega_u", "E_u"],
+         "blocks = 'x' in its map: must be one of i_u, omega_u"),
+    ],
+)  # fmt: skip
+def test_ports_that_do_not_fit_are_refused(ports, outputs, message):
+    with pytest.raises(UserError) as refused:
+        wire("model", PortMap.model_validate(ports), ["p"], outputs, inner=False)
+    assert message in str(refused.value) and str(refused.value).startswith("model: ")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("inputs = 1", "inputs: "),
+        ("fixed.i_u = nan", "fixed.i_u: "),
+        ("=", "Invalid"),
+        (None, "No such file"),
+    ],
+)
+def test_a_map_that_is_wrong_is_refused(text, message, tmp_path):
+    if text is not None:
+        (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(UserError, match=message):
+        read_map(tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ("exe:x", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
+        ("dll:", "must be dll:FILE, fmu:FILE, c:FILE or pil:TARGET"),
+        ("dll:none.so", "none.so: there is no such file"),
+        ("c:mine.c", "is a source, not a library; compile it by cc -O2 -shared -fPIC"),
+        ("dll:{text}", "cannot be loaded"),
+        ("fmu:{text}", "is no FMU that FMPy reads"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused(model, message, tmp_path):
+    (tmp_path / "text").write_text("no model")
+    with pytest.raises(UserError, match=message):
+        open_controller(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
+
+
+@pytest.mark.attack(
+    "16.5", "an FMU of 3 GB when unpacked, or a pipe", "3 GB written; waits for ever"
+)
+@pytest.mark.parametrize("kind", ["bomb", "members", "description"])
+def test_an_fmu_is_unpacked_within_limits(kind, tmp_path, monkeypatch, attack_now):
+    file, scratch = tmp_path / "x.fmu", tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", bytes(40 << 20 if kind == "description" else 9))
+        for k in range(10_001 if kind == "members" else 0):
+            archive.writestr(f"resources/{k}", b"")
+        for k in range(9 if kind == "bomb" else 0):
+            archive.writestr(f"resources/{k}", bytes(64 << 20))
+    said = {
+        "bomb": "unpacked it has 603979785 bytes, more than 536870912",
+        "members": "its directory has more than 10000 members",
+        "description": "modelDescription.xml has 41943040 bytes, more than 33554432",
+    }[kind]
+    with pytest.raises(UserError, match=f"{file}: is no FMU that FMPy reads: {said}"):
+        open_controller(f"fmu:{file}", PortMap(), BenchContext())
+    assert not [path for path in scratch.rglob("*") if path.is_file()]
+    attack_now("refused before it is unpacked")

@@ -1,0 +1,306 @@
+"""The laws of a run on another processor: the bits of the kernel, and how it fails."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gfm_hil.cli import main
+from gfm_hil.controllers import BenchContext, PortMap, open_controller, pil
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine import setup
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
+from gfm_hil.scenario import find_scenario, load_scenario
+from gfm_runtime.firmware import TARGETS
+
+from ...support.processes import write
+
+
+def qemu(test: Any) -> Any:
+    return pytest.mark.compilers(pytest.mark.timeout(300)(test))
+
+
+SHM, PAUSE_S = {"type": "shm"}, 2.0
+STEP = {"tick": 100, "type": "reference", "P_ref": 0.8, "ramp_s": 0.01}
+GAINS = {"tick": 150, "type": "gains", "values": {"D_p": 0.02}}
+CHANGE = {"tick": 300, "type": "law", "law": "mimo-gfm"}
+BACK = {"tick": 400, "type": "law", "law": "vsg-2"}
+DIP = [{"tick": 100, "type": "grid-voltage", "V_g": 0.0}, {"tick": 300, "type": "reset"}]
+
+
+def run(tmp_path: Path, target: str, **content: Any) -> Run:
+    """A run on a target, by the command."""
+    file = write(tmp_path, **{"law": "vsg-2", "link": SHM, "duration": 0.06, **content})
+    folder = tmp_path / "run"
+    command = ["run", file, "--controller", f"pil:{target}", "--out", str(folder), "--quiet"]
+    code = main([*command, "--no-figures"])
+    found = Run.load(folder)
+    assert (code == 0) == (found.summary["status"] == "completed")
+    return found
+
+
+def in_process(found: Run, real: str, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """The same scenario with the kernel of a precision in this process."""
+    monkeypatch.setattr(runner, "make_bench", partial(setup.make_bench, real=real))
+    assert found.folder is not None
+    return runner.run_in_memory(
+        load_scenario(str(found.folder / "scenario.toml"), link__type="inproc")
+    )
+
+
+def assert_same(found: Run, near: Run) -> None:
+    """Every recorded column, byte by byte, and what happened to the laws."""
+    assert found.summary["status"] == near.summary["status"]
+    assert found.summary["laws"] == near.summary["laws"]
+    assert found.summary["bump_pu"] == near.summary["bump_pu"]
+    for name, column in near.columns.items():
+        assert found.columns[name][:].tobytes() == column[:].tobytes(), name
+
+
+@qemu
+@pytest.mark.parametrize(
+    ("target", "content"),
+    [
+        ("m4f", {"events": [STEP, GAINS, CHANGE, BACK]}),
+        ("m4f", {"inner": "cascaded", "events": [STEP, CHANGE]}),
+        ("m7", {"inner": "virtual-stator", "events": DIP, "after_trip": "wait"}),
+        ("host", {"law": "mimo-gfm-scheduled", "events": [STEP]}),
+    ],
+)
+def test_a_run_has_the_bits_of_the_kernel(target, content, tmp_path, monkeypatch):
+    found = run(tmp_path, target, **content)
+    assert found.summary["controller"] == f"gfmhil on {target}"
+    near = in_process(found, TARGETS[target].real, monkeypatch)
+    assert_same(found, near)
+    assert np.ptp(near.columns["true_p"][:]) > 0.005
+    counted = found.summary.get("instructions")
+    if target == "host":
+        assert counted is None and "controller_instructions" not in found.timing
+    else:
+        column = found.timing["controller_instructions"][:]
+        column = column[column >= 0]
+        assert len(column) > 300  # a tick that waits for a reset has none
+        assert 100 < counted["least"] <= counted["p50"] <= counted["most"] < 1000
+        assert (column.min(), column.max()) == (counted["least"], counted["most"])
+
+
+@qemu
+@pytest.mark.parametrize("name", ["rig_pref_step", "switchover"])
+def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_path, monkeypatch):
+    """The paper's experiments on the rig on a Cortex-M4F, with their event after 20 ms."""
+    text = find_scenario(name).read_text(encoding="utf-8").split("\n")
+    short = {"t": "t = 0.02", "duration": "duration = 0.06"}
+    kept = [short.get(line.partition(" =")[0], line) for line in text]
+    (tmp_path / f"{name}.toml").write_text(
+        "\n".join(line for line in kept if not line.startswith("expect")), encoding="utf-8"
+    )
+    folder = tmp_path / "run"
+    command = ["run", str(tmp_path / f"{name}.toml"), "--controller", "pil:m4f", "--quiet"]
+    assert main([*command, "--out", str(folder), "--no-figures"]) == 0
+    found = Run.load(folder)
+    assert (found.scenario.mode, found.summary["ticks"]) == ("lockstep", 600)
+    exact = runner.run_in_memory(found.scenario)  # the negative control
+    assert found.columns["u_omega_u"][:].tobytes() != exact.columns["u_omega_u"][:].tobytes()
+    assert_same(found, in_process(found, "float32", monkeypatch))
+
+
+@qemu
+@pytest.mark.parametrize(
+    ("number", "link", "reason"),
+    [
+        (signal.SIGKILL, SHM, "gfmhil on m4f: qemu-system-arm has ended by SIGKILL"),
+        (signal.SIGSTOP, SHM, "gfmhil on m4f: has not answered for 10 s"),
+        (signal.SIGSTOP, SHM | {"peer_timeout_s": 4.0}, "gfmhil on m4f: has not answered for 2 s"),
+    ],
+)
+def test_a_machine_that_dies_or_hangs_is_named_and_the_run_is_kept(
+    number, link, reason, tmp_path, monkeypatch
+):
+    scratch = Path(tempfile.mkdtemp(prefix="pil-"))  # short: a socket is to be made there
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    machines: list[int] = []
+    thread = threading.Thread(target=hit, args=(tmp_path, scratch, machines, number))
+    thread.start()
+    found = run(tmp_path, "m4f", duration=60.0, link=link)
+    thread.join()
+    assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
+    assert found.summary["ticks"] > 100
+    assert np.isfinite(found.columns["u_omega_u"][:100]).all()
+    assert machines and not any(Path(f"/proc/{process}").exists() for process in machines)
+    scratch.rmdir()  # nothing is left there
+
+
+@qemu
+def test_a_machine_that_answers_after_seconds_completes_the_run(tmp_path, monkeypatch):
+    scratch = Path(tempfile.mkdtemp(prefix="pil-"))
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    machines: list[int] = []
+    stops = (signal.SIGSTOP, signal.SIGCONT)
+    thread = threading.Thread(target=hit, args=(tmp_path, scratch, machines, *stops))
+    thread.start()
+    found = run(tmp_path, "m4f", duration=4.0, link=SHM)
+    thread.join()
+    assert (found.summary["status"], found.summary["ticks"]) == ("completed", 40_000)
+    assert found.summary["wall_s"] > PAUSE_S
+    assert machines and not any(Path(f"/proc/{process}").exists() for process in machines)
+    scratch.rmdir()
+
+
+def hit(tmp_path: Path, scratch: Path, machines: list[int], *numbers: signal.Signals) -> None:
+    """Send the machine and its guard, which work below ``scratch``, signals in mid run."""
+    parts, ticks = tmp_path / "run" / "parts" / "plant_progress.npy", 0
+    while ticks <= 100:
+        time.sleep(0.01)
+        with contextlib.suppress(OSError, ValueError, EOFError):  # not there, or not whole, yet
+            ticks = np.load(parts)[0]
+    machines.extend(processes_in(scratch))
+    for number in numbers:
+        for process in machines:
+            with contextlib.suppress(ProcessLookupError):  # it has ended with its guard
+                os.kill(process, number)
+        time.sleep(PAUSE_S if number == signal.SIGSTOP else 0.0)
+
+
+def processes_in(folder: Path) -> list[int]:
+    """The processes that work in a folder below this one."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if folder in (place / "cwd").readlink().parents:
+                found.append(int(place.name))
+        except OSError:
+            pass  # it has ended, or is another user's
+    return found
+
+
+IMPOSTOR = """\
+#!{python}
+import os, struct
+os.write(from_ := os.open("from", os.O_WRONLY), bytes({size}))
+to = os.open("to", os.O_RDONLY)
+print("the machine is on fire", flush=True)
+while request := os.read(to, {asks}):
+    if (what := request[0]) == 0:
+        {does}
+    else:
+        os.read(to, 4096)  # a state, or a golden row of which no word differs
+        what == 3 and os.write(from_, bytes({size}))
+"""
+
+
+@qemu
+@pytest.mark.parametrize(
+    ("does", "reason"),
+    [
+        ("os._exit(3)", "qemu-system-arm has ended with code 3: the machine is on fire"),
+        ("os.write(from_, struct.pack('<ii', 77, 0) + bytes({size} - 8))",
+         "answers 77 for signal 0, which no law does: the machine is on fire"),
+        ("os.write(from_, struct.pack('<ii', 1, 3) + bytes({size} - 8))",
+         "refuses: a measurement is not finite or out of range: q"),
+    ],
+)  # fmt: skip
+def test_a_wrong_answer_is_named(does, reason, tmp_path, monkeypatch):
+    """Another program in the machine's place."""
+    machine = tmp_path / "qemu-system-arm"
+    asks, size = 4 * (3 + 5 + 5), 4 * (4 + 3 + 3 + 1 + 2)
+    does = does.replace("{size}", str(size))
+    machine.write_text(IMPOSTOR.format(python=sys.executable, asks=asks, size=size, does=does))
+    machine.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    found = run(tmp_path, "m4f")
+    assert (found.summary["status"], found.summary["reason"]) == (
+        "safe",
+        f"gfmhil on m4f: {reason}",
+    )
+    assert not processes_in(tmp_path)
+
+
+@qemu
+def test_what_it_cannot_do_is_refused(tmp_path, capsys):
+    file = write(tmp_path, law="vsg-2", link={"type": "shm"})
+    command = ["controller", file, "--endpoint", "shm://none", "--out", str(tmp_path / "run")]
+    assert main([*command, "--model", "pil:m4f", "--mode", "realtime"]) == 2
+    said = capsys.readouterr().err
+    assert "mode = 'realtime': gfmhil on m4f keeps no time; choose --mode lockstep" in said
+
+
+@qemu
+@pytest.mark.parametrize("content", [{"events": [STEP, CHANGE]}, {"inner": "cascaded"}])
+def test_a_program_with_other_bits_is_refused_before_tick_0(content, tmp_path, monkeypatch, capsys):
+    """A compiler that fuses multiply-add, which the processor can do."""
+    instead(tmp_path, "arm-none-eabi-gcc", 'exec {real} "$@" -ffp-contract=fast', monkeypatch)
+    file = write(tmp_path, **{"law": "vsg-2", "link": SHM, **content})
+    command = ["run", file, "--controller", "pil:m4f", "--out", str(tmp_path / "run")]
+    assert main([*command, "--quiet", "--no-figures"]) == 2
+    said = re.sub(r"[1-9][\d,]*", "N", capsys.readouterr().err.strip())
+    assert said == (
+        "gfmhil: controller pil: gfmhil on mNf: its program does not compute the kernel's bits: "
+        "N words differ in N golden rows, the first in law vsg-N; a compiler that fuses "
+        "multiply-add (-ffp-contract=fast, -ffast-math) does this"
+    )
+    assert not (tmp_path / "run" / "signals.npz").exists()
+
+
+@qemu
+@pytest.mark.parametrize(
+    ("does", "reason"),
+    [
+        (
+            'exec {real} "${{@/mps2-an386/mps3}}"',
+            "qemu-system-arm has ended with code 1: qemu-system-arm: unsupported machine type",
+        ),
+        (  # a Cortex-M3, which has no floating-point unit
+            'exec {real} "${{@/mps2-an386/mps2-an385}}"',
+            "qemu-system-arm has ended by SIGABRT: qemu: fatal: Lockup: can't escalate 3 to Hard",
+        ),
+        ("echo no machine; echo for you; exec sleep 60", "for 0.5 s: no machine; for you"),
+        ("yes > from", r"answers a golden row with 175704697, which no law does"),
+    ],
+)
+def test_what_is_no_such_machine_is_refused_with_what_it_says(does, reason, tmp_path, monkeypatch):
+    instead(tmp_path, "qemu-system-arm", does, monkeypatch)
+    monkeypatch.setattr(pil, "_START_S", 0.5 if "sleep" in does else 30.0)
+    model = open_controller("pil:m4f", PortMap(), BenchContext())
+    bench = setup.make_bench(load_scenario("pref_step", in_process=True, law="vsg-2"), "float32")
+    with pytest.raises(UserError, match=re.escape(reason)):
+        model.begin(bench.controller)
+    assert not processes_in(tmp_path)
+
+
+def instead(folder: Path, name: str, does: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a shell script in a program's place, whose path is ``real`` in it."""
+    script = folder / name
+    script.write_text("#!/bin/bash\n" + does.format(real=shutil.which(name)) + "\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+
+
+# --- without a compiler ---
+
+
+def test_a_missing_tool_and_a_wrong_target_are_named(tmp_path, monkeypatch):
+    with pytest.raises(
+        UserError, match=r"pil:m0: must be pil: and one of host, clang, m4f, m7, m3, rv"
+    ):
+        open_controller("pil:m0", PortMap(), BenchContext())
+    with pytest.raises(UserError, match=r"pil:s390x: has the other order of bytes"):
+        open_controller("pil:s390x", PortMap(), BenchContext())
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(
+        UserError, match=r"m4f: arm-none-eabi-gcc is not there; apt-get install gcc"
+    ):
+        open_controller("pil:m4f", PortMap(), BenchContext())
+    with pytest.raises(UserError, match=r"pil:m4f: has our signals, and takes no map"):
+        open_controller("pil:m4f", PortMap(fixed={"i_u": 0.5}), BenchContext())

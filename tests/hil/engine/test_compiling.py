@@ -1,0 +1,99 @@
+"""What is compiled when: nothing by an import, everything by a warm-up, and runs say so."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from numba import njit
+
+from gfm_hil.engine.compiling import compile_everything, compile_sets
+from gfm_hil.links import link_names
+from gfm_hil.run.runner import run_scenario
+
+pytestmark = pytest.mark.processes
+
+_IMPORTS = """
+import importlib, pkgutil, sys
+from numba.core import ccallback, event
+import gfm_design, gfm_hil, gfm_plant, gfm_runtime
+
+class Compiled(event.Listener):
+    def on_start(self, event): print(event.data["dispatcher"])
+    def on_end(self, event): pass
+
+event.register("numba:compile", Compiled())
+ccallback.CFunc.compile = lambda self: print(self)
+for package in (gfm_design, gfm_hil, gfm_plant, gfm_runtime):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+"""
+_LIGHT = """
+import sys
+from gfm_hil.cli import main
+try:
+    main(sys.argv[1:])
+finally:
+    print(*{"numba", "numpy", "scipy", "pydantic", "rich"} & set(sys.modules), file=sys.stderr)
+"""
+
+
+def test_importing_compiles_nothing(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", _IMPORTS],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_the_help_loads_no_library(option):
+    done = subprocess.run(
+        [sys.executable, "-c", _LIGHT, option], capture_output=True, text=True, check=True
+    )
+    assert "gfmhil" in done.stdout and done.stderr.strip() == ""
+
+
+def test_an_operator_s_command_loads_no_compiler(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", _LIGHT, "command", str(tmp_path)], capture_output=True, text=True
+    )
+    refusal, modules = done.stderr.splitlines()
+    assert "no run is going on there" in refusal
+    assert not {"numba", "scipy", "rich"} & set(modules.split())
+
+
+def test_only_what_is_compiled_is_said_and_which_of_how_many():
+    new = njit(lambda x: x + 1)
+    said: list[str] = []
+    sets = [("nothing", lambda: None), ("a sum", lambda: new(1)), ("it again", lambda: new(2))]
+    assert compile_sets(sets, said.append) == 1
+    assert said == ["compiling a sum (2 of 3, once a machine) …"]
+
+
+def cached(folder: Path) -> dict[Path, int]:
+    """The files of numba's cache and their times; not those of a kernel in user mode beside."""
+    files = (file for file in folder.rglob("*.nb[ic]") if ".pytest_cache" not in file.parts)
+    return {file: file.stat().st_mtime_ns for file in files}
+
+
+@pytest.mark.timeout(900)  # the first time it compiles everything
+def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
+    compile_everything(lambda text: None)
+    said: list[str] = []
+    assert compile_everything(said.append)[0] == len(said) == 0
+    root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[3])
+    before = cached(root)
+    assert before
+    kinds = [(link, inner) for link in link_names() for inner in ("none", "virtual-stator")]
+    for link, inner in kinds:
+        options = {"every": 2} if link == "can" else {}
+        about = {"type": link, "peer_timeout_s": 60.0, "options": options}
+        scenario = make(link=about, duration=0.005, inner=inner)
+        folder = tmp_path / f"{link}-{inner}"
+        run = run_scenario(scenario, folder, notice=said.append)
+        assert run.summary["status"] == "completed"
+    assert said == ["starting controller and plant …"] * len(kinds)
+    assert cached(root) == before

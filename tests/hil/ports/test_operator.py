@@ -1,0 +1,169 @@
+"""Commands to runs in progress, with two real processes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gfm_hil.core import temporary as scratch
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine.announcement import present
+from gfm_hil.ports.commands import Operator
+from gfm_hil.recording.log import read_log
+
+from ...support.processes import PATIENCE_S, running, wait_for
+
+pytestmark = pytest.mark.processes
+
+SCENARIO = """
+title = "told"
+duration = 600.0
+after_trip = "wait"
+ready_laws = ["vsg-5"]
+[link]
+type = "{link}"
+options = {options}
+peer_timeout_s = 30.0
+[[events]]
+type = "law"
+t = 599.0
+law = "vsg-2"
+"""
+
+
+@pytest.fixture(
+    params=[("shm", "{}"), ("zmq", "{}"), ("zmq", "{portable = true}")],
+    ids=["shm", "zmq", "zmq portable"],
+)
+def going(request, tmp_path):
+    """The folder of a long run in progress."""
+    folder, (link, options) = tmp_path / "run", request.param
+    with running(folder, SCENARIO.format(link=link, options=options)) as process:
+        yield process, folder
+
+
+def rows(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "signals.npz") as file:
+        return {name: file[name] for name in file.files if name != "laws"}
+
+
+def test_what_is_told_is_carried_out_in_the_tick_that_the_answer_names(going):
+    process, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    reference = operator.command({"type": "reference", "P_ref": 0.8})
+    law = operator.command({"type": "law", "law": "vsg-2"})
+    grid = operator.command({"type": "grid-frequency", "f_hz": 49.99})
+    assert reference["label"] == "P_ref = 0.8"
+    wait_for(lambda: operator.snapshot()["tick"] > grid["tick"] + 100)
+    seen = operator.snapshot()
+    assert (seen["ref_P_ref"], seen["law"], seen["state"]) == (0.8, 1.0, "RUNNING")
+    operator.stop()
+    assert process.wait(PATIENCE_S) == 130  # as after Ctrl-C
+    operator.close()
+    signals = rows(folder)
+    assert np.flatnonzero(signals["ref_P_ref"] == 0.8)[0] == reference["tick"]
+    assert np.flatnonzero(signals["law"] == 1)[0] == law["tick"]
+    assert np.flatnonzero(signals["true_omega_g"] < 0.9999)[0] == grid["tick"]
+    told = [e for e in read_log(folder / "events.jsonl") if e.get("by") == "operator"]
+    assert [e["tick"] for e in told] == [reference["tick"], law["tick"], grid["tick"]]
+    assert not list(folder.glob("commands_*"))
+
+
+def test_a_trip_is_waited_for_and_reset_and_gains_change(going):
+    process, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    with pytest.raises(UserError, match="the controller is RUNNING, not SAFE"):
+        operator.command({"type": "reset"})
+    operator.command({"type": "law", "law": "vsg-5"})
+    gains = operator.command({"type": "gains", "values": {"D_p": 0.012}})
+    wait_for(lambda: operator.snapshot()["tick"] > gains["tick"])
+    seen = operator.snapshot()
+    assert (seen["active"], seen["gains"]) == ("vsg-5", {"D_p": 0.012})
+    assert seen["laws"] == ["mimo-gfm", "vsg-2", "vsg-5"]
+    operator.command({"type": "grid-voltage", "V_g": 0.0})
+    wait_for(lambda: operator.snapshot()["state"] == "SAFE" and operator.snapshot()["trip"])
+    seen = operator.snapshot()
+    assert (seen["trip"], seen["reason"]) == ("over-current", "the plant's protection tripped")
+    reset = operator.command({"type": "reset"})
+    wait_for(lambda: operator.snapshot()["tick"] > reset["tick"] + 100)
+    seen = operator.snapshot()
+    assert (seen["state"], seen["active"], seen["trip"]) == ("RUNNING", "mimo-gfm", "")
+    assert seen["true_p"] == pytest.approx(0.5, abs=1e-6)
+    operator.stop()
+    assert process.wait(PATIENCE_S) == 130
+    operator.close()
+
+
+REFUSED = [
+    ({"type": "reference", "P_ref": 9.0}, r"P_ref = 9\.0: must lie in \[-2, 2\]"),
+    ({"type": "law", "law": "droop-1"}, "not made ready"),
+    ({"type": "reference", "P_ref": 0.6, "t": 1.0}, "t = 1.0: a command is carried out"),
+    ({"type": "grid-impedance", "L_g": 1e-9, "R_g": 0.0}, "too fast"),
+    ({"type": "grid-breaker", "closed": False}, "load"),
+    ({"type": "nonsense"}, "must be one of"),
+    ({"type": "gains", "values": {"k_99": 1.0}}, "parameter k_99: unknown"),
+    ({"type": "gains", "values": {}}, "at least 1"),
+    ({"type": "reset"}, "RUNNING, not SAFE"),
+    ({}, "missing"),
+]
+
+
+@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+def test_what_is_refused_changes_nothing(going):
+    _, folder = going
+    operator = Operator(folder)
+    wait_for(lambda: operator.snapshot().get("tick", 0) > 100)
+    for event, words in REFUSED:
+        with pytest.raises(UserError, match=words):
+            operator.command(event)
+        seen = operator.snapshot()
+        assert (seen["ref_P_ref"], seen["law"], seen["true_trip"]) == (0.5, 0.0, 0.0), event
+    operator.close()
+
+
+@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+def test_the_command(going):
+    process, folder = going
+
+    def tell(*words: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-m", "gfm_hil", "command", str(folder), *words]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    wait_for(lambda: json.loads(tell().stdout or "{}").get("tick", 0) > 0)
+    assert tell("P_ref=0.7", "--ramp", "0.1").stdout.startswith("P_ref = 0.7 at tick ")
+    assert tell("--gain", "D_p=0.0101").stdout.startswith("D_p = 0.0101 at tick ")
+    for words, problem in (
+        (["P=1"], "gfmhil: 'P=1': must be NAME=VALUE"),
+        (["--gain", "k_21"], "gfmhil: 'k_21': must be NAME=VALUE, NAME a gain"),
+        (["--reset"], "gfmhil: reset: the controller is RUNNING, not SAFE"),
+        (["--ramp", "1"], "gfmhil: --ramp 1: there is no reference"),
+        (["--event", "{"], "gfmhil: --event: not JSON"),
+    ):
+        refused = tell(*words)
+        assert (refused.returncode, refused.stdout) == (2, "")
+        assert refused.stderr.startswith(problem)
+    assert tell("--stop").returncode == 0
+    assert process.wait(PATIENCE_S) == 130
+    over = tell("P_ref=0.7")
+    assert over.returncode == 2 and "no run is going on there" in over.stderr
+
+
+def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
+    with scratch.temporary("gfmhil-commands-") as place:
+        endpoint = {"endpoint": f"ipc://{place}/plant"}
+        (tmp_path / "commands_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
+        assert present(tmp_path) == ["plant"]
+        Operator(tmp_path).close()
+    place.mkdir()  # as after SIGKILL
+    try:
+        assert present(tmp_path) == []
+        with pytest.raises(UserError, match="no run is going on there"):
+            Operator(tmp_path)
+    finally:
+        place.rmdir()
+    assert present(tmp_path) == []
