@@ -1,4 +1,4 @@
-"""Figures and tables of docs/h-infinity.md and docs/tuning.md. Writes
+"""Figures and tables of docs/tuning.md. Writes
 
     docs/_static/figures/{design,delay}_*.png    the figures
     docs/tables/{tune,delay}_*.md                what commands say, and numbers

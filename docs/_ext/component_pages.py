@@ -1,4 +1,4 @@
-"""The page of the plant's components: parameters from the models that check them, states and
+"""The section on the plant's components: parameters from the models that check them, states and
 breakers from plants that are built with and without each, columns from the recording's table."""
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def components() -> str:
     """Every component: what it is, its parameters, states, breaker and columns."""
     lines = []
     for one in ENTRIES:
-        lines += [f"## {one.title}", "", inspect.cleandoc(one.model.__doc__ or "")]
+        lines += [f"### {one.title}", "", inspect.cleandoc(one.model.__doc__ or "")]
         lines += ["", f"Where: {one.where}. How many: {one.how_many}.", "", table(one.model), ""]
         states = _states(one)
         lines += ["States:", "", *(states or ["- none"]), ""]

@@ -1,4 +1,4 @@
-"""The figures and the table of identification.md and envelopes.md."""
+"""The figures and the table of identification.md and conformity.md."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from gfm_hil.cli import common
 from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports import PORTS
-from gfm_hil.ports.companion import OWN_NUMBER, companion
+from gfm_hil.ports.port import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import INPROC, find_scenario

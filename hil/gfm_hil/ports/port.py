@@ -1,4 +1,5 @@
-"""The life of every port beside a run: options, address, encryption, begin and end."""
+"""The life of every port beside a run: options, address, encryption, begin and end; and the start
+of one, a gfmhil command of its own, beside a run that this process is about to start."""
 
 from __future__ import annotations
 
@@ -8,9 +9,12 @@ import contextlib
 import os
 import socket
 import ssl
+import subprocess
+import sys
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,11 +23,14 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.supervised import PAUSE_S, report
 from gfm_hil.engine.announcement import not_running, present
 from gfm_hil.links.zeromq.options import beyond_loopback
-from gfm_hil.ports import PORTS
+from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.live import begun
+from gfm_runtime.children import guarded
 
 INTERRUPTED = 130
+OWN_NUMBER = -1  # the port serves at its own number
+_GRACE_S = 5.0
 _LOOK_S = 0.1
 _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 _T = TypeVar("_T")
@@ -246,11 +253,10 @@ def check_number(option: str, number: int | None) -> None:
 def make_tls(
     words: str, certificate: Path, key: Path, clients: Path | None = None
 ) -> ssl.SSLContext:
-    """A server's TLS context.
+    """A server's TLS context, with its certificate and key.
 
     Args:
         words: the options, for an error.
-        certificate, key: of the server.
         clients: authority that signed a certificate of each client; None: clients need none.
 
     Raises:
@@ -266,3 +272,78 @@ def make_tls(
     except (OSError, ssl.SSLError) as problem:
         raise UserError(f"{words}: {problem}") from None
     return context
+
+
+@contextlib.contextmanager
+def companion(
+    name: str, folder: Path, number: int, in_process: bool
+) -> Iterator[subprocess.Popen[str] | None]:
+    """Start ``gfmhil NAME`` for a run folder that does not exist yet.
+
+    Its output goes to stderr, as stdout may carry JSON. It ends with this process, however that
+    ends.
+
+    Args:
+        name: of the port.
+        folder: where the run will be recorded.
+        number: to listen at, or ``OWN_NUMBER``.
+        in_process: the run takes no commands.
+
+    Yields:
+        The process if it stays when the run is over, else None.
+
+    Raises:
+        UserError: the port is in use, does without a run, or the command ended; it has printed why.
+    """
+    port = make_port(name)
+    port.check_needs()
+    if in_process and port.commands:
+        raise UserError(f"--{name}: a run in process takes no commands; choose --link")
+    if number == OWN_NUMBER and not port.or_any:
+        number = port.number
+    argv = [sys.executable, "-P", "-m", "gfm_hil", name, str(folder.absolute()), "--wait"]
+    if number != OWN_NUMBER:
+        _check_free(port, number)
+        argv += ["--port", str(number)]
+    # own session: the first Ctrl-C is for the run
+    process = subprocess.Popen(
+        guarded(argv), stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    out = process.stdout
+    assert out is not None
+
+    def pass_on_line() -> str:
+        line = out.readline()
+        print(line, end="", file=sys.stderr, flush=True)
+        return line
+
+    def pass_on() -> None:
+        while pass_on_line():
+            pass
+
+    try:
+        for _ in range(port.early):
+            if not pass_on_line():
+                raise UserError(f"--{name}: it ended before the run began")
+        threading.Thread(target=pass_on, daemon=True).start()
+        yield process if port.stays else None
+        if not port.stays:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_GRACE_S)
+    finally:
+        process.terminate()
+        try:
+            process.wait(_GRACE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _check_free(port: OperatorPort, number: int) -> None:
+    with socket.socket(socket.AF_INET, port.socket) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", number))
+        except (OSError, OverflowError) as problem:
+            why = getattr(problem, "strerror", None) or problem
+            raise UserError(f"--{port.name} {number}: {why}") from None

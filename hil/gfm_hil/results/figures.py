@@ -251,19 +251,16 @@ def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
     return list(axes.ravel())
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path, few_colours: bool = False) -> Picture:
+    """Save a figure; of many slanted curves, whose edges have many shades, 64 colours take a
+    quarter of the bytes and look the same."""
     with replacing(path) as part:
-        figure.savefig(part, dpi=110)
-
-
-def _save_small(figure: Figure, path: Path) -> None:
-    """Save a figure of many slanted curves, whose edges have many shades: 64 colours take a quarter
-    of the bytes and look the same."""
-    whole = io.BytesIO()
-    figure.savefig(whole, dpi=110, format="png")
-    with Image.open(whole) as picture, replacing(path) as part:
-        few = picture.convert("RGB").quantize(64, dither=Image.Dither.NONE)
-        few.save(part, "PNG", optimize=True)
+        figure.savefig(part, dpi=110, format="png")
+        if few_colours:
+            with Image.open(part) as picture:
+                few = picture.convert("RGB").quantize(64, dither=Image.Dither.NONE)
+            few.save(part, "PNG", optimize=True)
+    return Picture(path, panels(figure))
 
 
 def draw_run(
@@ -273,16 +270,12 @@ def draw_run(
     pictures = []
     if "true_p" in signals:
         figure = Figure(figsize=SIZE, layout="constrained")
-        path = folder / "signals.png"
         draw_signals(figure, scenario, signals, summary)
-        _save(figure, path)
-        pictures.append(Picture(path, panels(figure)))
+        pictures.append(_save(figure, folder / "signals.png"))
     if signals.keys() >= {*NEEDS}:
         figure = Figure(figsize=SIZE_WAVES, layout="constrained")
         if draw_waveforms(figure, scenario, signals, summary):
-            path = folder / "waveforms.png"
-            _save_small(figure, path)
-            pictures.append(Picture(path, panels(figure)))
+            pictures.append(_save(figure, folder / "waveforms.png", few_colours=True))
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
         pictures.append(draw_timing(folder, scenario, timing, summary))
     return pictures
@@ -419,9 +412,7 @@ def draw_timing(
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
     dress(right, f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}")
     right.set_xlabel("t [s]", fontsize=9)
-    path = folder / "timing.png"
-    _save(figure, path)
-    return Picture(path, panels(figure))
+    return _save(figure, folder / "timing.png")
 
 
 def draw_laws(
@@ -463,7 +454,8 @@ def draw_comparison(
     """Draw several laws into a file, see ``draw_laws``."""
     figure = Figure(figsize=SIZE_LAWS, layout="constrained")
     draw_laws(figure, scenario, runs, events)
-    _save(figure, path)
+    with replacing(path) as part:
+        figure.savefig(part, dpi=110)
 
 
 # Figures for a notebook, drawn with pyplot, which takes longer to import than a run takes.

@@ -125,7 +125,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of processes with one thread each. They are forked, when there is work, from a server
     that at once begins to import what all need. All end with this process, and a KeyboardInterrupt
     in this context ends them at once."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     context = multiprocessing.get_context("forkserver")
     # scipy loads its parts when they are first used
@@ -146,11 +146,9 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
             process.kill()
         raise
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _set_up() -> None:

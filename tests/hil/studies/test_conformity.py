@@ -198,6 +198,23 @@ def test_energy_of_the_swing_equation_is_the_inertia_constant(ramp, factor, sign
     assert found.verdict == (PASS if factor > 1 else FAIL)
 
 
+@pytest.mark.parametrize("H", [0.0, 4.0])
+def test_a_droop_is_no_inertia(ramp, H):
+    """P = (1 - omega) / droop - 2 H d(omega)/dt, against the same without net_of_droop."""
+    t = np.arange(50_000) * 1e-4
+    omega = 1.0 - 0.01 * np.clip(t - 2.0, 0.0, 0.5) / 0.5
+    p = 0.1 + (1.0 - omega) / UNDER.droop + 2 * H * 0.02 * ((t >= 2.0) & (t < 2.5))
+    asked = one("energy", df_hz=-0.5, least_s=2.5, window=[0.0, 0.5])
+    gross = one("energy", df_hz=-0.5, least_s=2.5, window=[0.0, 0.5], net_of_droop=False)
+    net, whole = judge(run_of(ramp, p=p, omega_u=omega), [asked, gross], UNDER)
+    assert net.value == pytest.approx(H, abs=1e-9)
+    assert net.verdict == (PASS if H else FAIL)
+    # the droop's energy is half of the end's power times half a second
+    by_droop = 50 * 0.5 * 0.01 / UNDER.droop * 0.5 / (2 * 0.5)
+    assert whole.value == pytest.approx(H + by_droop, rel=1e-3)
+    assert whole.verdict == PASS
+
+
 @pytest.mark.parametrize(
     ("p", "omega_u", "verdict"),
     [

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,7 +14,7 @@ from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.scenario import check_scenario, find_file, load_scenario, toml_text
-from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, Distribution, put
+from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_plant import make_plant
 from gfm_runtime import law_titles
 from gfm_runtime.errors import printable
@@ -35,15 +34,11 @@ def find_campaign(name: str) -> Path:
     return find_file("campaign", name, "campaigns/*.toml")
 
 
-def _silent(done: int, of: int) -> None:
-    """Report no progress."""
-
-
 def load_campaign(
     given: str | Path | dict[str, Any],
     laws: Mapping[str, str] = MappingProxyType({}),
     changes: Mapping[str, Any] = MappingProxyType({}),
-    tell: Tell = _silent,
+    tell: Tell = lambda done, of: None,
 ) -> Campaign:
     """Read and check a campaign, its runs included.
 
@@ -90,10 +85,18 @@ def load_campaign(
     for label, law in files.items():
         check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
     campaign = Campaign(path.stem, text, file, content, {titles[f]: f for f in files.values()})
-    checks = [*_end_checks(path, campaign), *_run_checks(path, campaign)]
-    for k, check in enumerate(checks):
-        tell(k, len(checks))
-        check()
+    ends = [(k, d, end) for k, d in enumerate(campaign.file.draw) for end in d.ends()]
+    runs = range(min(campaign.file.runs, _TRIED))
+    for done, (k, d, end) in enumerate(ends):
+        tell(done, len(ends) + len(runs))
+        # every distribution's extremes, one at a time, on the scenario as it is
+        content = copy.deepcopy(campaign.base)
+        for target in d.paths():
+            put(content, target, end)
+        check_scenario(content, f"{path}: draw.{k}, {d.path} = {end!r}")
+    for run in runs:
+        tell(len(ends) + run, len(ends) + len(runs))
+        _check_run(path, campaign, run)
     return campaign
 
 
@@ -128,29 +131,12 @@ def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> Non
         raise UserError("\n".join(f"{path}: {printable(p)}" for p in problems))
 
 
-def _end_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
-    """Try every distribution's extremes, one at a time, on the scenario as it is."""
-
-    def check(k: int, d: Distribution, value: Any) -> None:
-        content = copy.deepcopy(campaign.base)
-        for target in d.paths():
-            put(content, target, value)
-        check_scenario(content, f"{path}: draw.{k}, {d.path} = {value!r}")
-
-    for k, d in enumerate(campaign.file.draw):
-        yield from (partial(check, k, d, value) for value in d.ends())
-
-
-def _run_checks(path: Path, campaign: Campaign) -> Iterator[Callable[[], object]]:
-    """Make the runs' plants: what fails only in combination shows before anything starts."""
+def _check_run(path: Path, campaign: Campaign, run: int) -> None:
+    """Make a run's plant: what fails only in combination shows before anything starts."""
     law = campaign.file.laws[0]
-
-    def check(run: int) -> None:
-        try:
-            scenario, _ = campaign.scenario(run, law)
-            make_plant(scenario.plant, scenario.T_s)
-        except ValueError:
-            check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
-            raise
-
-    yield from (partial(check, run) for run in range(min(campaign.file.runs, _TRIED)))
+    try:
+        scenario, _ = campaign.scenario(run, law)
+        make_plant(scenario.plant, scenario.T_s)
+    except ValueError:
+        check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
+        raise
