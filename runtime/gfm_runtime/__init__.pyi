@@ -2,7 +2,7 @@ from .catalogue import LawSet, get_law, law_file, law_names, law_titles, load_la
 from .elements import Element
 from .errors import LawError
 from .kernel import law_dtype, pack_law, state_dtype, step
-from .law import HomeGrid, Limits, Parameter
+from .law import BuiltLaw, HomeGrid, Limits, Parameter
 from .lawfile import build_law, parse_law, read_law_file, tied
 from .realisation import LawStateSpace, realise
 from .signals import SIGNALS, Signal
@@ -10,8 +10,8 @@ from .switchover import change_law
 from .tustin import DiscreteLaw, discretise
 
 __all__ = [
-    "BuiltLaw",
     "SIGNALS",
+    "BuiltLaw",
     "DiscreteLaw",
     "Element",
     "HomeGrid",

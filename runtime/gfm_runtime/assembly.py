@@ -75,7 +75,10 @@ class Controller:
             self._first[asked] = len(self.discrete)
             self.discrete += [discretise(law, T_s) for law in s.laws]
             self.names += [asked] * len(s.laws)
-            self.labels += [s.name] if len(s.laws) == 1 else _stage_labels(s)
+            if (count := len(s.laws)) > MAX_STAGES:
+                why = f"{count} stages; the controller holds {MAX_STAGES}"
+                raise LawError(f"law {s.name}", why)
+            self.labels += [s.name] if count == 1 else [f"{s.name}[{k}]" for k in range(count)]
         self.discrete += [self.discrete[0]] * SPARE
         self.names += [next(iter(self.sets))] * SPARE
         self.changed: list[dict[str, float]] = [{} for _ in self.discrete]
@@ -196,12 +199,6 @@ class Controller:
         """One tick from Python: y (5,) in, u (3,) in and out, p.u.; (11,) and (4,) with an inner
         stage."""
         control(self.ctl, self.laws, self.states, self.est, y, u)
-
-
-def _stage_labels(s: LawSet) -> list[str]:
-    if len(s.laws) > MAX_STAGES:
-        raise LawError(f"law {s.name}", f"{len(s.laws)} stages; the controller holds {MAX_STAGES}")
-    return [f"{s.name}[{k}]" for k in range(len(s.laws))]
 
 
 def warm_up(controller: Controller) -> None:

@@ -53,10 +53,6 @@ def law_titles(names: Iterable[str]) -> dict[str, str]:
     return {name: titles[name] for name in laws}
 
 
-def _natural(name: str) -> list[int | str]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
-
-
 @cache
 def law_names() -> tuple[str, ...]:
     """Names of all laws that ship except the tuned ones, in natural order."""
@@ -72,7 +68,11 @@ def tuned_names() -> tuple[str, ...]:
 def _names(group: str) -> tuple[str, ...]:
     folder = files("gfm_runtime").joinpath("laws", group)
     found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
-    return tuple(sorted(found, key=_natural))  # vsg-2 before vsg-10
+
+    def natural(name: str) -> list[int | str]:  # vsg-2 before vsg-10
+        return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+
+    return tuple(sorted(found, key=natural))
 
 
 @cache

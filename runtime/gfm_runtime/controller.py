@@ -22,15 +22,7 @@ from gfm_runtime.impedance import estimate
 from gfm_runtime.inner import settle_inner, take_measurements
 from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner
 from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
-from gfm_runtime.states import (
-    BAD_U,
-    BAD_Y,
-    PLANT_TRIP,
-    READY,
-    RUNNING,
-    SAFE,
-    STALE,
-)
+from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
 from gfm_runtime.switchover import change_law, settle_into
 
 MAX_STAGES = 8

@@ -25,12 +25,7 @@ from gfm_runtime.compiled import inlined
 
 LINEAR, DC_ENERGY, DVOC, HYBRID_ANGLE = 0, 1, 2, 3
 
-ERROR_MAPS = {
-    "linear": LINEAR,
-    "dc-energy": DC_ENERGY,
-    "dvoc": DVOC,
-    "hybrid-angle": HYBRID_ANGLE,
-}
+ERROR_MAPS = {"linear": LINEAR, "dc-energy": DC_ENERGY, "dvoc": DVOC, "hybrid-angle": HYBRID_ANGLE}
 #: maps across a line, which need its R and X
 WITH_IMPEDANCE = ("hybrid-angle",)
 

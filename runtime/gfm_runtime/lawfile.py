@@ -153,18 +153,8 @@ class LawFile(TomlTable):
     )
 
 
-def build_element(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> Element:
-    """One factor with its numbers evaluated; the parameters may be arrays.
-
-    Raises:
-        LawError: naming the cell, the number and what is allowed.
-    """
-    numbers = element_numbers(where, spec, parameters)
-    return elements.make(where, spec.type, numbers)
-
-
 def element_numbers(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The numbers of a factor by name, its expressions evaluated."""
+    """The numbers of a factor by name, its expressions evaluated; the parameters may be arrays."""
     given = spec.model_dump(exclude={"type"}, exclude_none=True)
     return {name: evaluate(f"{where}.{name}", value, parameters) for name, value in given.items()}
 
@@ -183,7 +173,9 @@ def _cells(
             cell = (int(key[0]) - 1, int(key[1]) - 1)
             product = elements.P(1.0)
             for factor in spec:
-                product = product * build_element(cell_name(matrix, cell), factor, numbers)
+                where = cell_name(matrix, cell)
+                own = element_numbers(where, factor, numbers)
+                product = product * elements.make(where, factor.type, own)
             cells[cell] = product
     return cells
 

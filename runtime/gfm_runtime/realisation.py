@@ -16,15 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_runtime.elements import (
-    INTEGRATOR,
-    Element,
-    Polynomial,
-    over,
-    poly_add,
-    poly_mul,
-    union,
-)
+from gfm_runtime.elements import INTEGRATOR, Element, Polynomial, over, poly_add, poly_mul, union
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import BuiltLaw, cell_name
 from gfm_runtime.signals import NU, NY, REF_NAMES
@@ -76,6 +68,7 @@ class Row(NamedTuple):
     D_y: Matrix
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused
 def realise(law: BuiltLaw) -> LawStateSpace:
     """State space of a law.
 
@@ -83,7 +76,13 @@ def realise(law: BuiltLaw) -> LawStateSpace:
         LawError: two integrators in series through omega_u, a coefficient that is not finite.
     """
     _check_series(law)
-    return assemble([_row(law, i) for i in range(NU)], law.u_0)
+    rows = []
+    for i in range(NU):
+        phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
+        rows.append(row_of(phi, psi))
+        if not all(np.isfinite(part).all() for part in rows[-1]):
+            raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
+    return assemble(rows, law.u_0)
 
 
 def assemble(rows: Sequence[Row], u_0: Sequence[float | str]) -> LawStateSpace:
@@ -130,16 +129,6 @@ def _check_series(law: BuiltLaw) -> None:
                 raise LawError(cell_name(matrix, (i, 2)), why)
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused below
-def _row(law: BuiltLaw, i: int) -> Row:
-    """Observer form of row i."""
-    phi, psi = ([law.element(matrix, (i, j)) for j in range(NY)] for matrix in ("phi", "psi"))
-    row = row_of(phi, psi)
-    if not all(np.isfinite(part).all() for part in row):
-        raise LawError(law.dynamic(i), "together they give a coefficient that is not finite")
-    return row
-
-
 def row_of(phi: Sequence[Element], psi: Sequence[Element], smooth: bool = False) -> Row:
     """Observer form of a row by its elements, five each; those of N laws give N rows.
 
@@ -164,27 +153,15 @@ def row_of(phi: Sequence[Element], psi: Sequence[Element], smooth: bool = False)
             for k, c in enumerate(numerator):
                 on[..., j, k] = c / lead
     T: Matrix = powers(monic)
-    return observer_form(monic, on_r, on_y, T if smooth else np.exp2(np.round(np.log2(T))))
-
-
-def observer_form(d: Matrix, on_r: Matrix, on_y: Matrix, T: Matrix) -> Row:
-    """One row of a law as a state space: A, B_r, B_y, D_r, D_y; its C is (1, 0, ..., 0).
-
-    Coefficients are in ascending powers of s and may have leading axes.
-
-    Args:
-        d: common denominator with leading coefficient 1, shape (..., m+1).
-        on_r, on_y: numerators, shape (..., 5, m+1).
-        T: scales of the states, shape (..., m).
-    """
-    m = d.shape[-1] - 1
-    A = np.zeros((*d.shape[:-1], m, m))
+    T = T if smooth else np.exp2(np.round(np.log2(T)))
+    m = monic.shape[-1] - 1
+    A = np.zeros((*monic.shape[:-1], m, m))
     if m:
-        A[..., 0] = -d[..., m - 1 :: -1]
+        A[..., 0] = -monic[..., m - 1 :: -1]
         A[..., : m - 1, 1:] = np.eye(m - 1)
     D_r, D_y = on_r[..., m], on_y[..., m]
     B_r, B_y = (
-        np.swapaxes(b[..., :m] - b[..., m:] * d[..., None, :m], -1, -2)[..., ::-1, :]
+        np.swapaxes(b[..., :m] - b[..., m:] * monic[..., None, :m], -1, -2)[..., ::-1, :]
         for b in (on_r, on_y)
     )
     across, down = T[..., None, :], T[..., None]

@@ -35,18 +35,17 @@ def _number(value: Any) -> float | str:
     raise PydanticCustomError("number", "must be a number or an expression over the parameters")
 
 
-def _positive(value: Any) -> float | str:
-    number = _number(value)
-    if not isinstance(number, str) and not number > 0.0:
-        raise PydanticCustomError("positive", "must be > 0")
-    return number
+def _signed(zero: bool) -> PlainValidator:
+    """A validator of numbers > 0, or >= 0 if ``zero``, and of expressions."""
+    name, must = ("not_negative", "must be >= 0") if zero else ("positive", "must be > 0")
 
+    def validated(value: Any) -> float | str:
+        number = _number(value)
+        if not isinstance(number, str) and not (number >= 0.0 if zero else number > 0.0):
+            raise PydanticCustomError(name, must)
+        return number
 
-def _not_negative(value: Any) -> float | str:
-    number = _number(value)
-    if not isinstance(number, str) and not number >= 0.0:
-        raise PydanticCustomError("not_negative", "must be >= 0")
-    return number
+    return PlainValidator(validated, float | str)
 
 
 # A number or an expression over the law's parameters: a float once the expressions are
@@ -58,8 +57,8 @@ if TYPE_CHECKING:
     NotNegative = float
 else:
     Number = NumberOrName = Annotated[float | str, PlainValidator(_number, float | str)]
-    Positive = Annotated[float | str, PlainValidator(_positive, float | str)]
-    NotNegative = Annotated[float | str, PlainValidator(_not_negative, float | str)]
+    Positive = Annotated[float | str, _signed(zero=False)]
+    NotNegative = Annotated[float | str, _signed(zero=True)]
 
 
 def read_toml(path: str | Path, links: bool = True) -> dict[str, Any]:

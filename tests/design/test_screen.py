@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gfm_design.model.least_stable import least_stable
+from gfm_design.model.closed_loop import least_stable
 from gfm_design.norms.peaks import model, peaks
 from gfm_design.norms.performance import StateSpace
 from gfm_design.tuning.gains import Encoding, free_gains

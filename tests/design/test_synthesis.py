@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from gfm_design.model.least_stable import least_stable
+from gfm_design.model.closed_loop import least_stable
 from gfm_design.tuning.gains import Encoding, FreeGain, free_gains
 from gfm_design.tuning.paper import PAPER_START, PaperProblem, tune_paper
 from gfm_design.tuning.synthesis import UNSTABLE, NotStabilised, Tuned, tune, unstable_cost

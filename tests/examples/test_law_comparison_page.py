@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_design.model.least_stable import LeastStable
+from gfm_design.model.closed_loop import LeastStable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper import PaperProblem
 from gfm_runtime import law_file, law_names, tuned_names

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gfm_design.model.closed_loop import T_S
-from gfm_design.model.least_stable import LeastStable, least_stable
+from gfm_design.model.closed_loop import T_S, LeastStable, least_stable
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper import PaperProblem
 from gfm_design.tuning.synthesis import UNSTABLE

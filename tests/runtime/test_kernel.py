@@ -178,8 +178,10 @@ def test_limits_are_exact_and_do_nothing_inside():
 
 
 def limited(law: BuiltLaw, **limits: Any) -> BuiltLaw:
-    return BuiltLaw(law.name, "", "", law.phi, law.psi, law.u_0, law.error_map, law.error_parameters,
-               Limits(**limits))  # fmt: skip
+    return BuiltLaw(
+        law.name, "", "", law.phi, law.psi, law.u_0, law.error_map, law.error_parameters,
+        Limits(**limits),
+    )  # fmt: skip
 
 
 INTEGRATORS = [

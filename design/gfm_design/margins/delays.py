@@ -100,6 +100,7 @@ class DelayMargins:
             scan.append(min(end, scan[-1] + step))
         self.scan = [samples * self.T_s for samples in scan]
         self._paths: dict[tuple[bool, bytes], Any] = {}
+        self._first_seen: dict[bool, Response] = {}
 
     def overall(self) -> DelayMargin:
         """Margin for more delay of all of u at once."""
@@ -140,8 +141,9 @@ class DelayMargins:
     def _first_unstable(self, at_u: bool, channels: list[int]) -> int:
         """Which value of the scan is the first with an unstable pole; their number if none is."""
         omega, scan = self._omega, self.scan[1:]
-        x = self._seen_u if at_u else self._seen_y
-        G = self._ratio(at_u, channels, omega, x, scan)
+        if at_u not in self._first_seen:
+            self._first_seen[at_u] = self._seen(at_u, omega)
+        G = self._ratio(at_u, channels, omega, self._first_seen[at_u], scan)
         for _ in range(_ROUNDS):
             turns = np.angle(G[:, 1:] * G[:, :-1].conj())
             # from z = 1 to z = -1, half a turn for each pole
@@ -179,14 +181,6 @@ class DelayMargins:
         z = np.exp(1j * omega * self.T_s)
         to_u, from_y = self._responses
         return to_u(z).swapaxes(1, 2) if at_u else from_y(z)
-
-    @cached_property
-    def _seen_u(self) -> Response:
-        return self._seen(True, self._omega)
-
-    @cached_property
-    def _seen_y(self) -> Response:
-        return self._seen(False, self._omega)
 
     def _ratio(
         self, at_u: bool, channels: list[int], omega: Matrix, x: Response, scan: Sequence[float]

@@ -30,7 +30,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import ClosedLoop, Responses, frequencies_near
+from gfm_design.model.closed_loop import GONE, ClosedLoop, Responses, frequencies_near
 from gfm_design.norms.hinf import hinf_norm
 
 Matrix = NDArray[np.float64]
@@ -40,7 +40,6 @@ _LOWEST = 1e-3  # rad/s; below it H hardly changes, unless the loop has a pole t
 _STRAIGHT = 0.01
 _ROUNDS = 12
 _APART = 1e-9  # relative distance of two frequencies
-_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Locus:
         """(omega, H(omega)) from 0 to the Nyquist frequency, as fine as the locus needs."""
         top = np.pi / self.T_s
         poles = np.linalg.eigvals(self.A)
-        s = np.log(poles[np.abs(poles) > _GONE].astype(complex)) / self.T_s
+        s = np.log(poles[np.abs(poles) > GONE].astype(complex)) / self.T_s
         near, base = frequencies_near(s), np.geomspace(_LOWEST, top, 200)
         omega = np.unique(np.concatenate([[0.0, top], base, near[near < top]]))
         omega = omega[np.diff(omega, prepend=-1.0) > _APART * omega]  # modes may be equal
@@ -155,15 +154,9 @@ def gain_phase(locus: Locus, omega: Matrix, H: Response, k: int) -> GainPhase:
     H_unit = at(unit)
     phases = np.abs(np.angle((H_unit - 0.5) / (H_unit + 0.5), deg=True))
     phase, phase_at = _nearest(phases, unit, (0.0, np.inf), np.min, np.inf)
-    return GainPhase(
-        low,
-        low_at / (2 * np.pi),
-        high,
-        high_at / (2 * np.pi),
-        phase,
-        phase_at / (2 * np.pi),
-        1.0 / _peak(at, omega, np.abs(h)),
-    )
+    low_at, high_at, phase_at = (w / (2 * np.pi) for w in (low_at, high_at, phase_at))
+    disk = 1.0 / _peak(at, omega, np.abs(h))
+    return GainPhase(low, low_at, high, high_at, phase, phase_at, disk)
 
 
 def _nearest(

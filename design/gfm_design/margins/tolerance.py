@@ -78,19 +78,19 @@ def factor(loop: ClosedLoop, element: Element) -> float:
 def element_range(loop: ClosedLoop, names: Sequence[Element]) -> Range:
     """The range of one element, or of several together, each over its value in the loop."""
     now = {name: factor(loop, name) for name in names}
-    return _range(loop, lambda f: {name: v * f for name, v in now.items()})
+
+    def at(f: float) -> dict[Element, float]:
+        return {name: v * f for name, v in now.items()}
+
+    return Range(_end(loop, at, FLOOR), _end(loop, at, CEILING))
 
 
 def grid_strength(loop: ClosedLoop) -> GridStrength:
     """L_g and R_g together."""
-    L_g, R_g = factor(loop, "L_g"), factor(loop, "R_g")
-    found = _range(loop, lambda f: {"L_g": L_g * f, "R_g": R_g * f})
     R, X = (float(loop.made_of.par[name][0]) for name in ("R_g", "L_g"))
-    return GridStrength(found, 1 / np.hypot(R, X), X / R if R else np.inf)
-
-
-def _range(loop: ClosedLoop, at: Callable[[float], Mapping[Element, float]]) -> Range:
-    return Range(_end(loop, at, FLOOR), _end(loop, at, CEILING))
+    return GridStrength(
+        element_range(loop, ("L_g", "R_g")), 1 / np.hypot(R, X), X / R if R else np.inf
+    )
 
 
 def _end(loop: ClosedLoop, at: Callable[[float], Mapping[Element, float]], last: float) -> End:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,8 +51,11 @@ from gfm_runtime.catalogue import get_law
 from gfm_runtime.errors import LawError
 from gfm_runtime.law import BuiltLaw
 from gfm_runtime.realisation import realise
-from gfm_runtime.signals import NY, REF_NAMES, Y_NAMES, carried
+from gfm_runtime.signals import NY, REF_NAMES, U_NAMES, Y_NAMES, carried
 from gfm_runtime.tustin import OMEGA_COLUMN, OMEGA_ROW, DiscreteLaw, discretise
+
+if TYPE_CHECKING:
+    from gfm_design.model.network import Surroundings
 
 Matrix = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -71,7 +74,7 @@ NOT_IDEAL = (
 
 #: distances from a resonance at which to look, as multiples of its damping
 _ACROSS = np.concatenate([-np.logspace(1, -1.5, 8), [0.0], np.logspace(-1.5, 1, 8)])
-_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
+GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 _P_REF, _OMEGA_G = INPUTS.index("P_ref"), INPUTS.index("grid.omega_g")
 _V_C, _I_O = 2, 4  # where v_d and i_od are in the plant's state; v_q and i_oq follow
 _P, _Q, _V = (Y_NAMES.index(name) for name in ("p", "q", "V"))
@@ -89,33 +92,66 @@ class Origin:
     op: OperatingPoint  #: the operating point
 
 
-class Surroundings(Protocol):
-    """The rest of a network around one converter, see ``gfm_design.model.network``."""
+class LinearLoop:
+    """What the loop of one converter and that of a network have in common."""
 
-    @property
-    def name(self) -> str:
-        """That of the converter, and of its law."""
+    _what = "loop"
+    T_s: float | None
 
-    @property
-    def op(self) -> OperatingPoint:
-        """Where the converter rests."""
+    @cached_property
+    def A(self) -> Matrix:
+        """The loop's matrix, shape (..., n, n)."""
+        raise NotImplementedError
 
-    @property
-    def ref(self) -> Matrix:
-        """Its references, shape (5,), p.u."""
+    @cached_property
+    def state_space(self) -> StateSpace:
+        """(A, B, C, D) from the inputs to y, before the sensors."""
+        raise NotImplementedError
 
-    def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
-        """The network from tick to tick as the converter meets it, all others under their laws.
+    def sigma(self) -> Any:
+        """Largest real part of any mode, 1/s: a number, or the shape of the leading axes.
 
-        Args:
-            u_delay, y_delay: of the converter, as for ``ClosedLoop``.
+        A sampled loop without any eigenvalue but 0 gives -inf.
         """
+        values = np.linalg.eigvals(self.A)
+        if self.T_s is None:
+            return values.real.max(axis=-1)
+        with np.errstate(divide="ignore"):
+            return np.log(np.abs(values).max(axis=-1)) / self.T_s
 
-    def lines(self, u_delay: Matrix, y_delay: Matrix) -> list[slice]:
-        """Where the delay line of each u, then of each y, of the converter is there."""
+    def poles(self) -> Response:
+        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without delay lines."""
+        values = np.linalg.eigvals(self.A).astype(complex)
+        return values if self.T_s is None else np.log(values[np.abs(values) > GONE]) / self.T_s
+
+    def _step(
+        self, of: str, among: Sequence[str], seconds: float, every: float
+    ) -> tuple[Matrix, Matrix]:
+        """(t, y) after a unit step of one of the inputs.
+
+        Raises:
+            ValueError: no such input.
+        """
+        if of not in among:
+            raise ValueError(f"{of!r} is no input of the {self._what}; use one of {list(among)}")
+        A, B, C, D = self.state_space
+        k, tick = among.index(of), self.T_s or every
+        if self.T_s is None:
+            A, B = hold(A, B, tick)
+        t = np.asarray(tick * np.arange(round(seconds / tick) + 1), np.float64)
+        x, y = np.zeros(len(A)), np.empty((len(t), len(C)))
+        for row in y:
+            row[:] = C @ x + D[:, k]
+            x = A @ x + B[:, k]
+        return t, y
+
+    def _at(self, omega: ArrayLike) -> Response:
+        """s, or z = e^(s T_s), on the imaginary axis."""
+        s = 1j * np.asarray(omega, float)
+        return s if self.T_s is None else np.exp(s * self.T_s)
 
 
-class ClosedLoop:
+class ClosedLoop(LinearLoop):
     """A law on a plant around one operating point.
 
     Args:
@@ -396,22 +432,6 @@ class ClosedLoop:
 
     # results
 
-    def sigma(self) -> Any:
-        """Largest real part of any mode, 1/s: a number, or the shape of the leading axes.
-
-        A sampled loop without any eigenvalue but 0 gives -inf.
-        """
-        values = np.linalg.eigvals(self.A)
-        if self.T_s is None:
-            return values.real.max(axis=-1)
-        with np.errstate(divide="ignore"):
-            return np.log(np.abs(values).max(axis=-1)) / self.T_s
-
-    def poles(self) -> Response:
-        """Poles of a single loop as s, 1/s; of a sampled one log(z)/T_s without delay lines."""
-        values = np.linalg.eigvals(self.A).astype(complex)
-        return values if self.T_s is None else np.log(values[np.abs(values) > _GONE]) / self.T_s
-
     def modes(self) -> list[Mode]:
         """Modes of a single loop, the slowest to decay (largest sigma) first."""
         upper = [Mode.of(s) for s in self.poles() if s.imag >= 0.0]
@@ -446,19 +466,7 @@ class ClosedLoop:
         Raises:
             ValueError: no such input.
         """
-        if of not in INPUTS:
-            raise ValueError(f"{of!r} is no input of the loop; use one of {list(INPUTS)}")
-        A, B, C, D = self.state_space
-        k = INPUTS.index(of)
-        tick = self.T_s or every
-        if self.T_s is None:
-            A, B = hold(A, B, tick)
-        t = np.asarray(tick * np.arange(round(seconds / tick) + 1), np.float64)
-        x, y = np.zeros(len(A)), np.empty((len(t), NY))
-        for row in y:
-            row[:] = C @ x + D[:, k]
-            x = A @ x + B[:, k]
-        return t, y
+        return self._step(of, INPUTS, seconds, every)
 
     def frequency_response(self, omega: ArrayLike) -> Response:
         """The closed loop from ``INPUTS`` to y at omega [rad/s] (K,), shape (K, 5, 7)."""
@@ -542,11 +550,6 @@ class ClosedLoop:
         v_by = response((A, np.hstack([alone.B, by_i]), v, zero), s)
         return -(v_by[..., n_u:] + v_by[..., :n_u] @ u)
 
-    def _at(self, omega: ArrayLike) -> Response:
-        """s, or z = e^(s T_s), on the imaginary axis."""
-        s = 1j * np.asarray(omega, float)
-        return s if self.T_s is None else np.exp(s * self.T_s)
-
 
 def frequencies_near(poles: Response) -> Matrix:
     """Frequencies [rad/s] across the resonance of each pole [1/s], in no order."""
@@ -576,3 +579,54 @@ class Responses:
 def response(of: StateSpace, s: Response) -> Response:
     """C (s I - A)^-1 B + D, one a row of s."""
     return Responses(*of)(s)
+
+
+# --- the least stable mode, and the states that take part in it ---
+
+_PLANT = ("i_d", "i_q", "v_d", "v_q", "i_od", "i_oq", "delta", "v_dc")  # gfm_plant.model
+_SENSORS = tuple(f"sensor of {name}" for name in Y_NAMES if name != "omega_u")
+_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class LeastStable:
+    """A mode of a loop, and its largest participation factors by state.
+
+    The factor of state k is |l_k r_k| of the mode's left and right eigenvectors, divided by the sum
+    over all states (Pérez-Arriaga, Verghese and Schweppe, 1982).
+    """
+
+    mode: Mode
+    states: tuple[tuple[str, float], ...]
+
+    def words(self) -> str:
+        """The mode and its states in one line."""
+        who = ", ".join(f"{name} {100 * share:.0f} %" for name, share in self.states)
+        return f"{self.mode.words()}: {who}"
+
+
+def least_stable(loop: ClosedLoop) -> LeastStable:
+    """The mode of a loop with the largest sigma, and the states that take part in it."""
+    values, right = np.linalg.eig(loop.A)
+    k = int(np.argmax(values.real if loop.T_s is None else np.abs(values)))
+    shares = np.abs(np.linalg.inv(right)[k] * right[:, k])
+    s = complex(values[k]) if loop.T_s is None else np.log(complex(values[k])) / loop.T_s
+    names, shares = _states(loop), shares / shares.sum()
+    assert len(names) == len(shares)
+    largest = tuple((names[n], float(shares[n])) for n in np.argsort(-shares)[:_SHOWN])
+    return LeastStable(Mode.of(s), largest)
+
+
+def _states(loop: ClosedLoop) -> list[str]:
+    """Names of the states of a single loop, in their order."""
+    size, acts = len(loop.plant.A) - len(_PLANT), loop.plant.B.any(axis=0)
+    names = [*_PLANT, *["integral of the DC source"] * (size % len(_SENSORS))]
+    names += _SENSORS if size >= len(_SENSORS) else ()
+    late = [*zip(U_CARRIED, loop.u_delay * acts, strict=False)]
+    late += zip(Y_CARRIED, loop.y_delay, strict=False)
+    for name, delay in late if loop.T_s else ():
+        names += [f"{name} on its way"] * int(np.ceil(delay / loop.T_s - 1e-9))
+    if loop.stage is not None and loop.stage.has_pll:
+        names.append("omega_u that acts")
+    names += [f"law's state of {U_NAMES[row]}" for row in loop.law.rows]
+    return [*names, *(loop.stage.states if loop.stage else ())]

@@ -351,13 +351,12 @@ def _splits(
     plant: LinearPlant, T_s: float, u_delay: Matrix, y_delay: Matrix
 ) -> tuple[Splits, Splits]:
     """Whole samples and fraction of each u and y; a command that does not act needs no line."""
-    u = [_split(d, T_s) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
-    return u, [_split(d, T_s) for d in y_delay]
 
+    def split(delay: float) -> tuple[int, float]:
+        samples = float(delay) / T_s
+        whole = int(np.floor(samples + _WHOLE))
+        part = samples - whole
+        return whole, part if part > _WHOLE else 0.0
 
-def _split(delay: float, T_s: float) -> tuple[int, float]:
-    """Whole samples, and the remaining fraction of one."""
-    samples = float(delay) / T_s
-    whole = int(np.floor(samples + _WHOLE))
-    part = samples - whole
-    return whole, part if part > _WHOLE else 0.0
+    u = [split(d) if plant.B[:, j].any() else (0, 0.0) for j, d in enumerate(u_delay)]
+    return u, [split(d) for d in y_delay]

@@ -26,7 +26,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eig
 
-from gfm_design.model.closed_loop import INPUTS, ClosedLoop, Matrix, Response, response
+from gfm_design.model.closed_loop import (
+    GONE,
+    INPUTS,
+    ClosedLoop,
+    LinearLoop,
+    Matrix,
+    Response,
+    response,
+)
 from gfm_design.model.inner import LinearStage, linearise_stage
 from gfm_design.model.linear import (
     LinearLaw,
@@ -55,7 +63,6 @@ GRID, LINES = "the grid", "lines and loads"
 """The parts of a network that take part in modes besides converters, machines and loads of constant
 power."""
 
-_GONE = 1e-9  # poles with a smaller |z| are those of the delay lines: z = 0 but for rounding
 _SAME = (
     1e-6  # distance of poles that count as one, over 1 1/s + |s|: identical converters have such
 )
@@ -123,7 +130,7 @@ class LinearNetwork:
         return slice(len(self.turn), sum(self.turn.shape))
 
 
-class NetworkLoop:
+class NetworkLoop(LinearLoop):
     """All converters of a network under their laws, sampled, around their operating point.
 
     Args:
@@ -133,8 +140,8 @@ class NetworkLoop:
         u_delay: of each command, from the tick that samples y to the moment when it acts, s.
     """
 
-    #: what a converter's view is
-    view: type[ClosedLoop] = ClosedLoop
+    _what = "network"
+    T_s: float
 
     def __init__(
         self,
@@ -181,7 +188,7 @@ class NetworkLoop:
             members.append(LinearConverter(unit.name, title, linear, stage, op, ref, *places))
             delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
             at_u, at_y = at_u + n_u, at_y + n_y
-        return cls(linearise_network(resting, members), members, T_s, np.array(delays))
+        return cls(_Writing(resting, members).written(), members, T_s, np.array(delays))
 
     def __repr__(self) -> str:
         titles = ", ".join(member.title for member in self.members)
@@ -207,10 +214,10 @@ class NetworkLoop:
             raise ValueError(f"{name!r} is no converter of the network; use one of {self.names}")
         place = self.names.index(name)
         one, whole = self.members[place], self._steady(self.network.plant)
-        around = _Others(self, place)
+        around = Surroundings(self, place)
         delays = self.u_delay[one.u], self.y_delay[one.y]
         plant = around.seen(whole)
-        return self.view(plant, one.law, self.T_s, *delays, stage=one.stage, around=around)
+        return ClosedLoop(plant, one.law, self.T_s, *delays, stage=one.stage, around=around)
 
     # matrices
 
@@ -257,15 +264,6 @@ class NetworkLoop:
 
     # results
 
-    def sigma(self) -> float:
-        """Largest real part of any mode, 1/s."""
-        return float(np.log(np.abs(np.linalg.eigvals(self.A)).max()) / self.T_s)
-
-    def poles(self) -> Response:
-        """Poles as s = log(z)/T_s, 1/s, without those of the delay lines."""
-        values = np.linalg.eigvals(self.A).astype(complex)
-        return np.asarray(np.log(values[np.abs(values) > _GONE]) / self.T_s)
-
     def modes(self) -> list[NetworkMode]:
         """The modes and the parts that take part in each, the largest sigma first.
 
@@ -273,7 +271,7 @@ class NetworkLoop:
         participations.
         """
         values, left, right = eig(self.A, left=True, right=True)
-        there = np.abs(values) > _GONE
+        there = np.abs(values) > GONE
         values, left, right = values[there], left[:, there], right[:, there]
         s = np.log(values) / self.T_s
         found, done = list[NetworkMode](), s.imag < 0.0
@@ -330,32 +328,25 @@ class NetworkLoop:
         Raises:
             ValueError: no such input.
         """
-        if of not in self.inputs:
-            raise ValueError(f"{of!r} is no input of the network; use one of {list(self.inputs)}")
-        A, B, C, D = self.state_space
-        k = self.inputs.index(of)
-        t = np.asarray(self.T_s * np.arange(round(seconds / self.T_s) + 1), np.float64)
-        x, y = np.zeros(len(A)), np.empty((len(t), len(C)))
-        for row in y:
-            row[:] = C @ x + D[:, k]
-            x = A @ x + B[:, k]
+        t, y = self._step(of, self.inputs, seconds, self.T_s)
         each = np.split(y, len(self.members), axis=1)
         return t, dict(zip(self.names, each, strict=True))
 
     def frequency_response(self, omega: ArrayLike) -> Response:
         """From ``inputs`` to y of all converters at omega [rad/s] (K,), shape (K, 5 N, 5 N + 2)."""
-        return response(self.state_space, np.exp(1j * np.asarray(omega, float) * self.T_s))
+        return response(self.state_space, self._at(omega))
 
 
 @dataclass(frozen=True)
-class _Others:
-    """The network around one converter; see ``closed_loop.Surroundings``."""
+class Surroundings:
+    """The network around one converter, all others under their laws."""
 
     loop: NetworkLoop
     place: int
 
     @property
     def name(self) -> str:
+        """That of the converter, and of its law."""
         return self.loop.members[self.place].title
 
     @property
@@ -367,6 +358,7 @@ class _Others:
         return self.loop.members[self.place].ref
 
     def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
+        """The network from tick to tick as the converter meets it; its delays as for a loop."""
         loop, one = self.loop, self.loop.members[self.place]
         p = loop._steady(loop.held(*self._of_all(u_delay, y_delay)))
         A = _closed(p, [m for m in loop.members if m is not one])
@@ -376,6 +368,7 @@ class _Others:
         return self.seen(LinearPlant(A, B, B_d, C, C_true))
 
     def lines(self, u_delay: Matrix, y_delay: Matrix) -> list[slice]:
+        """Where the delay line of each u, then of each y, of the converter is there."""
         loop, one = self.loop, self.loop.members[self.place]
         gone = len(loop.network.plant.A) - len(loop.network.turn)
         lines = delay_lines(loop.network.plant, loop.T_s, *self._of_all(u_delay, y_delay))
@@ -413,13 +406,8 @@ def _closed(p: LinearPlant, members: Sequence[LinearConverter]) -> Matrix:
     return A
 
 
-def linearise_network(plant: Network, members: Sequence[LinearConverter]) -> LinearNetwork:
-    """A network at rest, as ``Network.start`` leaves it, around that rest."""
-    return _Writing(plant, members).written()
-
-
 class _Writing:
-    """The network's matrices while they are written, in absolute angles.
+    """The matrices of a network at rest, as ``Network.start`` leaves it, while they are written.
 
     The states are the modes of the circuit, their real parts and then their imaginary parts; of
     each converter its angle and what ``linearise_plant`` has from v_dc on; of each machine angle,

@@ -53,11 +53,7 @@ class OperatingPoint:
 
 
 def operating_point(
-    par: Record,
-    law: DiscreteLaw,
-    ref: Vector,
-    omega_g: float = 1.0,
-    V_g: float = 1.0,
+    par: Record, law: DiscreteLaw, ref: Vector, omega_g: float = 1.0, V_g: float = 1.0
 ) -> OperatingPoint:
     """Solve for the operating point by Newton's method.
 
@@ -72,15 +68,10 @@ def operating_point(
             within the line's capacity, or no steady state at all).
     """
     side = _ConverterRest(par, law, np.asarray(ref))
-    z = side.first(V_g, omega_g)
-
-    def residual(z: Vector) -> Vector:
-        return side.residual(z, V_g, omega_g)
-
-    found = _newton(residual, z)
-    if found is None:
+    z = _newton(lambda z: side.residual(z, V_g, omega_g), side.first(V_g, omega_g))
+    if z is None:
         raise NoEquilibrium(side.no_rest(f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."))
-    return side.found(found, omega_g)
+    return side.found(z, omega_g)
 
 
 def operating_points(
@@ -306,7 +297,9 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
         if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
             return z
         if not largest < 0.1 * before:
-            jacobian = _slopes(residual, z)
+            nudges = _NUDGE * np.eye(len(z))
+            slopes = [(residual(z + n) - residual(z - n)) / (2 * _NUDGE) for n in nudges]
+            jacobian = np.stack(slopes, axis=1)
         step = np.linalg.lstsq(jacobian, now, rcond=1e-12)[0]
         before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
@@ -315,15 +308,6 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
         if largest < 1e-10:
             return z if np.abs(residual(z)).max() <= 1e-5 else None
     return None
-
-
-def _slopes(residual: Callable[[Vector], Vector], z: Vector) -> Vector:
-    columns = []
-    for j in range(len(z)):
-        nudge = np.zeros(len(z))
-        nudge[j] = _NUDGE
-        columns.append((residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE))
-    return np.stack(columns, axis=1)
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:

@@ -59,8 +59,13 @@ def hinf_norm(
     if T_s is not None:
         if len(poles) and np.abs(poles).max() >= 1.0:
             raise Unstable(complex(poles[np.argmax(np.abs(poles))]), True)
-        A, B, C, D = _to_continuous(A, B, C, D)
-        gain, omega = hinf_norm(A, B, C, D, tol=tol)
+        # s = (z-1)/(z+1): the norm stays, omega becomes tan(omega T_s / 2)
+        eye, root = np.eye(len(A)), np.sqrt(2)
+        inverse = np.linalg.inv(A + eye)
+        D = D - C @ inverse @ B
+        gain, omega = hinf_norm(
+            inverse @ (A - eye), root * inverse @ B, root * C @ inverse, D, tol=tol
+        )
         return Norm(gain, 2 / T_s * float(np.arctan(omega)))
     if len(poles) and poles.real.max() >= 0.0:
         raise Unstable(complex(poles[np.argmax(poles.real)]), False)
@@ -89,10 +94,7 @@ def _crossings(A: Matrix, B: Matrix, C: Matrix, D: Matrix, level: float) -> Matr
     F = A + B @ np.linalg.solve(R, D.T @ C)
     # scaled so that both off-diagonal blocks have the size of a gain, not of its square
     H = np.block(
-        [
-            [F, level * B @ np.linalg.solve(R, B.T)],
-            [-level * C.T @ np.linalg.solve(S, C), -F.T],
-        ]
+        [[F, level * B @ np.linalg.solve(R, B.T)], [-level * C.T @ np.linalg.solve(S, C), -F.T]]
     )
     values = np.linalg.eigvals(H)
     near = np.abs(values.real) <= _CROSSES * np.maximum(np.abs(values), 1e-12)
@@ -124,20 +126,6 @@ def _sigma(M: NDArray[np.complex128] | Matrix) -> float:
     if M.shape == (1, 1):
         return float(abs(M[0, 0]))
     return float(np.linalg.svd(M, compute_uv=False)[0]) if M.size else 0.0
-
-
-def _to_continuous(
-    A: Matrix, B: Matrix, C: Matrix, D: Matrix
-) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """s = (z-1)/(z+1): the norm stays, omega becomes tan(omega T_s / 2)."""
-    eye = np.eye(len(A))
-    inverse = np.linalg.inv(A + eye)
-    return (
-        inverse @ (A - eye),
-        np.sqrt(2) * inverse @ B,
-        np.sqrt(2) * C @ inverse,
-        D - C @ inverse @ B,
-    )
 
 
 def balance(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:

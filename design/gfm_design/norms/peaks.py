@@ -30,8 +30,7 @@ class Sizes:
 
     def __init__(self, weights: Sequence[Weight]) -> None:
         self._num, self._den = (
-            _stacked([_squared_size(c) for c in side])
-            for side in ([w.num for w in weights], [w.den for w in weights])
+            _squared_sizes(side) for side in ([w.num for w in weights], [w.den for w in weights])
         )
 
     def squared(self, omega: Vector) -> Vector:
@@ -59,17 +58,12 @@ def sizes_of(weights: tuple[Weight, ...]) -> Sizes:
     return Sizes(weights)
 
 
-def _squared_size(c: tuple[float, ...]) -> Vector:
-    """|c(j omega)|^2 as a polynomial in omega^2, ascending."""
-    ascending = np.asarray(c)[::-1]
-    signs = (-1.0) ** np.arange(len(c))
-    return np.convolve(ascending, ascending * signs)[::2] * signs
-
-
-def _stacked(polynomials: list[Vector]) -> Vector:
-    out = np.zeros((len(polynomials), max(len(p) for p in polynomials)))
-    for row, p in zip(out, polynomials, strict=True):
-        row[: len(p)] = p
+def _squared_sizes(polynomials: list[tuple[float, ...]]) -> Vector:
+    """|c(j omega)|^2 of each as a polynomial in omega^2, ascending; one a row."""
+    out = np.zeros((len(polynomials), max(len(c) for c in polynomials)))
+    for row, c in zip(out, polynomials, strict=True):
+        ascending, signs = np.asarray(c)[::-1], (-1.0) ** np.arange(len(c))
+        row[: len(c)] = np.convolve(ascending, ascending * signs)[::2] * signs
     return out
 
 

@@ -81,15 +81,12 @@ class Weight:
         return (A, B, C, D) if T_s is None else tustin(A, B, C, D, T_s / 2)
 
 
-def _lead(T_1: float, T_2: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (T_1, 1.0), (T_2, 1.0)
+_LEAD = (1.447e-3, 1.0), (1.447e-5, 1.0)
 
 
 def _squared(c: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(float(v) for v in np.polymul(c, c))
 
-
-_LEAD = _lead(1.447e-3, 1.447e-5)
 
 #: the paper's six weights, Table "Numbers Used in Weighting Functions"
 PAPER_WEIGHTS: tuple[Weight, ...] = (
@@ -171,9 +168,8 @@ def _weight(name: str, entry: Any) -> Weight:
 
 
 def _coefficients(where: str, value: Any) -> tuple[float, ...]:
-    if not isinstance(value, list) or not 1 <= len(value) <= _DEGREE + 1:
-        raise ValueError(f"{where}: must be a list of 1 to {_DEGREE + 1} numbers")
-    if not all(isinstance(c, (int, float)) and not isinstance(c, bool) for c in value):
+    listed = isinstance(value, list) and 1 <= len(value) <= _DEGREE + 1
+    if not listed or not all(type(c) in (int, float) for c in value):
         raise ValueError(f"{where}: must be a list of 1 to {_DEGREE + 1} numbers")
     try:
         return tuple(float(c) for c in value)

@@ -48,9 +48,7 @@ class FreeGain:
 
 
 def free_gains(
-    file: LawFile,
-    start: Mapping[str, float] | None = None,
-    only: Sequence[str] | None = None,
+    file: LawFile, start: Mapping[str, float] | None = None, only: Sequence[str] | None = None
 ) -> tuple[FreeGain, ...]:
     """The gains that the file declares free, optionally with other starts or only some of them.
 

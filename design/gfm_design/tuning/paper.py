@@ -159,7 +159,7 @@ class PaperProblem:
     decay: float = 0.0
 
     def __post_init__(self) -> None:
-        judged = LATE if self.has_stage else Plant()
+        judged = LATE if self.file.inner is not None else Plant()
         update = {"sensors": judged.sensors, "delay": judged.delay}
         self._judged = self.plant.model_copy(update=update)
         self._screen = Screen(self.weights)
@@ -181,14 +181,9 @@ class PaperProblem:
         self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
 
     @property
-    def has_stage(self) -> bool:
-        """Whether the law has an inner stage."""
-        return self.file.inner is not None
-
-    @property
     def is_sampled(self) -> bool:
         """Whether the sampled loop is judged: with an inner stage, and in a network."""
-        return self.has_stage or self.among is not None
+        return self.file.inner is not None or self.among is not None
 
     @property
     def op(self) -> OperatingPoint:

@@ -147,18 +147,10 @@ def _search(
         raise ModuleNotFoundError("synthesis needs cma: pip install 'gfmhil[design]'") from None
     # cma needs two dimensions at least: add a coordinate without effect
     idle = 1 if len(start) == 1 else 0
-    search = cma.CMAEvolutionStrategy(
-        np.r_[start, np.zeros(idle)],
-        _STEP,
-        {
-            "seed": seed,
-            "verbose": -9,
-            "popsize": _POPULATION,
-            "maxfevals": max(evaluations, _STABILISE),
-            "tolfun": 1e-5,
-            "bounds": [[*code.low, *[-1.0] * idle], [*code.high, *[1.0] * idle]],
-        },
-    )
+    limits = [[*code.low, *[-1.0] * idle], [*code.high, *[1.0] * idle]]
+    options = {"seed": seed, "verbose": -9, "popsize": _POPULATION, "tolfun": 1e-5,
+               "maxfevals": max(evaluations, _STABILISE), "bounds": limits}  # fmt: skip
+    search = cma.CMAEvolutionStrategy(np.r_[start, np.zeros(idle)], _STEP, options)
     best, best_cost, usable = start, np.inf, 0
     while not search.stop() and usable < evaluations:
         asked = search.ask()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_design.margins.tolerance import End, Range
-from gfm_design.model.least_stable import LeastStable
+from gfm_design.model.closed_loop import LeastStable
 from gfm_design.norms.performance import WeightedChannel
 from gfm_hil.api.design import channels_as_json, write_law
 from gfm_hil.results.report import finite

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from gfm_design.margins.delays import DelayMargin, overall_delay
 from gfm_design.margins.tolerance import Range, element_range
-from gfm_design.model.closed_loop import T_S, ClosedLoop
-from gfm_design.model.least_stable import LeastStable, least_stable
+from gfm_design.model.closed_loop import T_S, ClosedLoop, LeastStable, least_stable
 from gfm_design.model.linear import LinearLaw, Mode
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, WeightedChannel

@@ -12,8 +12,7 @@ import numpy as np
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
-from gfm_design.model.closed_loop import ClosedLoop
-from gfm_design.model.least_stable import least_stable
+from gfm_design.model.closed_loop import ClosedLoop, least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+#: by its name, whether a choice holds
+Choices = Mapping[str, bool]
 TEMPLATES = files("gfm_runtime.firmware").joinpath("templates")
 
 
@@ -65,15 +67,15 @@ def wrapped(line: str, width: int = 100) -> list[str]:
     return [*out, line]
 
 
-def body(lines: Iterable[str]) -> list[str]:
-    """A function's body."""
-    return ["{", *(part for line in lines for part in wrapped(f"    {line}")), "}", ""]
-
-
 @cache
 def template(name: str) -> str:
     """A file of the folder ``templates``."""
     return TEMPLATES.joinpath(name).read_text(encoding="utf-8")
+
+
+def written(name: str, keys: Mapping[str, str], choices: Choices | None = None) -> str:
+    """A template with its choices made and its keys replaced; errors as of those."""
+    return filled(chosen(template(name), choices or {}), keys)
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
@@ -85,8 +87,6 @@ def filled(text: str, values: Mapping[str, str]) -> str:
     return re.sub(r"@([\w.-]+)@", lambda found: values[found[1]], text)
 
 
-#: by its name, whether a choice holds
-Choices = Mapping[str, bool]
 _MARK = re.compile(r" */\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
 
 

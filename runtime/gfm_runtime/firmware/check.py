@@ -179,24 +179,15 @@ def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKE
             if line is None:
                 raise LawError(f"target {target}", f"the program said no result of {m.name}")
             counted, differ, least, most, checks, state = map(int, line.groups())
-            instructions = None
+            clocked, of_checks = None, None
             if where.tick_ns:
-                instructions = where.instructions(least), where.instructions(most)
+                clocked = where.instructions(least), where.instructions(most)
+                of_checks = where.instructions(checks)
             step = "gfm" if found.style == "records" else m.prefix
             code, constants = _sections(at, where, {step, m.prefix})
-            out.append(
-                Checked(
-                    m.name,
-                    counted,
-                    differ,
-                    instructions,
-                    where.instructions(checks) if where.tick_ns else None,
-                    code,
-                    constants,
-                    state,
-                    _stack(at / f"{step}.su", f"{step}_step"),
-                )
-            )
+            stack = _stack(at / f"{step}.su", f"{step}_step")
+            sizes = code, constants, state, stack
+            out.append(Checked(m.name, counted, differ, clocked, of_checks, *sizes))
         return out
 
 

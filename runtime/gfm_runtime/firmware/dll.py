@@ -15,7 +15,7 @@ import numpy as np
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import chosen, filled, identifier, plain, template
+from gfm_runtime.firmware.c_text import identifier, plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
@@ -60,8 +60,8 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
     }
     return {
         **code,
-        _INTERFACE: filled(template(_INTERFACE), keys),
-        "model.c": filled(chosen(template("model.c"), {**m.choices, "schedule": schedule}), keys),
+        _INTERFACE: written(_INTERFACE, keys),
+        "model.c": written("model.c", keys, {**m.choices, "schedule": schedule}),
     }
 
 

@@ -28,6 +28,7 @@ _REAL = re.compile(r"gfm(_\w+)?_real")
 _MOST_ELEMENTS = 64  # of an array of instances
 _MOST_BYTES = 1 << 28
 _MOST_LINKS = 64  # from a variable to its type: more of them go in a circle
+_DECLARATIONS = ("DW_AT_specification", "DW_AT_abstract_origin")
 _FLOATS = {4: "FLOAT32_IEEE", 8: "FLOAT64_IEEE"}
 _SIGNED = {1: "SBYTE", 2: "SWORD", 4: "SLONG", 8: "A_INT64"}
 _UNSIGNED = {1: "UBYTE", 2: "UWORD", 4: "ULONG", 8: "A_UINT64"}
@@ -83,20 +84,12 @@ class _Place:
     fixed: bool = False
 
     def member(self, name: str, offset: int) -> _Place:
-        return replace(
-            self,
-            name=f"{self.name}.{name}",
-            symbol=f"{self.symbol}.{name}",
-            address=self.address + offset,
-        )
+        at = self.address + offset
+        return _Place(f"{self.name}.{name}", f"{self.symbol}.{name}", at, self.fixed)
 
     def element(self, k: int, size: int, name: str = "") -> _Place:
-        return replace(
-            self,
-            name=f"{self.name}.{name}" if name else f"{self.name}[{k}]",
-            symbol=f"{self.symbol}[{k}]",
-            address=self.address + k * size,
-        )
+        own = f"{self.name}.{name}" if name else f"{self.name}[{k}]"
+        return _Place(own, f"{self.symbol}[{k}]", self.address + k * size, self.fixed)
 
 
 @dataclass(frozen=True)
@@ -173,22 +166,17 @@ def _variables(dwarf: Any) -> Iterator[tuple[_Place, _Type]]:
             if die.tag != "DW_TAG_variable" or "DW_AT_location" not in die.attributes:
                 continue
             address = _address(dwarf, unit, die.attributes["DW_AT_location"])
-            said = _declared(die)
+            said = die  # the DIE that has the name: itself, or that of its declaration
+            for _ in range(_MOST_LINKS):
+                links = [a for a in _DECLARATIONS if a in said.attributes]
+                if "DW_AT_name" in said.attributes or not links:
+                    break
+                said = said.get_DIE_from_attribute(links[0])
             if address is None or "DW_AT_name" not in said.attributes:
                 continue
             name, kind = _name(said), _type(said)
             if kind is not None:
                 yield _Place(name, name, address, kind.fixed), kind
-
-
-def _declared(die: Any) -> Any:
-    """The DIE that has a variable's name: itself, or that of its declaration."""
-    for _ in range(_MOST_LINKS):
-        links = [a for a in ("DW_AT_specification", "DW_AT_abstract_origin") if a in die.attributes]
-        if "DW_AT_name" in die.attributes or not links:
-            break
-        die = die.get_DIE_from_attribute(links[0])
-    return die
 
 
 def _address(dwarf: Any, unit: Any, location: Any) -> int | None:
@@ -197,13 +185,11 @@ def _address(dwarf: Any, unit: Any, location: Any) -> int | None:
 
     if not location.form.startswith(("DW_FORM_exprloc", "DW_FORM_block")):
         return None  # a list of places
-    steps = DWARFExprParser(unit.structs).parse_expr(location.value)
-    if len(steps) != 1:
-        return None
-    if steps[0].op_name == "DW_OP_addr":
-        return int(steps[0].args[0])
-    if steps[0].op_name == "DW_OP_addrx":
-        return int(dwarf.get_addr(unit, steps[0].args[0]))
+    match DWARFExprParser(unit.structs).parse_expr(location.value):
+        case [step] if step.op_name == "DW_OP_addr":
+            return int(step.args[0])
+        case [step] if step.op_name == "DW_OP_addrx":
+            return int(dwarf.get_addr(unit, step.args[0]))
     return None
 
 

@@ -908,7 +908,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
         real: ``fixed``, or float32 or float64, whose own distance from exact arithmetic is given.
         near: for inputs within ``NEAR`` of the defaults and u within its limits.
     """
-    spans, maps = _spans(law, near), _of_map(law, real, near)
+    rounding = _Rounding(law, real, near)
     rows, A = record["row"][: law.n], np.asarray(record["A"][: law.n, : law.n], np.float64)
     out: dict[int, Deviation] = {}
     for i in (OMEGA - 1, 0, 2):
@@ -917,12 +917,7 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
         c, W = gain * record["C"][i, own].astype(float), record["W"][own, i].astype(float)
         row = ClampedRow(A[np.ix_(own, own)], c, W)
         b = record["B_y"][own, OMEGA].astype(float)
-        local = (
-            _in_fixed_point(law, i, own, spans, maps)
-            if real == FIXED
-            else _in_floating_point(law, i, own, spans, maps, _unit(real))
-        )
-        feedback = b
+        local, feedback = rounding.of_row(i, own), b
         if i != OMEGA - 1:  # omega_u, which has its own deviation, is an input of this row
             omega, feedback = out[OMEGA - 1], np.zeros(len(own))
             at_once = abs(float(record["D_y"][i, OMEGA]))
@@ -935,11 +930,6 @@ def deviations(law: FixedLaw, record: np.void, real: str, near: bool = False) ->
                 )
         out[i] = _row(row, feedback, local, clamped=not near)
     return [out[i] for i in range(NU)]
-
-
-def _unit(real: str) -> float:
-    """The unit roundoff of a floating-point precision."""
-    return 2.0 ** (-24 if real == "float32" else -53)
 
 
 def _row(row: ClampedRow, feedback: Matrix, local: Local, clamped: bool) -> Deviation:
@@ -1005,101 +995,80 @@ def _of_angle(law: FixedLaw) -> float:
     return turned / 2 + 4 * 2.0**-30
 
 
-def _error(
-    total: Sum,
-    numbers: Sequence[Number],
-    spans: Mapping[int, Span],
-    maps: Mapping[int, float],
-) -> float:
-    """What the rounding of a sum's coefficients and of the error map adds to it at most, p.u."""
-    has = {place: coefficient for coefficient, place in total.terms}
-    low = high = math.ldexp(total.start, -total.e) - total.meant_start
-    for place, meant in total.meant.items():
-        error = math.ldexp(has.get(place, 0), numbers[place].q - total.e) - meant
-        ends = [error * end for end in spans[place]]
-        low, high = low + min(ends), high + max(ends)
-    return most((low, high)) + _through(total, maps)
+class _Rounding:
+    """What rounding adds in a tick at most, in fixed point or in a floating-point precision."""
 
+    def __init__(self, law: FixedLaw, real: str, near: bool) -> None:
+        self.law, self.fixed = law, real == FIXED
+        self.unit = 2.0 ** (-24 if real == "float32" else -53)  # of a floating-point precision
+        self.spans, self.maps = _spans(law, near), self._of_map(near)
 
-def _through(total: Sum, maps: Mapping[int, float]) -> float:
-    """What the errors of an error map become in a sum."""
-    return sum(abs(c) * maps.get(place, 0.0) for place, c in total.meant.items())
+    def of_row(self, i: int, own: Sequence[int]) -> Local:
+        """Of row i, whose states are ``own``."""
+        law, fade = self.law, -self.law.decay[i].meant[OFFSET + i]
+        if self.fixed:
+            units = [math.ldexp(1.0, -one.q) for one in law.numbers]
+            settled = {**self.spans, **{U + j: law.numbers[U + j].span for j in range(NU)}}
+            halves = np.array([units[X + k] / 2 for k in own])
+            return Local(
+                raw=self._error(law.output[i]) + math.ldexp(1.0, -law.output[i].e),
+                u=units[U + i],
+                excess=units[EXCESS + i],
+                offset=self._error(law.decay[i]) / fade + 1.5 * units[OFFSET + i],
+                x=np.array([self._error(law.state[k]) for k in own]),
+                first=np.array([self._error(law.settle[k], settled) for k in own]) + halves,
+                q=halves,
+            )
+        m = law.n + 12
+        gamma = m * self.unit / (1 - m * self.unit)
 
+        def size(total: Sum, more: float = 0.0) -> float:
+            terms = sum(abs(c) * most(self.spans[place]) for place, c in total.meant.items())
+            return gamma * (terms + abs(total.meant_start) + more) + self._through(total)
 
-def _of_map(law: FixedLaw, real: str, near: bool) -> dict[int, float]:
-    """By place, the error of what an error map gives: in fixed point of its roundings; in floating
-    point 8 roundings at most."""
-    if law.error_map == LINEAR:
-        return {}
-    places = [p for p in range(R, M + 5) if law.numbers[p].text.startswith(("t->r[", "t->m["))]
-    units = {p: math.ldexp(1.0, -law.numbers[p].q) for p in places}
-    if law.error_map == HYBRID_ANGLE and not near:  # at a vector without length the map jumps
-        return {R + 1: math.inf}
-    if real != FIXED:
-        return {p: 8 * _unit(real) * most(law.numbers[p].span) for p in places}
-    if law.error_map == DC_ENERGY:
-        return {p: unit / 2 for p, unit in units.items()}
-    if law.error_map == HYBRID_ANGLE:
-        return {R + 1: _of_angle(law)}
-    V = 1 - NEAR if near else V_MIN
-    first = math.ldexp(1.0, -QUOTIENT) / V
-    # the least V is an integer, and p/V^2 has twice its relative error
-    least = 0.0 if near else G_MOST * 2 * math.ldexp(1.0, -1 - min(YS[4].q, REFS[4].q)) / V_MIN
-    return {p: unit + first + 1.01 * least for p, unit in units.items()}
+        u, raw = self.unit * most(self.spans[U + i]), size(law.output[i])
+        return Local(
+            raw=raw,
+            u=u,
+            excess=raw + u,
+            offset=gamma * most(self.spans[OFFSET + i]) / fade + raw,
+            x=np.array([size(law.state[k], 2 * most(self.spans[X + k])) for k in own]),
+            first=np.array([size(law.settle[k]) for k in own]),
+            q=np.zeros(len(own)),
+        )
 
+    def _error(self, total: Sum, spans: Mapping[int, Span] | None = None) -> float:
+        """What the rounding of a sum's coefficients and of the error map adds to it, p.u."""
+        has = {place: coefficient for coefficient, place in total.terms}
+        low = high = math.ldexp(total.start, -total.e) - total.meant_start
+        for place, meant in total.meant.items():
+            error = math.ldexp(has.get(place, 0), self.law.numbers[place].q - total.e) - meant
+            ends = [error * end for end in (spans or self.spans)[place]]
+            low, high = low + min(ends), high + max(ends)
+        return most((low, high)) + self._through(total)
 
-def _in_fixed_point(
-    law: FixedLaw, i: int, own: Sequence[int], spans: Mapping[int, Span], maps: Mapping[int, float]
-) -> Local:
-    numbers = law.numbers
+    def _through(self, total: Sum) -> float:
+        """What the errors of an error map become in a sum."""
+        return sum(abs(c) * self.maps.get(place, 0.0) for place, c in total.meant.items())
 
-    def unit(place: int) -> float:
-        return math.ldexp(1.0, -numbers[place].q)
-
-    fade = -law.decay[i].meant[OFFSET + i]
-    faded = _error(law.decay[i], numbers, spans, {}) / fade
-    settled = {**spans, **{U + j: numbers[U + j].span for j in range(NU)}}
-    return Local(
-        raw=_error(law.output[i], numbers, spans, maps) + math.ldexp(1.0, -law.output[i].e),
-        u=unit(U + i),
-        excess=unit(EXCESS + i),
-        offset=faded + 1.5 * unit(OFFSET + i),
-        x=np.array([_error(law.state[k], numbers, spans, maps) for k in own]),
-        first=np.array(
-            [_error(law.settle[k], numbers, settled, maps) + unit(X + k) / 2 for k in own]
-        ),
-        q=np.array([unit(X + k) / 2 for k in own]),
-    )
-
-
-def _in_floating_point(
-    law: FixedLaw,
-    i: int,
-    own: Sequence[int],
-    spans: Mapping[int, Span],
-    maps: Mapping[int, float],
-    u: float,
-) -> Local:
-    m = law.n + 12
-    gamma = m * u / (1 - m * u)
-
-    def size(total: Sum, more: float = 0.0) -> float:
-        return gamma * (
-            sum(abs(c) * most(spans[place]) for place, c in total.meant.items())
-            + abs(total.meant_start)
-            + more
-        ) + _through(total, maps)
-
-    limit = most(spans[U + i])
-    raw = size(law.output[i])
-    offset = most(spans[OFFSET + i])
-    fade = -law.decay[i].meant[OFFSET + i]
-    return Local(
-        raw=raw,
-        u=u * limit,
-        excess=raw + u * limit,
-        offset=gamma * offset / fade + raw,
-        x=np.array([size(law.state[k], 2 * most(spans[X + k])) for k in own]),
-        first=np.array([size(law.settle[k]) for k in own]),
-        q=np.zeros(len(own)),
-    )
+    def _of_map(self, near: bool) -> dict[int, float]:
+        """By place, the error of what an error map gives: in fixed point of its roundings; in
+        floating point 8 roundings at most."""
+        law, numbers = self.law, self.law.numbers
+        if law.error_map == LINEAR:
+            return {}
+        places = [p for p in range(R, M + 5) if numbers[p].text.startswith(("t->r[", "t->m["))]
+        units = {p: math.ldexp(1.0, -numbers[p].q) for p in places}
+        if law.error_map == HYBRID_ANGLE and not near:  # at a vector without length the map jumps
+            return {R + 1: math.inf}
+        if not self.fixed:
+            return {p: 8 * self.unit * most(numbers[p].span) for p in places}
+        if law.error_map == DC_ENERGY:
+            return {p: unit / 2 for p, unit in units.items()}
+        if law.error_map == HYBRID_ANGLE:
+            return {R + 1: _of_angle(law)}
+        V = 1 - NEAR if near else V_MIN
+        first = math.ldexp(1.0, -QUOTIENT) / V
+        # the least V is an integer, and p/V^2 has twice its relative error
+        least = 0.0 if near else G_MOST * 2 * math.ldexp(1.0, -1 - min(YS[4].q, REFS[4].q)) / V_MIN
+        return {p: unit + first + 1.01 * least for p, unit in units.items()}

@@ -21,7 +21,7 @@ from xml.sax.saxutils import escape
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import chosen, filled, plain, template
+from gfm_runtime.firmware.c_text import plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED
 from gfm_runtime.firmware.dll import build_library
 from gfm_runtime.firmware.module import RESULT_TEXT, Module, keys_of
@@ -74,9 +74,7 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
     if fmi == "3":
         options = " ".join([*FLAGS, OPTIMISED])
         keys = {"P": m.prefix, "OPTIONS": options, "FILES": _files("SourceFile", code)}
-        held["sources/buildDescription.xml"] = filled(
-            template("buildDescription.xml"), keys
-        ).encode()
+        held["sources/buildDescription.xml"] = written("buildDescription.xml", keys).encode()
     held |= _binaries(m, code, fmi)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -104,7 +102,7 @@ def _sources(
             "TOKEN": "@TOKEN@",
         }
     )
-    interface = filled(chosen(template("fmi.c"), {"fmi2": two}), keys)
+    interface = written("fmi.c", keys, {"fmi2": two})
     code = {
         **own,
         f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
@@ -117,7 +115,7 @@ def _sources(
         "VERSION": _quoted(f"signal table {TABLE_VERSION} ({table_hash()})"),
         "FILES": _files("File", code),
     }
-    description = filled(chosen(template("modelDescription.xml"), {"fmi2": two}), keys)
+    description = written("modelDescription.xml", keys, {"fmi2": two})
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, chr(10).join([*code.values(), description]))}}}"
     code[f"fmi{fmi}.c"] = code[f"fmi{fmi}.c"].replace("@TOKEN@", token)
     return code, description.replace("@TOKEN@", token).encode()

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import chosen, filled, template
+from gfm_runtime.firmware.c_text import written
 from gfm_runtime.firmware.check import script
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
@@ -90,7 +90,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
             "REST": str(2 * NU + m.n),
             **e,
         }
-        adapters.append(filled(chosen(template("adapter.c"), choices), keys))
+        adapters.append(written("adapter.c", keys, choices))
         table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
     states = max([1, *(m.n for m in modules)])
     keys = {
@@ -111,9 +111,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         "NAMES": "\n".join(f'    "{m.prefix}",' for m in modules),
         "SIZES": "\n".join(f"    sizeof({m.prefix if own else 'gfm'}_t)," for m in modules),
     }
-    return {
-        name: filled(chosen(template(name), choices), keys) for name in ("selftest.h", "selftest.c")
-    }
+    return {name: written(name, keys, choices) for name in ("selftest.h", "selftest.c")}
 
 
 def _golden_header(rows: Golden) -> str:
@@ -144,4 +142,4 @@ def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -
     root = bool(choosing) or style == "records"  # whether a step takes a square root
     root = root or any(not m.fixed and (m.stages or m.tick.operations()["sqrt"]) for m in modules)
     keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
-    return filled(template("CMakeLists.txt"), keys)
+    return written("CMakeLists.txt", keys)

@@ -25,13 +25,7 @@ from gfm_runtime.compiled import compiled
 from gfm_runtime.firmware.fixed import REFS, YS, Instance, bump_of, refusal, to_integers
 from gfm_runtime.firmware.module import BAD_REF, Module
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
-from gfm_runtime.kernel import (
-    advance,
-    advance_with_inner,
-    look,
-    look_with_inner,
-    state_dtype,
-)
+from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner, state_dtype
 from gfm_runtime.signals import (
     NU,
     NU_INNER,
@@ -69,11 +63,8 @@ class Golden:
 
     def csv(self) -> str:
         """Lines of hexadecimal words under a line of names."""
-        return (
-            ",".join(self.columns)
-            + "\n"
-            + "".join(",".join(f"0x{w:x}" for w in row) + "\n" for row in self.words.tolist())
-        )
+        rows = [self.columns, *([f"0x{w:x}" for w in row] for row in self.words.tolist())]
+        return "".join(",".join(row) + "\n" for row in rows)
 
 
 def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
@@ -110,6 +101,9 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     instances = np.zeros((len(modules), 2), state_dtype(real))
     signals = (*carried_rows("y", stages), *group("ref"))
     ranges = np.array([[getattr(s, e) for s in signals] for e in ("low", "high")], real)
+    fresh: NDArray[Any] = np.zeros(1, instances.dtype)  # an instance after its init
+    fresh["u"] = _, omega, E = [s.default for s in group("u")]
+    fresh["omega_pll"], fresh["pll"], fresh["e"] = omega, (1.0, 0.0), (E, 0.0)
     now, io = np.zeros(3, np.int64), np.zeros(1, _io_dtype(real))
     parts = []
     for k, module in enumerate(modules):
@@ -118,10 +112,8 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         result, u = np.zeros(ticks, np.int64), np.zeros((ticks, len(carried("u", stages))), real)
         bump = np.zeros(ticks, real)
         after: NDArray[Any] = np.zeros(ticks, instances.dtype)
-        _drive(
-            laws, instances, _started(real), ranges, op, k, refs, ys, now, io, result, u, bump,
-            after,
-        )  # fmt: skip
+        own = now, io, result, u, bump, after
+        _drive(laws, instances, fresh, ranges, op, k, refs, ys, *own)
         integers = [op, np.full(ticks, k), result]
         numbers = [refs, ys, u, bump, after["x"][:, :states]]
         numbers += [after[name] for name in ("offset", "u", "trend")]
@@ -182,14 +174,6 @@ def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
         ],
         align=True,
     )  # fmt: skip
-
-
-def _started(real: np.dtype[Any]) -> NDArray[Any]:
-    """An instance after its init, one element."""
-    start = np.zeros(1, state_dtype(real))
-    start["u"] = _, omega, E = [s.default for s in group("u")]
-    start["omega_pll"], start["pll"], start["e"] = omega, (1.0, 0.0), (E, 0.0)
-    return start
 
 
 @compiled
@@ -281,11 +265,8 @@ def inputs(seed: int, ticks: int, real: np.dtype[Any], stages: bool = False) -> 
     uniform = _uniform(seed)
     ref_group, y_group = group("ref"), group("y")
     rest = np.array([s.default for s in ref_group])
-    ref_low, ref_high, y_low, y_high = (
-        np.array([getattr(s, end) for s in signals])
-        for signals in (ref_group, y_group)
-        for end in ("low", "high")
-    )
+    ref_low, ref_high = (np.array([getattr(s, end) for s in ref_group]) for end in ("low", "high"))
+    y_low, y_high = (np.array([getattr(s, end) for s in y_group]) for end in ("low", "high"))
     op = np.zeros(ticks, np.int64)
     refs, ys = np.tile(rest, (ticks, 1)), np.tile(rest, (ticks, 1))
     for k, start in enumerate(range(0, ticks, SEGMENT)):

@@ -19,16 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE, LINEAR
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import (
-    Choices,
-    chosen,
-    filled,
-    identifier,
-    literal,
-    literals,
-    plain,
-    template,
-)
+from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, written
 from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
 from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
 from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
@@ -215,12 +206,12 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         for m in modules:
             tick = m.fixed_tick if m.fixed else m.tick
             keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
-            text = filled(chosen(template("interface.h"), m.choices), keys)
+            text = written("interface.h", keys, m.choices)
             out[f"{m.prefix}.h"] = about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
-            out[f"{m.prefix}.c"] = _source(m.choices, keys | tick.keys(m.prefix))
+            out[f"{m.prefix}.c"] = written("shell.c", keys | tick.keys(m.prefix), m.choices)
             if m.fixed:
                 keys["HINTS"] = m.fixed_tick.hints()
-                proofs[f"proof/{m.prefix}.c"] = filled(template("proof.c"), keys)
+                proofs[f"proof/{m.prefix}.c"] = written("proof.c", keys)
         return out | proofs
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
@@ -234,11 +225,12 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         ),
         "CONSTANTS": "\n        ".join(textwrap.wrap(", ".join(names), 80)),
     }
-    common["TYPES"] = filled(chosen(template("records.h"), choices), types).rstrip("\n")
+    common["TYPES"] = written("records.h", types, choices).rstrip("\n")
+    generic = Tick(None, real, states, stages)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
-        + filled(chosen(template("interface.h"), choices), common),
-        "gfm.c": _source(choices, common | Tick(None, real, states, stages).keys("gfm")),
+        + written("interface.h", common, choices),
+        "gfm.c": written("shell.c", common | generic.keys("gfm"), choices),
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
@@ -250,11 +242,6 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
         )
     return out
-
-
-def _source(choices: Choices, keys: Mapping[str, str]) -> str:
-    """The source of a law, or of the generic step."""
-    return filled(chosen(template("shell_top.c") + template("shell_end.c"), choices), keys)
 
 
 def about(m: Module, T_s: float) -> str:
@@ -314,7 +301,7 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "P": prefix,
         "GUARD": guard,
         **C_TYPES[str(real)],
-        "GUARDS": filled(template("guards.c"), {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
+        "GUARDS": written("guards.c", {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": "\n".join(
             f"    {guard}_{name} = {code}{',' * (name != 'BAD_REF')} /* {text} */"

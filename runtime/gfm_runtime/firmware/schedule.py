@@ -13,7 +13,7 @@ import numpy as np
 from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import choose
-from gfm_runtime.firmware.c_text import chosen, filled, literals, plain, template
+from gfm_runtime.firmware.c_text import literals, plain, written
 from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources
 from gfm_runtime.firmware.tick import place
 from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
@@ -40,12 +40,8 @@ def one_module(
     code = sources(modules, T_s, "unrolled")
     if laws.schedule is None:
         return modules[0], code
-    return whole(laws, modules), code | schedule_sources(laws, modules, T_s, omega_b, "unrolled")
-
-
-def whole(laws: LawSet, stages: Sequence[Module]) -> Module:
-    """What stands for a scheduled law's stages: it has their signals, and its own name."""
-    return replace(stages[0], name=laws.name)
+    whole = replace(modules[0], name=laws.name)  # has the stages' signals
+    return whole, code | schedule_sources(laws, modules, T_s, omega_b, "unrolled")
 
 
 def schedule_sources(
@@ -59,7 +55,7 @@ def schedule_sources(
         T_s, omega_b: as for ``make_modules``.
         style: of the modules.
     """
-    schedule, m = laws.schedule, whole(laws, stages)
+    schedule, m = laws.schedule, replace(stages[0], name=laws.name)
     assert schedule is not None and m.law is not None
     bench = Controller([laws], T_s, [s.default for s in group("ref")], omega_b=omega_b)
     ctl, n = bench.ctl[0], len(stages)
@@ -107,10 +103,7 @@ def schedule_sources(
         "X_0": repr(float(schedule.X_0)),
         "FUNCTIONS": _functions(m.prefix, bench.est[0], ctl, n),
     }
-    return {
-        f"{m.prefix}{end}": filled(chosen(template(f"schedule{end}"), choices), keys)
-        for end in (".h", ".c")
-    }
+    return {f"{m.prefix}{end}": written(f"schedule{end}", keys, choices) for end in (".h", ".c")}
 
 
 def _functions(prefix: str, est: np.void, ctl: np.void, n: int) -> str:

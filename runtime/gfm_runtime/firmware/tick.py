@@ -87,16 +87,6 @@ def _state(real: np.dtype[Any], n: int) -> Struct:
     return Struct(fields)
 
 
-def _of_record(real: np.dtype[Any], stages: bool) -> Struct:
-    """The law's constants as members of a record in C; without stages those of none."""
-    of = law_dtype(real)
-    fields = {name: place(name, of[name].shape, f"law->{name}") for name in of.names or ()}
-    fields |= {name: number(1.0) for name in SHARED}
-    if not stages:
-        fields |= {name: number(0) for name, _ in INNER_NUMBERS} | {"k_pll": number(0.0)}
-    return Struct(fields)
-
-
 class Tick:
     """The functions of a law's tick.
 
@@ -117,7 +107,12 @@ class Tick:
         all_terms: bool = False,
     ) -> None:
         self._n, own = n, record is not None
-        law = _of_record(real, stages)
+        of = law_dtype(real)  # the constants as members of a record in C
+        fields = {name: place(name, of[name].shape, f"law->{name}") for name in of.names or ()}
+        fields |= {name: number(1.0) for name in SHARED}
+        if not stages:  # those of none
+            fields |= {name: number(0) for name, _ in INNER_NUMBERS} | {"k_pll": number(0.0)}
+        law = Struct(fields)
         if record is not None:
             law = Struct({name: record[name] for name in record.dtype.names or ()})
             all_terms = all_terms or bool(np.any(np.signbit(record["u_0"]) & (record["u_0"] == 0)))

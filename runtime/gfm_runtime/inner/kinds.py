@@ -42,10 +42,7 @@ from gfm_runtime.inner.voltage_loop import (
 )
 from gfm_runtime.signals import NU
 
-Inner = Annotated[
-    VirtualStator | Cascaded | ThresholdImpedance,
-    Field(discriminator="type"),
-]
+Inner = Annotated[VirtualStator | Cascaded | ThresholdImpedance, Field(discriminator="type")]
 
 STAGES: dict[str, type[InnerStage]] = {
     str(one.model_fields["type"].default): one for one in get_args(get_args(Inner)[0])
