@@ -48,12 +48,7 @@ def main() -> None:
         for name, extrapolate, impairment, (color, marker) in (
             ("no pause", 0, None, (GREY, "o")),
             ("hold", 0, pause, ("C0", "s")),
-            (
-                "extrapolate = 6, then hold",
-                6,
-                pause,
-                ("C1", "^"),
-            ),
+            ("extrapolate = 6, then hold", 6, pause, ("C1", "^")),
         ):
             found = run(place, name, extrapolate, impairment)
             omega = (found.signals["u_omega_u"][ticks] - 1) * 1e3

@@ -3,17 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from _figures.common import (
-    FIGURES,
-    GREY,
-    arrow,
-    box,
-    number,
-    run,
-    scenario,
-    signed,
-    write_table,
-)
+from _figures.common import FIGURES, GREY, arrow, box, number, run, scenario, signed, write_table
 from matplotlib.figure import Figure
 
 from gfm_design.margins.delays import overall_delay

@@ -5,17 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from _figures.common import (
-    FIGURES,
-    GREY,
-    RIG,
-    modes,
-    run,
-    scenario,
-    signed,
-    within,
-    write_table,
-)
+from _figures.common import FIGURES, GREY, RIG, modes, run, scenario, signed, within, write_table
 from _figures.steps import window
 from matplotlib.figure import Figure
 
@@ -25,12 +15,7 @@ from gfm_hil.run.runner import Run
 from gfm_plant import Plant
 
 LSB = 2.0 / 2**12  # of E_u on the DS2101, p.u.
-CHOKES: tuple[dict[str, float], ...] = (
-    {},
-    {"R_g": 0.5},
-    {"R_g": 0.25},
-    {"R_f": 0.5, "R_g": 0.5},
-)
+CHOKES: tuple[dict[str, float], ...] = ({}, {"R_g": 0.5}, {"R_g": 0.25}, {"R_f": 0.5, "R_g": 0.5})
 
 
 def limit_cycles() -> None:

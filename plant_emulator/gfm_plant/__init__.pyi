@@ -1,13 +1,7 @@
 from .bases import Bases
 from .build import make_network, make_plant
 from .components import NetworkParts
-from .emulator import (
-    plant_advance,
-    plant_command,
-    plant_is_delayed,
-    plant_step,
-    plant_truth,
-)
+from .emulator import plant_advance, plant_command, plant_is_delayed, plant_step, plant_truth
 from .grid import (
     SynchroCheckResult,
     breaker,

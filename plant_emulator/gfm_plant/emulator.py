@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_plant.clearing import advance_clearing, begin_clearing
-from gfm_plant.components import (
-    every_at_rest,
-    every_tick,
-)
+from gfm_plant.components import every_at_rest, every_tick
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
@@ -24,14 +21,7 @@ from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
-from gfm_plant.solution import (
-    I_F,
-    V,
-    circuit,
-    enter,
-    mirror_sources,
-    own,
-)
+from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, own
 from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled
 

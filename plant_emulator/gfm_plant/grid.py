@@ -206,9 +206,7 @@ def clear_fault(plant: Network) -> None:
 
 
 def grid_unbalance(
-    plant: Network,
-    phases: Sequence[complex],
-    duration: float | None = None,
+    plant: Network, phases: Sequence[complex], duration: float | None = None
 ) -> None:
     """Multiply the three phase voltages of the grid; (1, 1, 1) makes them equal again.
 
@@ -326,13 +324,7 @@ def line_breaker(plant: Network, name: str, closed: bool) -> None:
 
 
 def check_synchronism(
-    plant: Network,
-    name: str,
-    V: float,
-    omega: float,
-    degrees: float,
-    lasting: float,
-    within: float,
+    plant: Network, name: str, V: float, omega: float, degrees: float, lasting: float, within: float
 ) -> None:
     """Let a synchro-check close an open breaker: as soon as its two sides have agreed for a time.
 

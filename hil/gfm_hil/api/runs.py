@@ -15,13 +15,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.engine.compiling import compile_external
 from gfm_hil.engine.processes import Progress
 from gfm_hil.recording.run import Run, converters_of
-from gfm_hil.results.figures import (
-    draw_comparison,
-    plot,
-    plot_laws,
-    plot_network,
-    plot_waveforms,
-)
+from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
 from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.network_run import NetworkRun, save_network

@@ -56,10 +56,7 @@ _KINDS = {
         "how late a loop that only paces begins its ticks",
         "--load --policy --seconds --rounds",
     ),
-    "kernel": (
-        "time of one step of every law, and of the same in C",
-        "--laws --cflags --rounds",
-    ),
+    "kernel": ("time of one step of every law, and of the same in C", "--laws --cflags --rounds"),
     "loop": (
         "closed loop: ticks a second in lockstep, misses in real time",
         "--links --mode --load --laws --seconds --rounds",

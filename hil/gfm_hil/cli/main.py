@@ -23,10 +23,7 @@ COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "command": ("command", "command a run that is going on, or print its newest tick"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
-    "merge": (
-        "merge",
-        "join the run folders of a controller and a plant started apart",
-    ),
+    "merge": ("merge", "join the run folders of a controller and a plant started apart"),
     **{name: ("", entry.text) for name, entry in PORTS.items()},
     "export": (
         "export",
@@ -38,10 +35,7 @@ COMMANDS = {
     "scan": ("scan", "measure a converter's dq admittance, and judge grids by it"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),
-    "firmware": (
-        "firmware",
-        "export laws as C99, FMUs and models; check them on a processor",
-    ),
+    "firmware": ("firmware", "export laws as C99, FMUs and models; check them on a processor"),
     "design": ("design", "compute gamma, margins, and gains by H-infinity synthesis"),
     "dbc": ("dbc", "write the CAN link's DBC file, or its bus budget"),
     "warm-up": ("warm_up", "compile all that runs call, so that the first one starts at once"),

@@ -21,8 +21,7 @@ from gfm_hil.scenario import INPROC, find_scenario
 def add(command: argparse.ArgumentParser) -> None:
     common.add_scenario_options(command)
     command.add_argument(
-        "--law",
-        help="override law: catalogue name or law file; of a network see --converter",
+        "--law", help="override law: catalogue name or law file; of a network see --converter"
     )
     command.add_argument(
         "--converter", metavar="NAME",

@@ -17,11 +17,7 @@ class Rate:
     """
 
     def __init__(
-        self,
-        who: str,
-        per_s: float,
-        burst: int,
-        clock: Callable[[], float] = time.monotonic,
+        self, who: str, per_s: float, burst: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._who, self._per_s, self._burst, self._clock = who, per_s, burst, clock
         self._left, self._since = float(burst), clock()

@@ -154,10 +154,7 @@ class Timeline:
         if "controller" in self._roles and int(ctl["changes"][0]) != self._changes:
             self._changes = int(ctl["changes"][0])
             self.write(
-                tick,
-                "law-active",
-                law=self._bench.controller.active,
-                bump_pu=float(ctl["bump"][0]),
+                tick, "law-active", law=self._bench.controller.active, bump_pu=float(ctl["bump"][0])
             )
         found = self._found(ctl, st)
         if found is not None and self._fault is None:

@@ -35,10 +35,7 @@ CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
-SIGNALS_OF: dict[Role, tuple[str, ...]] = {
-    "plant": PLANT_COLUMNS,
-    "controller": CONTROLLER_COLUMNS,
-}
+SIGNALS_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
 TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
 #: kept after the times: of a law that runs on a processor in the loop, -1: not counted
 COUNTS_OF: dict[Role, tuple[str, ...]] = {"plant": (), "controller": ("instructions",)}

@@ -140,11 +140,7 @@ def _places(folder: Path, scenario: Scenario) -> dict[str, Path]:
     return places
 
 
-def save_network(
-    run: NetworkRun,
-    folder: str | Path,
-    report: Report | None = None,
-) -> Path:
+def save_network(run: NetworkRun, folder: str | Path, report: Report | None = None) -> Path:
     """Write a folder with the run folder of each converter, and a figure of all; returns it. Raises
     UserError: the folder holds something already, or cannot be written."""
     folder = Path(folder)

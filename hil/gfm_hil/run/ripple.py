@@ -79,8 +79,7 @@ def remaining_ripple(
         return None
     explained = _even_multiples(scenario, signals, log, done)
     limit = max(
-        scenario.expect_ripple,
-        _NOISE * max(scenario.plant.sensors.noise_std.values(), default=0.0),
+        scenario.expect_ripple, _NOISE * max(scenario.plant.sensors.noise_std.values(), default=0.0)
     )
     columns = {name: signals[f"true_{name}"] for name in _SIGNALS}
     last = np.array([column[done - n : done] for column in columns.values()])

@@ -35,8 +35,7 @@ class LinkSettings(StrictSchema):
 
     type: str = Field("zmq", description="name of a link; inproc: one compiled loop, lockstep only")
     endpoint: str | None = Field(
-        None,
-        description="where the sides meet, in the form of the link; a fresh one if none",
+        None, description="where the sides meet, in the form of the link; a fresh one if none"
     )
     options: dict[str, Any] = Field(default_factory=dict, description="the link's own options")
     peer_timeout_s: float | None = Field(

@@ -104,7 +104,4 @@ def swing(one: Any, T_s: float, w: float) -> float:
 def slopes(one: Any, w: float, P: float, power: float) -> tuple[float, float]:
     """Return d/dt of omega - 1 = w and of the turbines' power P, under a power p.u. of the
     rating."""
-    return (
-        (P + power - one.D * w) / (2.0 * one.H),
-        (one.P_set - w / one.droop - P) / one.T_gov,
-    )
+    return ((P + power - one.D * w) / (2.0 * one.H), (one.P_set - w / one.droop - P) / one.T_gov)

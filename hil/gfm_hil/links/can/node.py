@@ -26,13 +26,7 @@ from gfm_hil.links.can.emulation import (
     set_bus,
 )
 from gfm_hil.links.can.layout import Plan
-from gfm_hil.links.can.sockets import (
-    FULL,
-    read_frame,
-    sleep_for_frame,
-    socket_dtype,
-    write_frame,
-)
+from gfm_hil.links.can.sockets import FULL, read_frame, sleep_for_frame, socket_dtype, write_frame
 from gfm_hil.links.can.vectors import (
     PARTS,
     belongs,

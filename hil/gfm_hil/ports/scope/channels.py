@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import (
-    CONTROLLER_INNER,
-    DERIVED,
-    I_REF,
-    PHASES,
-    TABLE,
-    Columns,
-    wave,
-)
+from gfm_hil.recording.columns import CONTROLLER_INNER, DERIVED, I_REF, PHASES, TABLE, Columns, wave
 from gfm_hil.recording.timing import LATE, MISS_NEEDS, ROUND_TRIP, SLACK, Duration, missed
 from gfm_hil.recording.waveforms import NEEDS, Phase
 from gfm_runtime.signals import names
