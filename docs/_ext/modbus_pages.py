@@ -26,7 +26,7 @@ def registers() -> str:
         mine = [p for p in points if p.path.partition(".")[0] == model]
         rows = [_row(device, p) for p in mine if _is_there(device, p)]
         absent = [f"`{p.name}`" for p in mine if not _is_there(device, p)]
-        parts += [f"### {model}: {group['label']}", "", markdown(_HEAD, rows), ""]
+        parts += [f"#### {model}: {group['label']}", "", markdown(_HEAD, rows), ""]
         if absent:
             parts += [f"Not implemented: {', '.join(absent)}.", ""]
     return "\n".join(parts)

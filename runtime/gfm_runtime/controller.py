@@ -48,11 +48,11 @@ controller_dtype = np.dtype(
         ("out", "f8", (NU_INNER,)),  # with an inner stage: what goes to the bridge
         ("y_low", "f8", (NY_INNER,)),
         ("y_high", "f8", (NY_INNER,)),
-        # gain scheduling: stages first..first+count-1 of the laws share one schedule
+        # gain scheduling: how many points, and the law of each
         ("stages", "i8"),
         ("stage_law", "i8", (MAX_STAGES,)),
-        ("above", "f8", (MAX_STAGES,)),  # reactance beyond which the next stage takes over, p.u.
-        ("below", "f8", (MAX_STAGES,)),  # and from which that one gives back, p.u.
+        ("above", "f8", (MAX_STAGES,)),  # the next point is taken above this reactance, p.u.
+        ("below", "f8", (MAX_STAGES,)),  # and left again below this one, p.u.
         ("dwell", "i8"),  # least ticks between two changes
         ("since", "i8"),  # ticks since the last change, until the next one is allowed
     ],

@@ -120,7 +120,7 @@ class LawFile(TomlTable):
     base: str | None = Field(
         None,
         description="a law of the catalogue, or a .toml file beside this one, that this file "
-        "changes: what stands here replaces what stands there, key by key",
+        "changes, key by key; a table with a type replaces the whole other one",
     )
     name: str = Field(
         pattern=r"^[a-z0-9][a-z0-9_.-]*$", description="lower case letters, digits, _, . and -"
@@ -228,7 +228,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Buil
     with mistakes.noting():
         inner = None if file.inner is None else evaluated("inner", file.inner, numbers)
     law = None
-    with mistakes.noting():  # of what is good so far, for the mistakes that it has itself
+    with mistakes.noting():  # from the valid parts: BuiltLaw finds further mistakes
         law = BuiltLaw(
             name=file.name,
             title=file.title,
@@ -271,7 +271,7 @@ def _with_base(content: dict[str, Any], folder: Path, seen: tuple[str, ...]) -> 
     """The content of a law file over that of its base, of the base's base, and so on.
 
     Raises:
-        ValueError: one line: a base cannot be read, or is one of itself.
+        ValueError: one line: a base cannot be read, or the bases form a circle.
     """
     if "base" not in content:
         return content
@@ -296,7 +296,8 @@ def _with_base(content: dict[str, Any], folder: Path, seen: tuple[str, ...]) -> 
 
 
 def _over(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """Tables are joined key by key; anything else replaces what is below it."""
+    """Merge tables key by key. A table with a ``type`` replaces the other one; a bare number
+    replaces a parameter's value and clears its source."""
     merged = dict(below)
     for key, value in content.items():
         old = below.get(key)

@@ -63,9 +63,7 @@ GRID, LINES = "the grid", "lines and loads"
 """The parts of a network that take part in modes besides converters, machines and loads of constant
 power."""
 
-_SAME = (
-    1e-6  # distance of poles that count as one, over 1 1/s + |s|: identical converters have such
-)
+_SAME = 1e-6  # poles closer than this times (1 1/s + |s|) are equal: those of identical converters
 _D = INPUTS[NY:]
 
 
@@ -223,7 +221,7 @@ class NetworkLoop(LinearLoop):
 
     def held(self, u_delay: Matrix, y_delay: Matrix) -> LinearPlant:
         """The network from tick to tick with its delay lines, without controllers; the angles of
-        the references stay where they are.
+        the references are still among the states.
 
         Args:
             u_delay, y_delay: of each command and each measurement, s.
@@ -267,8 +265,8 @@ class NetworkLoop(LinearLoop):
     def modes(self) -> list[NetworkMode]:
         """The modes and the parts that take part in each, the largest sigma first.
 
-        The eigenvectors of equal poles are not determined: such modes get the mean of their
-        participations.
+        The eigenvectors of equal poles are not determined: all of them get
+        the participation of their common eigenspace.
         """
         values, left, right = eig(self.A, left=True, right=True)
         there = np.abs(values) > GONE
@@ -305,7 +303,7 @@ class NetworkLoop(LinearLoop):
 
     @cached_property
     def _drift(self) -> Matrix:
-        """How the angles of the references go on in a tick, by all states and themselves."""
+        """The rows of the closed loop that give the references' angles at the next tick."""
         return _closed(self._held, self.members)[self.network.references]
 
     @cached_property

@@ -1,7 +1,7 @@
 """The H-infinity norm with a guarantee: Bruinsma and Steinbuch's level-set method.
 
-A level gamma is crossed by the largest singular value of G(j omega) exactly at the imaginary
-eigenvalues of a Hamiltonian matrix. The level starts from a gain that is reached and rises to
+A level gamma is crossed by singular values of G(j omega) exactly at the imaginary eigenvalues of a
+Hamiltonian matrix. The level starts from a gain that is reached and rises to
 the largest gain between its crossings until it has none: then the gain exceeds it at no frequency.
 N. A. Bruinsma and M. Steinbuch, "A fast algorithm to compute the H-infinity norm of a transfer
 function matrix", Systems & Control Letters 14 (1990).

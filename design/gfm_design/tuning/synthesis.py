@@ -53,7 +53,7 @@ class Tuned:
 
     values: Vector  #: the free gains, in the given order
     cost: float  #: of these gains
-    #: evaluations, seconds: the effort
+    #: evaluations of CMA-ES, without the polish; seconds of all
     evaluations: int
     seconds: float
     seed: int  #: of the random numbers; a seed always gives the same result

@@ -30,7 +30,7 @@ _LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
 _NYQUIST = 3.0  # half a side of the figure: beyond it L is not near -1
 _GREY = "#888888"
 _SHOWN = 12  # modes of the figure of participations
-_LEAST = 0.005  # of a participation that is drawn
+_LEAST = 0.005  # a part below this in every mode is left out
 
 
 def bode(loop: ClosedLoop, *at: str) -> list[Axes]:

@@ -1,7 +1,7 @@
 """Two processes for a whole benchmark: one sends, one answers, each on its processor.
 
 Both open every contender at the start, so that a round of one can follow a round of another at
-once. They are pinned and get the priority of the two sides of a run in real time.
+once. Both are pinned; with the policy fifo they also get the real-time priority of a run's sides.
 """
 
 from __future__ import annotations

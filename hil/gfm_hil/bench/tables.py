@@ -22,7 +22,7 @@ def _table(heading: str, rows: list[Row], columns: Mapping[str, Column]) -> Tabl
 
 
 def micro(value: float | None) -> str:
-    """A number with three significant digits; – for none."""
+    """A time in µs: two decimals below 10, one below 100, none above; – for none."""
     if value is None:
         return "–"
     if value >= 100:

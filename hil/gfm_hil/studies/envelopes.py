@@ -85,9 +85,10 @@ class Tolerance:
     """What an envelope allows; the defaults are those of DyCoV's published curves.
 
     Attributes:
-        low, high: of the expected change. After a phase jump it may be high times as large at the
-            start, after ``start_s``, and 1 + low times. After a ramp or a jump of the SCR the lower
-            limit allows for low of it, and the upper one for high of it, either way.
+        low, high: of the expected change. After a phase jump of an overdamped unit the limits are
+            high times it, from ``start_s`` on, and 1 + low times it; of an underdamped one 1 - low
+            and 1 + high times the decay. After a ramp or a jump of the SCR the lower limit allows
+            for low of it, and the upper one for high of it, either way.
         ratio: factors of D, at which H is divided by the same, whose responses are allowed too.
         part, least: the tunnel that opens around the response: a part of the first change, and
             least p.u.

@@ -17,7 +17,7 @@ from gfm_plant import NoEquilibrium
 from gfm_runtime import BuiltLaw, DiscreteLaw, discretise, law_titles, load_law
 from gfm_runtime.assembly import Controller
 
-_GROWS = 1e-6  # 1/s; rounding may move a mode that rests, as the angle of an island, by less
+_GROWS = 1e-6  # 1/s; rounding moves a mode at s = 0, such as an island's angle, by less
 
 
 def initial_law(scenario: Scenario) -> tuple[DiscreteLaw, str]:
@@ -35,9 +35,9 @@ def title_of(loop: ClosedLoop) -> str:
 
 
 def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[ClosedLoop, str]:
-    """The loop of the scenario's first law, and its label; of a network that of the converter that
-    is named, or whose folder it is. Raises NoEquilibrium, UserError: there is no operating point;
-    or no converter is named, or one that the network does not have."""
+    """The loop of the scenario's first law, and its label; in a network that of ``converter``, or
+    of the converter to which this run folder belongs. Raises NoEquilibrium, UserError: there is no
+    operating point; or no converter is named, or one that the network does not have."""
     if scenario.network is None:
         law, label = initial_law(scenario)
         return ClosedLoop.of(law, scenario.plant, scenario.references.vector()), label
@@ -55,11 +55,11 @@ def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Clo
 
 
 def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
-    """The law under which the linear loop of a scenario's start is unstable, and the mode that
-    grows fastest there, in words.
+    """The first law whose linear loop at the start is unstable, and its fastest growing mode in
+    words; None if there is none.
 
-    Of a network the law is empty. Of other scenarios those count that the run changes to as well.
-    None if every loop is stable, or if there is none, for example for want of an operating point.
+    Without a network, the laws to which the run changes are checked too; with one, the law is "".
+    A law without an operating point is skipped.
     """
     alone = scenario.network is None
     laws = scenario.model_copy(update={"ready_laws": []}).laws() if alone else [""]

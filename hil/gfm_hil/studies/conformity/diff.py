@@ -134,7 +134,7 @@ class ReportDiff:
 
 def read_results(path: str | Path) -> Results:
     """A report's results.json, or that in a report's folder. Raises UserError: it cannot be read,
-    or is none."""
+    or is no results.json."""
     file = Path(path)
     file = file / "results.json" if file.is_dir() else file
     try:
@@ -150,8 +150,8 @@ def read_results(path: str | Path) -> Results:
 
 def compare_results(old: Results, new: Results, share: float = SHARE) -> ReportDiff:
     """Lay two reports beside each other. A value has moved if it changed by more than the share of
-    the larger of both, and by more than 1e-3 in its unit. Raises UserError: the share cannot be
-    one."""
+    the larger of both, and by more than 1e-3 in its unit. Raises UserError: the share is not in
+    [0, 1)."""
     if not 0.0 <= share < 1.0:
         raise UserError(f"share = {share:g}: must lie in [0, 1)")
     tests_old, tests_new = _tests(old), _tests(new)

@@ -31,7 +31,7 @@ _LIGHT = "#c9d6e2"
 
 def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> Picture:
     """Draw one run: every tick in light grey, one-cycle means in blue, the limits that were judged
-    in the colour of their verdict, and below each panel the windows without limits."""
+    in the colour of their verdict, and at the bottom of each panel the windows without limits."""
     judged = [v.signal for v in verdicts if v.signal and v.signal != "omega_u"]
     names = list(dict.fromkeys([*_ALWAYS, *judged]))
     figure = Figure(figsize=(9.0, 0.6 + 1.45 * len(names)), layout="constrained")

@@ -91,7 +91,7 @@ class Test(StrictSchema):
         None, description="in a network: the converter whose signals are judged"
     )
     scenario: dict[str, Any] = Field(
-        description="the run: keys of a scenario file but for title, law, inner and link"
+        description="the run: keys of a scenario file except title, law, inner, link and mode"
     )
     criteria: list[Criterion] = Field([], description="what is asked of every part")
     parts: list[TestPart] = Field([], description="runs of the test; one if none")
