@@ -6,16 +6,11 @@ import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree import ElementTree
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image  # matplotlib needs it too
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
@@ -26,6 +21,10 @@ from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
+
+if TYPE_CHECKING:  # matplotlib takes half a second to import: the functions that draw import it
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart, and which print well
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -120,6 +119,8 @@ def _mark(
     """
     if not events:
         return
+    from matplotlib.collections import LineCollection
+
     for a in axes:  # one artist a panel: thousands of lines take minutes to draw
         lines = LineCollection(
             [[(e["t"], 0), (e["t"], 1)] for e in events], colors=colour, linewidths=0.8,
@@ -211,8 +212,10 @@ def panels(figure: Figure) -> list[str]:
         if a.get_shared_x_axes().joined(a, axes[-1]):
             a.tick_params(labelbottom=True)
             a.set_xlabel(axes[-1].get_xlabel(), fontsize=9)
+    from matplotlib import rc_context
+
     whole = io.BytesIO()
-    with matplotlib.rc_context(_IN_A_PAGE):
+    with rc_context(_IN_A_PAGE):
         figure.savefig(whole, format="svg", metadata={"Date": None})
     root = ElementTree.fromstring(whole.getvalue())
     for element in root.iter():  # a page knows SVG without namespaces
@@ -251,9 +254,17 @@ def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
     return list(axes.ravel())
 
 
+def _figure(size: tuple[float, float]) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
 def _save(figure: Figure, path: Path, few_colours: bool = False) -> Picture:
     """Save a figure; of many slanted curves, whose edges have many shades, 64 colours take a
     quarter of the bytes and look the same."""
+    from PIL import Image  # matplotlib needs it too
+
     with replacing(path) as part:
         figure.savefig(part, dpi=110, format="png")
         if few_colours:
@@ -269,11 +280,11 @@ def draw_run(
     """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png."""
     pictures = []
     if "true_p" in signals:
-        figure = Figure(figsize=SIZE, layout="constrained")
+        figure = _figure(SIZE)
         draw_signals(figure, scenario, signals, summary)
         pictures.append(_save(figure, folder / "signals.png"))
     if signals.keys() >= {*NEEDS}:
-        figure = Figure(figsize=SIZE_WAVES, layout="constrained")
+        figure = _figure(SIZE_WAVES)
         if draw_waveforms(figure, scenario, signals, summary):
             pictures.append(_save(figure, folder / "waveforms.png", few_colours=True))
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
@@ -389,7 +400,7 @@ def draw_timing(
     folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]
 ) -> Picture:
     """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
-    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    figure = _figure((10.5, 3.4))
     left, right = figure.subplots(1, 2)
     for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
         spread = duration.spread(timing, scenario.T_s)
@@ -452,13 +463,13 @@ def draw_comparison(
     path: Path, scenario: Scenario, runs: Mapping[str, Columns], events: Sequence[dict[str, Any]]
 ) -> None:
     """Draw several laws into a file, see ``draw_laws``."""
-    figure = Figure(figsize=SIZE_LAWS, layout="constrained")
+    figure = _figure(SIZE_LAWS)
     draw_laws(figure, scenario, runs, events)
     with replacing(path) as part:
         figure.savefig(part, dpi=110)
 
 
-# Figures for a notebook, drawn with pyplot, which takes longer to import than a run takes.
+# Figures for a notebook, drawn with pyplot.
 
 
 def _pyplot_figure(size: tuple[float, float]) -> Figure:
