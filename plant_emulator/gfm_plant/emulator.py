@@ -23,7 +23,7 @@ from gfm_plant.ramps import advance_grid
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, own
 from gfm_plant.synchro_check import WATCHING, watch
-from gfm_runtime.compiled import cached, compiled
+from gfm_runtime.compiled import cached, compiled, inlined
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
@@ -82,7 +82,7 @@ def plant_is_delayed(plant: PlantRecords) -> bool:
     return delayed
 
 
-@compiled
+@inlined
 def plant_command(plant: PlantRecords, k: int, u: NDArray[np.float64]) -> None:
     """Put u, (3,) or (4,), through the D/A into the delay line."""
     r, s = plant.par[k], plant.st[k]

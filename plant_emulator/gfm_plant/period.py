@@ -37,7 +37,7 @@ from gfm_plant.solution import (
 from gfm_runtime.compiled import compiled, inlined
 
 
-@compiled
+@inlined
 def keep(plant: PlantRecords) -> None:
     """Keep what `go_back` takes the plant back to."""
     n, now = plant.net[0], plant.now[0]
@@ -79,7 +79,7 @@ def go_back(plant: PlantRecords) -> None:
     every_go_back(plant, circuit(n, now), 0)
 
 
-@compiled
+@inlined
 def stretch(plant: PlantRecords, part: int) -> None:
     """Go on by one stretch of the period, under the commands that act in it."""
     n, now = plant.net[0], plant.now[0]

@@ -11,11 +11,11 @@ from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussians
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecords
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.signals import NY
 
 
-@compiled
+@inlined
 def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
     """Write the readings of converter k's A/D at this tick to y (5,): (v_dc, p, omega_u, q, V) in
     p.u. of the converter.

@@ -199,7 +199,7 @@ def bad_output(ctl, channel):
     _go_safe(ctl[0], BAD_U, channel)
 
 
-@compiled
+@inlined
 def control(ctl, laws, states, est, y, u):
     """One tick: y[k] in, u[k] out.
 
