@@ -21,6 +21,7 @@ from typing import Any
 
 from gfm_hil.cli import main as gfmhil
 from gfm_hil.core.terminal import markdown
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, SIGNS
 
 DOCS = Path(__file__).resolve().parent
 FOLDER = DOCS.parent / "runs" / "conformity"
@@ -28,7 +29,7 @@ FIGURES = DOCS / "_static" / "figures"
 STAGE, LAW = "virtual-stator", "vsg-2"
 STAGED = (LAW, "mimo-gfm-practical")
 STAGES = (STAGE, "cascaded", "threshold-impedance")
-VERDICTS = ("pass", "fail", "cannot judge", "informative")
+VERDICTS = tuple(SIGNS)
 
 
 def conform(folder: Path, *arguments: str, stage: str = STAGE) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def causes(laws: dict[str, Any]) -> str:
     by: dict[tuple[str, str, str], dict[str, str]] = {}
     for law, tests in laws.items():
         for test, found in tests.items():
-            if found["verdict"] in ("pass", "informative"):
+            if found["verdict"] not in (FAIL, CANNOT):
                 continue
             part = next(p for p in found["parts"] if p["verdict"] == found["verdict"])
             clause, text = (part["cause"] or {"clause": "–", "text": part["reason"]}).values()

@@ -31,6 +31,7 @@ MAKERS: dict[str, Callable[..., str]] = {
     "law-overview": law_pages.overview,
     "law-catalogue": law_pages.catalogue,
     "conformity-tests": conformity_pages.tests,
+    "conformity-limits": conformity_pages.limits,
     "conformity-keys": conformity_pages.keys,
     "conformity-criteria": conformity_pages.criteria,
     "inner-keys": scenario_pages.inner_tables,

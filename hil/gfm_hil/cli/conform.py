@@ -17,19 +17,32 @@ from gfm_hil.realtime.priority import processors
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import ALL, Case, load_cases, shipped_sets
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS
+from gfm_hil.studies.conformity.sets import ALL, Case, all_limits, counted, load_cases, shipped_sets
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    CONSISTENT,
+    FAIL,
+    INFORMATIVE,
+    LIMITED,
+    PASS,
+    SIGNS,
+)
 from gfm_runtime import law_names
 
 EXIT_FAILED = 1
-_EXIT = {PASS: 0, FAIL: EXIT_FAILED, CANNOT: 4, INFORMATIVE: 4}
-_STYLES = {PASS: "good", FAIL: "bad", CANNOT: "warn", INFORMATIVE: "dim"}
+_EXIT = {
+    **dict.fromkeys((PASS, LIMITED, CONSISTENT), 0),
+    FAIL: EXIT_FAILED,
+    **dict.fromkeys((CANNOT, INFORMATIVE), 4),
+}
+_STYLES = {**dict.fromkeys(SIGNS, "dim"), PASS: "good", FAIL: "bad", CANNOT: "warn"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
-        "Exit code 0: every clause passes, the informative ones left out; 1: one fails; 2: wrong "
-        "input; 4: none fails, but one cannot be judged."
+        "Exit code 0: no clause fails, and all could be judged; 1: one fails; 2: wrong input; 4: "
+        "none fails, but one cannot be judged. What is limited, consistent with itself or "
+        "informative is no pass, and counts as no failure."
     )
     others = command.add_subparsers(metavar="{diff}", title="on reports")
     diff = others.add_parser("diff", help="what changed between two reports")
@@ -76,7 +89,10 @@ def add(command: argparse.ArgumentParser) -> None:
         help="processes; all cores by default",
     )  # fmt: skip
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
-    command.add_argument("--list", action="store_true", help="list the tests, and run nothing")
+    command.add_argument(
+        "--list", nargs="?", const="tests", choices=("tests", "limits"),
+        help="list the tests, or all limits with source and how each is known; run nothing",
+    )  # fmt: skip
     add_study_options(command, "results.json")
 
 
@@ -84,11 +100,14 @@ def call(options: argparse.Namespace) -> int:
     against = options.against or [ALL]
     if options.list:
         cases = load_cases(against)
+        rows = [_plain(case) for case in cases] if options.list == "tests" else all_limits(cases)
         if options.json:
-            print(json.dumps([_plain(case) for case in cases], indent=2))
+            print(json.dumps(rows, indent=2))
         else:
-            rows = [[*_plain(case).values()] for case in cases]
-            terminal().print(Table(("test", "runs", "title", "source"), rows, text=None))
+            heads = [*rows[0]]
+            terminal().print(Table(heads, [[*row.values()] for row in rows], text=None))
+            if options.list == "limits":
+                print(counted(rows))
         return 0
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")

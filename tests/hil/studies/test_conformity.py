@@ -26,16 +26,30 @@ from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.base import judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.execute import PartResult
+from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import (
     Case,
+    Test,
     TestPart,
+    all_limits,
+    counted,
     load_cases,
     load_under_test,
     scaled,
     scenario_of,
     shipped_sets,
 )
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict, worst
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    CONSISTENT,
+    FAIL,
+    INFORMATIVE,
+    LIMITED,
+    PASS,
+    Verdict,
+    worst,
+)
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 from gfm_plant.options import Grid
@@ -220,8 +234,9 @@ def test_a_droop_is_no_inertia(ramp, H):
     [
         (0.5 + 0.005 / 0.01, 0.995, PASS),
         (0.5 + 1.06 * 0.005 / 0.01, 0.995, FAIL),  # further off than 0.02
-        (1.0, 0.98, PASS),  # the droop asks for 2.5: the declared power is the limit
-        (-1.0, 1.02, PASS),
+        (1.0, 0.98, LIMITED),  # the droop asks for 2.5: the declared power is the limit
+        (-1.0, 1.02, LIMITED),
+        (0.95, 0.98, FAIL),
         (0.5, 0.98, FAIL),
     ],
 )
@@ -232,7 +247,8 @@ def test_droop_is_that_of_the_declaration_within_the_declared_power(ramp, p, ome
     asked = one("settles", to="droop", tolerance=0.02, within=1.0)
     (found,) = judge(run, [asked], UNDER)
     assert found.verdict == verdict
-    assert found.value == (pytest.approx(0.3, abs=0.02) if verdict == PASS else None)
+    assert found.value == (None if verdict == FAIL else pytest.approx(0.3, abs=0.02))
+    assert found.text.startswith("Limited: judged on the limiter.") is (verdict == LIMITED)
 
 
 @pytest.mark.parametrize("beyond", [0.09, 0.12])
@@ -307,7 +323,7 @@ def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_co
     }
     content = {
         "title": "closed form", "f_n": 50.0,
-        "source": {"document": "here", "clause": "closed form", "revision": "1", "known": "own"},
+        "source": {"document": "here", "clause": "closed form", "revision": "1", "known": "ours"},
         "scenario": {
             "duration": 1.0, "references": {"P_ref": 0.0}, "plant": plant,
             "events": [{"t": 0.5, "type": "grid-phase-jump", "degrees": -10.0}],
@@ -393,7 +409,7 @@ f_n = 50.0
 document = "Our lab"
 clause = "jump"
 revision = "1"
-known = "own"
+known = "ours"
 
 [scenario]
 duration = 1.5
@@ -442,6 +458,7 @@ def test_command_writes_report_results_and_junit(lab, capsys):
     assert content["passed"] is True
     (part,) = content["laws"]["droop-3"]["lab/jump"]["parts"]
     assert [c["verdict"] for c in part["clauses"]] == [PASS, PASS]
+    assert {(c["source"], c["known"]) for c in part["clauses"]} == {("Our lab, jump, 1", "ours")}
     report = (out / "report.html").read_text("utf-8")
     assert all(word in report for word in ("Our lab, jump, 1", "opposes", "at least 0.05 p.u."))
     assert 'aria-label="lab/jump"' in report and report.count("<svg") >= 4
@@ -533,7 +550,9 @@ def test_a_good_law_passes_the_documented_default(tmp_path):
     }
     told = {(name, kind) for name, kind, verdict in clauses if verdict == INFORMATIVE}
     assert told == {("gb/6-nfp", "nfp"), ("rte/2-rocof", "in_envelope")}
-    assert {verdict for *_, verdict in clauses} == {PASS, INFORMATIVE}
+    assert {kind for _, kind, verdict in clauses if verdict == LIMITED} == {"settles"}
+    assert {kind for _, kind, verdict in clauses if verdict == CONSISTENT} == {"in_envelope"}
+    assert {verdict for *_, verdict in clauses} == {PASS, INFORMATIVE, LIMITED, CONSISTENT}
 
 
 def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
@@ -553,7 +572,7 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
         ("least = 0.05", "least = 0.05\nwindow = [0.0, 2.0]\nat = [0.5]", "window to 2"),
         ("f_n = 50.0", 'f_n = 50.0\njudged = "twin"', "judged: 'twin'"),
         ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
-        ('known = "own"', 'known = "rumour"', "rumour"),
+        ('known = "ours"', 'known = "rumour"', "rumour"),
         ('kind = "no_trip"', 'kind = "nfp"\nunknown = "why"', "nfp: must be its only criterion"),
         ('kind = "no_trip"', 'kind = "nfp"', "bands, unknown: give one of them"),
         ("least = 0.05", "least = 0.05\nat = [7.0]", "at = 7"),
@@ -659,7 +678,7 @@ def test_a_plot_is_judged_in_its_bands(band, verdict, at):
 NFP = """
 title = "plot"
 f_n = 50.0
-source = { document = "here", clause = "closed form", revision = "1", known = "own" }
+source = { document = "here", clause = "closed form", revision = "1", known = "ours" }
 [scenario]
 duration = 1.0
 references = { P_ref = 0.0 }
@@ -782,8 +801,8 @@ def test_a_law_stays_in_the_envelope_of_its_own_inertia_and_not_of_another(lab):
     (lab / "jump.toml").write_text(LAB.split("[[criteria]]")[0] + criterion)
     asked = {"law": "vsg-2", "against": lab, "inner": "virtual-stator"}
     own = gfmhil.conform(**asked, folder=lab.parent / "out")
-    assert own.matrix == {("vsg-2", "lab/jump"): PASS}
-    assert "the envelope of D = 1" in own.parts[0].verdicts[0].text  # 1 % droop: D = 100
+    assert own.matrix == {("vsg-2", "lab/jump"): CONSISTENT} and own.passed
+    assert "the envelope of measured D = 1" in own.parts[0].verdicts[0].text  # 1 % droop: D = 100
     (figure,) = (lab.parent / "out").rglob("figure.png")
     assert figure.stat().st_size > 10_000
     declared = lab.parent / "light.toml"
@@ -843,6 +862,8 @@ def two_reports(place: Path, old: Iterable[dict[str, Any]], new: Any) -> list[st
         ([PASS], [PASS], [], 0),
         ([PASS], [FAIL], ["worse"], 1),
         ([PASS], [CANNOT], ["worse"], 1),
+        ([PASS], [LIMITED], ["worse"], 1),
+        ([LIMITED], [CONSISTENT], [], 0),
         ([CANNOT], [FAIL], ["worse"], 1),
         ([FAIL], [CANNOT], ["better"], 0),
         ([FAIL], [PASS], ["better"], 0),
@@ -912,6 +933,63 @@ def test_a_report_as_the_command_writes_it_is_read_again(lab, capsys):
     error = capsys.readouterr().err
     assert "old/results.json: is no results.json" in error and error.count("\n") == 1
     assert main(["conform", "diff", str(lab), str(lab.parent / "new"), "--share", "2"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "of_all", "passed"),
+    [
+        ([PASS, LIMITED], LIMITED, True),
+        ([PASS, CONSISTENT], CONSISTENT, True),
+        ([LIMITED, FAIL], FAIL, False),
+        ([CONSISTENT, CANNOT], CANNOT, False),
+        ([PASS, INFORMATIVE], PASS, True),
+        ([INFORMATIVE], INFORMATIVE, False),
+        ([], CANNOT, False),
+    ],
+)
+def test_limited_and_consistent_are_shown_but_are_no_failure(outcomes, of_all, passed):
+    assert worst(outcomes) == of_all
+    verdicts = [
+        Verdict("as asked", "settles", "p", 0.0, 1.0, v, 1.0, "", "", "So.") for v in outcomes
+    ]
+    part = PartResult("law", "lab/jump", "", "completed", "", verdicts)
+    jump = Test.model_validate(
+        {
+            "title": "jump", "f_n": 50.0, "scenario": {"duration": 1.0},
+            "source": {"document": "Lab", "clause": "1", "revision": "1", "known": "ours"},
+            "criteria": [{"kind": "no_trip", "clause": "lasts"}],
+        }
+    )  # fmt: skip
+    found = Conformity(["law"], None, UNDER, [Case("lab/jump", Path(), jump)], [part])
+    assert found.passed is passed and (found.failures == []) is (of_all not in (FAIL, CANNOT))
+    suite = ElementTree.fromstring(found._junit())[0]
+    neither = sum(v in (LIMITED, CONSISTENT, INFORMATIVE) for v in outcomes)
+    assert suite.attrib["skipped"] == str(neither) == str(len([*suite.iter("skipped")]))
+
+
+def test_every_limit_has_a_source_and_says_how_it_is_known(tmp_path):
+    """A limit that no source gives is called ours, in the list and in the results."""
+    limits = all_limits(load_cases(["all"]))
+    assert {row["known"] for row in limits} == {"read", "summary", "memory", "ours"}
+    assert counted(limits).startswith(f"{len(limits)} limits: ")
+    of = {(row["test"], row["clause"]): row for row in limits}
+    miso = of["miso/3-phase-jump", "90 % of the peak within 15 ms"]
+    assert (miso["known"], miso["criterion"]) == ("read", "rise_within")
+    assert "part = 0.9, within = 0.015" in miso["limit"] and "Appendix H, test 3" in miso["source"]
+    assert of["miso/3-phase-jump", "returns"]["known"] == "ours"
+    other = of["aemo/7-phase-jump", "P opposes the jump by at least 0.2 p.u."]
+    assert "MISO" in other["source"] and other["known"] == "read"
+
+
+def test_the_list_of_limits_is_printed_and_is_json(capsys):
+    assert main(["conform", "--against", "ercot", "--list", "limits"]) == 0
+    said = capsys.readouterr().out
+    assert "H of at least 2.5 s" in said and "summary" in said and "ours" in said
+    assert main(["conform", "--against", "ercot", "--list", "limits", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [*listed[0]] == ["test", "clause", "criterion", "limit", "source", "known"]
+    with pytest.raises(SystemExit):
+        main(["conform", "--against", "ercot", "--list", "nothing"])
 
 
 def test_the_list_is_also_json(capsys):

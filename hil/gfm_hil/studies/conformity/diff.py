@@ -19,7 +19,7 @@ from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.files import read_file
 from gfm_hil.results.page import render
 from gfm_hil.results.table import shown
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome
+from gfm_hil.studies.conformity.verdict import FAIL, PASS, SIGNS, Outcome
 from gfm_runtime.errors import printable
 
 Change = Literal["worse", "better", "gone", "new", "moved"]
@@ -27,7 +27,7 @@ Change = Literal["worse", "better", "gone", "new", "moved"]
 SHARE = 0.05
 _MOST = 64 << 20  # bytes of results.json: hundreds of laws
 _SMALL = 1e-3  # in the unit of a value: what moves by less has not moved
-_RANK = {PASS: 0, INFORMATIVE: 1, CANNOT: 1, FAIL: 2}
+_RANK = {**dict.fromkeys(SIGNS, 1), PASS: 0, FAIL: 2}
 _ORDER: tuple[Change, ...] = ("worse", "gone", "moved", "better", "new")
 
 
@@ -40,7 +40,7 @@ class ClauseResult(_Read):
 
     clause: str  # clause, kind: its words and its criterion
     kind: str
-    verdict: Outcome  # pass, fail, cannot judge or informative
+    verdict: Outcome
     value: float | None  # measured, in ``unit``, or None
     unit: str  # of the value
     text: str  # one sentence

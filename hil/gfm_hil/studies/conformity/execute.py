@@ -255,7 +255,7 @@ def run_part(job: Job) -> PartResult:
 
 
 def _run_part(job: Job) -> PartResult:
-    criteria = [*job.case.test.criteria, *job.part.criteria]
+    criteria = job.case.test.asked(job.part)
     names = job.law, job.case.id, job.part.name
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"

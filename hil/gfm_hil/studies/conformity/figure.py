@@ -16,13 +16,23 @@ from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, SIGNS, Verdict
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    CONSISTENT,
+    FAIL,
+    INFORMATIVE,
+    LIMITED,
+    PASS,
+    SIGNS,
+    Verdict,
+)
 from gfm_hil.studies.scan import FrequencyScan
 from gfm_hil.studies.scan_figures import nfp
 
-#: Okabe and Ito's green, vermilion, grey and blue: pass, fail, cannot judge, informative
+#: of Okabe and Ito, and a grey
 VERDICT_COLOURS = {
-    PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999", INFORMATIVE: COLOURS[0],
+    PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999", LIMITED: COLOURS[4],
+    CONSISTENT: COLOURS[3], INFORMATIVE: COLOURS[0],
 }  # fmt: skip
 _ALWAYS = ("p", "V", "i", "f_hz")
 _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "frequency f"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -18,13 +19,15 @@ from gfm_hil.recording.columns import printed
 from gfm_hil.results.page import render
 from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
-from gfm_hil.studies.conformity.criteria.base import UnderTest
+from gfm_hil.studies.conformity.criteria.base import KNOWN, UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
-from gfm_hil.studies.conformity.sets import KNOWN, Case
+from gfm_hil.studies.conformity.sets import Case
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
+    CONSISTENT,
     FAIL,
     INFORMATIVE,
+    LIMITED,
     PASS,
     SIGNS,
     Outcome,
@@ -33,7 +36,10 @@ from gfm_hil.studies.conformity.verdict import (
 )
 
 #: attributes of a suite of JUnit that count verdicts, and, without the s, elements that tell them
-_COUNTED: dict[Outcome, str] = {FAIL: "failures", CANNOT: "errors", INFORMATIVE: "skipped"}
+_COUNTED: dict[Outcome, str] = {
+    FAIL: "failures", CANNOT: "errors",
+    **dict.fromkeys((LIMITED, CONSISTENT, INFORMATIVE), "skipped"),
+}  # fmt: skip
 #: characters that XML cannot hold, not even escaped
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -60,9 +66,8 @@ class Conformity:
 
     @property
     def passed(self) -> bool:
-        """Whether every clause of every test passes under every law, the informative ones left
-        out."""
-        return self.verdict == PASS
+        """Whether no clause of any test fails or cannot be judged under any law, and some pass."""
+        return self.verdict in (PASS, LIMITED, CONSISTENT)
 
     @property
     def verdict(self) -> Outcome:
@@ -87,12 +92,12 @@ class Conformity:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each part that does not pass, with law, test, verdict and why."""
+        """One line for each part that fails or cannot be judged, with law, test and why."""
         return [
             f"{f.law}, {'/'.join(x for x in (f.test, f.part) if x)}: {f.verdict}: {f.words}"
             for key in self.matrix
             for f in self.of(*key)
-            if f.verdict not in (PASS, INFORMATIVE)
+            if f.verdict in (FAIL, CANNOT)
         ]
 
     def plain(self) -> dict[str, Any]:
@@ -143,7 +148,7 @@ class Conformity:
 
     def _junit(self) -> str:
         """One suite a law and test, one case a clause; what cannot be judged is an error, what is
-        informative is skipped."""
+        neither a pass nor a failure is skipped."""
         top = ElementTree.Element("testsuites", name="gfmhil conform")
         for law, test in self.matrix:
             parts = self.of(law, test)
@@ -154,14 +159,15 @@ class Conformity:
             ]
             told += [(f, f.part, f.verdict, f.reason) for f in parts if not f.verdicts]
             outcomes = [verdict for *_, verdict, _ in told]
-            count = {tag: str(outcomes.count(verdict)) for verdict, tag in _COUNTED.items()}
+            tags = Counter(_COUNTED.get(verdict) for verdict in outcomes)
+            count = {tag: str(tags[tag]) for tag in dict.fromkeys(_COUNTED.values())}
             attributes = {"name": f"{law}: {test}", "tests": str(len(told)), **count}
             suite = ElementTree.SubElement(top, "testsuite", attributes)
             for f, name, verdict, text in told:
                 place = ".".join(x for x in (law, f.test, f.part) if x)
                 entry = ElementTree.SubElement(suite, "testcase", classname=place, name=name)
                 if verdict in _COUNTED:
-                    kind = {"type": CANNOT} if verdict == CANNOT else {}
+                    kind = {} if verdict == FAIL else {"type": verdict}
                     tag = _COUNTED[verdict].removesuffix("s")
                     ElementTree.SubElement(entry, tag, {"message": text, **kind})
         ElementTree.indent(top)
@@ -187,4 +193,5 @@ def _row(v: Verdict) -> list[str]:
     """What a page says of a clause, after its verdict."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text]
+    source = f"{v.source}; {KNOWN[v.known]}" if v.known else "–"
+    return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text, source]

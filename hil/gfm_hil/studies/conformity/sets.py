@@ -9,10 +9,11 @@ which changes some of the scenario and is a run of its own.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -21,7 +22,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, toml_text
 from gfm_hil.studies.conformity.criteria import Criterion
-from gfm_hil.studies.conformity.criteria.base import UnderTest
+from gfm_hil.studies.conformity.criteria.base import KNOWN, Clause, Publication, UnderTest
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 from gfm_plant import ConverterParameters, load_converter
 from gfm_runtime.errors import allowed, printable
@@ -29,28 +30,7 @@ from gfm_runtime.toml_file import read_toml
 
 ALL = "all"
 _FOLDER, _UNDER_TEST = "conformity", "converter.toml"
-
-Known = Literal["read", "summary", "memory", "own"]
-#: how the source of a test is known, for people
-KNOWN: dict[str, str] = {
-    "read": "read",
-    "summary": "from a summary; check the original",
-    "memory": "from memory; check the original",
-    "own": "our own choice",
-}
-
-
-class Publication(StrictSchema):
-    """Where a test comes from."""
-
-    document: str = Field(min_length=1, description="name of the document")
-    clause: str = Field(min_length=1, description="section, table or test in it")
-    revision: str = Field(min_length=1, description="revision or year")
-    known: Known = Field(description="how its content is known to us")
-
-    def words(self) -> str:
-        """Document, clause and revision in one line."""
-        return f"{self.document}, {self.clause}, {self.revision}"
+_LIMIT = ("test", "clause", "criterion", "limit", "source", "known")  # of an entry of the list
 
 
 class TestPart(StrictSchema):
@@ -100,13 +80,17 @@ class Test(StrictSchema):
         """The parts, or the only run as a part without a name."""
         return self.parts or [TestPart.model_construct(name="", title="", cannot=None)]
 
+    def asked(self, part: TestPart) -> list[Clause]:
+        """All that is asked of a part, each with its source."""
+        return [c.of(self.source) for c in (*self.criteria, *part.criteria)]
+
     @model_validator(mode="after")
     def _fits_together(self) -> Test:
         names = [part.name for part in self.parts]
         if len(set(names)) < len(names):
             raise ValueError(f"parts: names {names}: each once")
         for part in self.runs():
-            asked = [*self.criteria, *part.criteria]
+            asked = self.asked(part)
             if any(isinstance(c, Nfp) for c in asked) and len(asked) > 1:
                 raise ValueError(f"parts {part.name!r}: nfp: must be its only criterion")
             if part.cannot is None and not asked:
@@ -193,7 +177,7 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
             if name and name not in members
         ]
     duration = content["duration"]
-    for c in (*test.criteria, *part.criteria):
+    for c in test.asked(part):
         window = getattr(c, "window", None) or (0.0, 0.0)
         for at in c.at or []:
             if not 0 < at + window[1] <= duration or at >= duration:
@@ -202,6 +186,27 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
                     f"run, which ends at {duration:g} s"
                 )
     return found
+
+
+def all_limits(cases: Sequence[Case]) -> list[dict[str, str]]:
+    """One entry a limit of tests, each once a test: what it asks, where that is from and how it is
+    known."""
+    found = dict[tuple[str, ...], None]()
+    for case in cases:
+        for part in case.test.runs():
+            for c in case.test.asked(part):
+                assert c.source is not None and c.known is not None
+                found[case.id, c.clause, c.kind, c.limits() or "–", c.source.words(), c.known] = (
+                    None
+                )
+    return [dict(zip(_LIMIT, row, strict=True)) for row in found]
+
+
+def counted(limits: Sequence[Mapping[str, str]]) -> str:
+    """How many limits there are, and how many are known in which way, in one line."""
+    ways = Counter(row["known"] for row in limits)
+    told = ", ".join(f"{ways[known]} {known}" for known in KNOWN if known in ways)
+    return f"{len(limits)} limits: {told}."
 
 
 def load_under_test(given: str | Path | None) -> UnderTest:

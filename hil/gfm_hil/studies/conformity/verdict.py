@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-Outcome = Literal["pass", "fail", "cannot judge", "informative"]
+Outcome = Literal[
+    "pass", "fail", "cannot judge", "limited", "consistent with itself", "informative"
+]
 PASS: Final = "pass"
 FAIL: Final = "fail"
 CANNOT: Final = "cannot judge"
-INFORMATIVE: Final = "informative"  # no law can be judged by it: it counts for nothing
-SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?", INFORMATIVE: "i"}
+# what is neither a pass nor a failure, and counts as none:
+LIMITED: Final = "limited"  # its target is beyond the rating: judged on the limiter
+CONSISTENT: Final = "consistent with itself"  # as measured on the converter, nothing declared
+INFORMATIVE: Final = "informative"  # no law can be judged by it
+SIGNS = {PASS: "✓", FAIL: "✗", CANNOT: "?", LIMITED: "L", CONSISTENT: "=", INFORMATIVE: "i"}
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Verdict:
     signal: str  # that was judged; may be empty
     start: float  # start, stop: of the window, s
     stop: float
-    verdict: Outcome  # pass, fail, cannot judge or informative
+    verdict: Outcome
     value: float | None  # measured, in ``unit``; None if there is none
     unit: str  # of the value
     limit: str  # of the value, with its unit
@@ -39,6 +44,8 @@ class Verdict:
     limited: tuple[float, float] | None = None  # from when to when they hold, s
     # t, s, and limits that change with it, shape (K,) each, for the figure
     curve: tuple[Vector, Vector, Vector] | None = None
+    source: str = ""  # document, clause and revision that ask for it
+    known: str = ""  # how the limit is known: read, summary, memory or ours
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
@@ -46,7 +53,7 @@ class Verdict:
 
 
 def worst(outcomes: Sequence[str]) -> Outcome:
-    """fail before cannot judge before pass before informative; no outcome at all cannot be
-    judged."""
-    order: tuple[Outcome, ...] = (FAIL, CANNOT, PASS, INFORMATIVE)
+    """fail, cannot judge, limited, consistent with itself, pass, informative, in this order; no
+    outcome at all cannot be judged."""
+    order: tuple[Outcome, ...] = (FAIL, CANNOT, LIMITED, CONSISTENT, PASS, INFORMATIVE)
     return next((outcome for outcome in order if outcome in outcomes), CANNOT)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.recording.run import Run, nominal_frequency
@@ -26,6 +26,29 @@ from gfm_hil.studies.envelopes import Unit
 from gfm_plant import Plant
 
 Vector = NDArray[np.float64]
+
+
+Known = Literal["read", "summary", "memory", "ours"]
+#: how a limit is known, for people
+KNOWN: dict[str, str] = {
+    "read": "read",
+    "summary": "from a summary; check the original",
+    "memory": "from memory; check the original",
+    "ours": "ours; no source gives it",
+}
+
+
+class Publication(StrictSchema):
+    """Where a test or a limit comes from."""
+
+    document: str = Field(min_length=1, description="name of the document")
+    clause: str = Field(min_length=1, description="section, table or test in it")
+    revision: str = Field(min_length=1, description="revision or year")
+    known: Known = Field(description="how its content is known to us")
+
+    def words(self) -> str:
+        """Document, clause and revision in one line."""
+        return f"{self.document}, {self.clause}, {self.revision}"
 
 
 class UnderTest(StrictSchema):
@@ -42,6 +65,18 @@ class UnderTest(StrictSchema):
     unit: Unit | None = Field(
         None, description="declared, for in_envelope; measured by a small phase jump if none"
     )
+    _measured: bool = PrivateAttr(False)
+
+    @property
+    def measured(self) -> bool:
+        """Whether ``unit`` was measured, and not declared."""
+        return self._measured
+
+    def with_measured(self, unit: Unit) -> UnderTest:
+        """The same with a unit that was measured on it."""
+        made = self.model_copy(update={"unit": unit})
+        made._measured = True
+        return made
 
 
 class Clause(StrictSchema):
@@ -51,6 +86,12 @@ class Clause(StrictSchema):
     clause: str = Field(min_length=1, description="what the source asks, in its own words or short")
     at: list[float] | None = Field(
         None, min_length=1, description="s; the first event of the run if none"
+    )
+    source: Publication | None = Field(
+        None, description="where it comes from, if not from where the test does"
+    )
+    known: Known | None = Field(
+        None, description="how its limit is known, if not as its source is, such as ours"
     )
     informative: str | None = Field(
         None,
@@ -67,9 +108,39 @@ class Clause(StrictSchema):
         """The verdict at one time of a run, whose window was recorded."""
         raise NotImplementedError
 
+    def of(self, test: Publication) -> Clause:
+        """The clause with its source filled in, from that of its test."""
+        source = self.source or test
+        known = self.known or source.known
+        return self.model_copy(update={"source": source, "known": known})
+
+    def limits(self) -> str:
+        """All limits in the words of the test file, for lists."""
+        own = [key for key in type(self).model_fields if key not in (*Clause.model_fields, "kind")]
+        told = {key: getattr(self, key) for key in own}
+        return ", ".join(
+            f"{k} = {_plain(x)}" for k, x in told.items() if x not in (None, [], False)
+        )
+
+    def sourced(self, verdict: Verdict) -> Verdict:
+        """A verdict with the source of its clause."""
+        words = "" if self.source is None else self.source.words()
+        return replace(verdict, source=words, known=self.known or "")
+
     def declared(self, under: UnderTest, scenario: Scenario) -> UnderTest:
         """What the owner declares, with what is measured in its place where it is missing."""
         return under
+
+
+def _plain(x: object) -> str:
+    """A value of a test file as one line."""
+    if isinstance(x, StrictSchema):
+        return _plain(x.model_dump(exclude_none=True))
+    if isinstance(x, dict):
+        return "{" + ", ".join(f"{k} = {_plain(v)}" for k, v in x.items()) + "}"
+    if isinstance(x, list | tuple):
+        return "[" + ", ".join(map(_plain, x)) + "]"
+    return f"{x:g}" if isinstance(x, float) else str(x)
 
 
 class Windowed(Clause):
@@ -195,7 +266,7 @@ def judge(
     T_s, events = run.scenario.T_s, run.scenario.events
     first = min((e.at(T_s) * T_s for e in events), default=0.0)
     return [
-        Moment(run, under, others or {}, criterion, at).verdict()
+        criterion.sourced(Moment(run, under, others or {}, criterion, at).verdict())
         for criterion in criteria
         for at in criterion.at or [first]
     ]
@@ -204,7 +275,11 @@ def judge(
 def cannot(criteria: Sequence[Clause], reason: str) -> list[Verdict]:
     """Verdicts on a run that did not take place, or none of a part without criteria."""
     return [
-        Verdict(c.clause, c.kind, getattr(c, "signal", ""), at, at, CANNOT, None, "", "", reason)
+        c.sourced(
+            Verdict(
+                c.clause, c.kind, getattr(c, "signal", ""), at, at, CANNOT, None, "", "", reason
+            )
+        )
         for c in criteria
         for at in c.at or [0.0]
     ]

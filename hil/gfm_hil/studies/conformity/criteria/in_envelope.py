@@ -17,7 +17,7 @@ from gfm_hil.scenario.events.grid_frequency import GridFrequency
 from gfm_hil.scenario.events.grid_impedance import GridImpedance
 from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.conformity.criteria.base import Moment, UnderTest, Vector, Windowed
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import CONSISTENT, Verdict
 from gfm_hil.studies.envelopes import Envelope, Unit, measure_unit, phase_jump, rocof, scr_jump
 
 _CURVE = 600  # points of a limit in the figure
@@ -25,8 +25,9 @@ _CURVE = 600  # points of a limit in the figure
 
 class InEnvelope(Windowed):
     """The means of p over the last cycle stay in the envelope that DyCoV draws around what a unit
-    of the declared or measured damping, inertia and reactance is expected to do. The event at the
-    time is a phase jump, a ramp of the grid's frequency or a jump of its short-circuit ratio."""
+    of the declared damping, inertia and reactance is expected to do. If none are declared they are
+    measured, and p that stays inside is only ``consistent with itself``. The event at the time is a
+    phase jump, a ramp of the grid's frequency or a jump of its short-circuit ratio."""
 
     kind: Literal["in_envelope"] = Field(description="kind of criterion")
     longest_s: float = Field(0.0, ge=0, description="s that p may be beyond, in one piece")
@@ -36,7 +37,7 @@ class InEnvelope(Windowed):
         if under.unit is not None:
             return under
         try:
-            return under.model_copy(update={"unit": measure_unit(scenario)})
+            return under.with_measured(measure_unit(scenario))
         except UserError:
             return under
 
@@ -69,7 +70,8 @@ class InEnvelope(Windowed):
         w = checks.Window("p", t, x[: len(low)], P_0, m.at)
         wrong = checks.envelope(w, low, high, self.longest_s)
         beyond = float(np.max(np.maximum(np.maximum(low - w.x, w.x - high), 0.0)))
-        words = f"D = {unit.D:.3g}, H = {unit.H:.3g} s, X_eff = {unit.X_eff:.3g}"
+        words = "measured " * m.under.measured
+        words += f"D = {unit.D:.3g}, H = {unit.H:.3g} s, X_eff = {unit.X_eff:.3g}"
         if wrong is None:
             text = f"p stays in the envelope of {words}" + (
                 f", but for {beyond:.2g} p.u. for a time." if beyond > 0 else "."
@@ -78,6 +80,8 @@ class InEnvelope(Windowed):
             text = f"{wrong.text} The envelope is that of {words}."
         every = max(1, len(t) // _CURVE)
         made = m.says(wrong is None, beyond, "p.u.", "beyond the envelope: 0 p.u.", text, "p")
+        if m.under.measured and wrong is None:
+            made = replace(made, verdict=CONSISTENT)
         return replace(made, curve=(t[::every], low[::every], high[::every]))
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -82,7 +81,7 @@ class Nfp(Clause):
 
     def judge_scan(self, found: FrequencyScan) -> list[Verdict]:
         """The verdicts on a plot, one a band and gain or phase."""
-        made = partial(Verdict, self.clause, self.kind, "p", 0.0, 0.0)
+        made = self._made
         hz, nfp = found.frequency, found.nfp
         gain, phase = np.abs(nfp), np.degrees(np.angle(nfp))
         span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
@@ -117,6 +116,9 @@ class Nfp(Clause):
                 verdict: Outcome = PASS if beyond[k] <= 0 else FAIL
                 verdicts.append(made(verdict, float(x[k]), unit, limit, text))
         return verdicts
+
+    def _made(self, *rest: Any) -> Verdict:
+        return self.sourced(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
 
     def draw_limits(
         self, panels: Sequence[Axes], verdicts: Sequence[Verdict], colours: dict[str, str]

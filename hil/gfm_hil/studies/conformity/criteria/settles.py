@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -9,11 +10,13 @@ from pydantic import Field
 
 from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import LIMITED, Verdict
 
 
 class Settles(Windowed):
-    """The one-cycle means of a signal come within a tolerance of a value and stay there."""
+    """The one-cycle means of a signal come within a tolerance of a value and stay there. Where the
+    declared droop asks for more than the declared power, p has to settle there, and the verdict is
+    ``limited``: the limiter was judged, and not the droop."""
 
     kind: Literal["settles"] = Field(description="kind of criterion")
     signal: str = Field("p", description="as for stays_within")
@@ -27,31 +30,34 @@ class Settles(Windowed):
     def judge(self, m: Moment) -> Verdict:
         """The value is the time that it takes, s."""
         w = m.window(self.signal)
-        to, why = self._aim(m, w)
+        to, why, limited = self._aim(m, w)
         if w.t[-1] < m.at + self.within:
             return m.cannot(f"its window ends before {self.within:g} s have passed")
         found = checks.settles(w, to, self.within, self.tolerance)
         took = checks.settled_after(w, to, self.tolerance)
         if found is None:
             text = f"{w.symbol} settles at {w.show(to)} ({why}) after {took:.3g} s."
+            if limited:
+                text = f"Limited: judged on the limiter. {text}"
         else:
             text = found.text.replace(
                 f"{w.symbol} should settle at {w.show(to)}",
                 f"The one-cycle mean of {w.symbol} should settle at {w.show(to)} ({why})",
                 1,
             )
-        return m.says(
+        made = m.says(
             found is None, took, "s", f"within {self.within:g} s, ± {self.tolerance:g}", text,
             self.signal, to - self.tolerance, to + self.tolerance,
             (m.at + self.within, m.last * m.T_s),
         )  # fmt: skip
+        return replace(made, verdict=LIMITED) if limited and found is None else made
 
-    def _aim(self, m: Moment, w: checks.Window) -> tuple[float, str]:
-        """Where it must settle, and why there."""
+    def _aim(self, m: Moment, w: checks.Window) -> tuple[float, str, bool]:
+        """Where it must settle, why there, and whether that is at a limit of the power."""
         if self.to == "before":
-            return w.before, "its value before"
+            return w.before, "its value before", False
         if self.to != "droop":
-            return self.to, "the value asked for"
+            return self.to, "the value asked for", False
         omega_u, under = m.ending("omega_u"), m.under
         asked = m.ending("ref_P_ref") + (1.0 - omega_u) / under.droop
         to = float(np.clip(asked, under.P_min, under.P_max))
@@ -61,7 +67,7 @@ class Settles(Windowed):
         )
         if to != asked:
             why += f", which asks for {asked:.3g} p.u., limited to the declared power"
-        return to, why
+        return to, why, to != asked
 
 
 CRITERION = Settles
