@@ -1,7 +1,14 @@
 from .bases import Bases
 from .build import make_network, make_plant
 from .components import NetworkParts
-from .emulator import plant_advance, plant_command, plant_is_delayed, plant_step, plant_truth
+from .emulator import (
+    plant_advance,
+    plant_command,
+    plant_connection,
+    plant_is_delayed,
+    plant_step,
+    plant_truth,
+)
 from .grid import (
     SynchroCheckResult,
     breaker,
@@ -19,7 +26,7 @@ from .grid import (
     start_again,
     take_out,
 )
-from .names import CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
+from .names import CONNECTION, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
 from .options import Plant
 from .parameters import ConverterParameters, load_converter
@@ -29,6 +36,7 @@ from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
 
 __all__ = [
+    "CONNECTION",
     "CONTROLLER_SAFE",
     "NO_FRESH_U",
     "TRIP_REASONS",
@@ -58,6 +66,7 @@ __all__ = [
     "phase_jump",
     "plant_advance",
     "plant_command",
+    "plant_connection",
     "plant_equilibrium",
     "plant_is_delayed",
     "plant_sample",

@@ -105,6 +105,7 @@ def _make(
     par = np.zeros(len(converters), converter_par_dtype)
     st = np.zeros(len(converters), converter_state_dtype)
     units = []
+    measured = any(options.lcl is not None for options, _ in converters.values())
     first = load_converter(next(iter(converters.values()))[0].converter)
     for k, (name, (options, node)) in enumerate(converters.items()):
         one = par[k : k + 1]
@@ -132,7 +133,7 @@ def _make(
     dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
     if grid.finite is not None and grid_node is not None:
         dynamic.append(("plant.grid.finite", "", grid.finite))
-    network = _network(par, st, wiring, T_s, dynamic)
+    network = _network(par, st, wiring, T_s, dynamic, measured)
     now = network.now
     st["x"][:, V_DC] = 1.0
     now["unit"] = now["sequence"][:, 0] = 1.0
@@ -146,18 +147,29 @@ def _make(
 
 
 def _network(
-    par: Record, st: Record, wiring: Wiring, T_s: float, dynamic: Sequence[tuple[str, str, Dynamic]]
+    par: Record,
+    st: Record,
+    wiring: Wiring,
+    T_s: float,
+    dynamic: Sequence[tuple[str, str, Dynamic]],
+    measured: bool,
 ) -> Network:
     """Return a plant whose circuits are still to be made.
 
     Args:
         dynamic: table, name and options of each component with a record.
+        measured: whether p, q and V of the connection points are looked at.
     """
     cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
     lags = [name for _, name, one in dynamic if one.lag() is not None]
     net, now = make_net_and_now(
-        len(par), len(wiring.order) + 2, len(places) + 1, len(cuts) - 1, len(par) + len(lags)
+        len(par),
+        len(wiring.order) + 2,
+        len(places) + 1,
+        len(cuts) - 1,
+        len(par) + len(lags),
+        measured,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)
@@ -247,6 +259,7 @@ def _pack_converter_circuit(
         elements["L_f"] * ratio, elements["R_f"] * ratio, elements["C_f"] / ratio,
         elements["L_g"] * ratio, elements["R_g"] * ratio,
         "end" if options.lcl is not None and options.lcl.earthed else "",
+        at_end=options.lcl is not None,
     )  # fmt: skip
 
 

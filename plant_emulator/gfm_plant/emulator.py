@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gfm_plant.clearing import advance_clearing, begin_clearing
 from gfm_plant.components import every_at_rest, every_tick
-from gfm_plant.layout import field
+from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.period import go_back, keep, length, stretch
@@ -21,7 +21,7 @@ from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
 from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
-from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, own
+from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled, inlined
 
@@ -175,6 +175,18 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     v, i = field(now, "w")[own(k) + V], field(now, "w")[own(k) + I_F]
     out[11], out[12] = v.real, v.imag
     out[13], out[14] = r.current * i.real, r.current * i.imag
+
+
+@compiled
+def plant_connection(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
+    """Write p, q and V at the connection point at this tick to out (3,), in the order of
+    `CONNECTION`: behind the second inductor or the transformer of a converter that has one, else at
+    the filter capacitor. Only for a plant whose ``net`` has ``connections``."""
+    n, now = plant.net[0], plant.now[0]
+    place, scale = CHECK_SIDES + k, plant.par[k].current
+    v = node_voltage(n, now, place, plant.st[k].tick)
+    i = field(now, "w")[field(n, "node_i")[place]]
+    out[0], out[1], out[2] = terminal(v.real, v.imag, scale * i.real, scale * i.imag)
 
 
 @compiled

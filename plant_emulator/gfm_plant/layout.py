@@ -23,6 +23,9 @@ intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's argu
 MOST_FAULTS = 8
 """None, one of three phases, and what is left of it as these open: two of them, or one."""
 
+CHECK_SIDES = 2
+"""Nodes whose voltage a synchro-check looks at."""
+
 Record = NDArray[np.void]
 _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
 
@@ -54,9 +57,13 @@ _NET: _Arrays = {
     # it carries none), see `Wiring.faults`
     "fault_current": (complex, ("n_faults", 3, "n_w")),
     "fault_next": (int, ("n_faults", 3)),
-    # of a synchro-check: the voltages of its two sides by w and by the sources
-    "check_w": (float, ("n_c", 2, "n_w")),
-    "check_s": (float, ("n_c", 2, "n_s")),
+    # of nodes whose voltage is looked at, the two sides of a synchro-check first and then the
+    # connection points: their voltages by w and by the sources, and by the mirror images of both;
+    # what turns the latter; and the place in w of the current that reaches the node
+    "node_w": (float, ("n_c", "n_nodes", 2, "n_w")),
+    "node_s": (float, ("n_c", "n_nodes", 2, "n_s")),
+    "node_turn": (complex, ("n_c",)),
+    "node_i": (int, ("n_nodes",)),
 }
 _NOW: _Arrays = {
     # modes, what drives them in the first and in the second half of the present piece, and states
@@ -89,6 +96,7 @@ net_dtype = _header(
         ("T_s", "f8"),
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
+        ("connections", "i8"),  # whether p, q and V of the connection points are looked at
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
         ("fault_w", "i8"),  # place of the fault's own current, -1: it has none
         # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;
@@ -142,7 +150,7 @@ now_dtype = _header(
 
 
 def make_net_and_now(
-    converters: int, states: int, sources: int, parts: int, lags: int
+    converters: int, states: int, sources: int, parts: int, lags: int, connections: bool
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -152,14 +160,17 @@ def make_net_and_now(
         sources: the bridges, two of the grid, and those of components.
         parts: stretches of the sampling period.
         lags: first-order lags, one of each converter's sensors included.
+        connections: whether p, q and V of the converters' connection points are looked at.
     """
     lengths = {
         "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
         "n_phasors": 2 * sources, "n_faults": MOST_FAULTS,
         "n_c": MOST_FAULTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
-        "n_lags": lags,
+        "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
     }  # fmt: skip
-    return _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
+    net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
+    net["connections"] = connections
+    return net, now
 
 
 def _allocate(header: np.dtype[np.void], arrays: _Arrays, lengths: dict[str, int]) -> Record:

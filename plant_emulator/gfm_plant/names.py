@@ -63,3 +63,7 @@ TRUTH = (*Y_NAMES, "i", "delta", *D_NAMES, "trip", "i_dc", "v_re", "v_im", "i_re
 source, delta is in rad, and trip is a key of `TRIP_REASONS`. The last four are the space vectors of
 the capacitor's voltage and the bridge's current in the common frame, which turns at omega_b; the
 grid's voltage lies on its real axis at tick 0."""
+
+CONNECTION = ("p_c", "q_c", "V_c")
+"""What `plant_connection` writes, in this order, in p.u.: active and reactive power and voltage at
+the connection point."""

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed, emf
 from gfm_plant.emulator import plant_start, reconnect
-from gfm_plant.layout import Record, head
+from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords
 from gfm_plant.wiring import GRID_SOURCE, Wiring
@@ -199,7 +199,7 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     _pack_faults(net, wiring)
     _pack_pieces(plant, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     places = wiring.sources()
-    net["check_w"] = net["check_s"] = 0.0
+    looked_at = _nodes(net, wiring)
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][circuit] = len(modes.rates)
         net["rate"][circuit, :n] = modes.rates
@@ -213,14 +213,26 @@ def _connect(plant: Network, wiring: Wiring) -> None:
             net["drive"][circuit, :n, places[source]] = modes.drive[:, j]
             if source == GRID_SOURCE:  # its negative sequence
                 net["drive"][circuit, :n, places[source] + 1] = modes.drive[:, j]
-        for side, node in enumerate(wiring.check.sides if wiring.check else ()):
+        for place, node in looked_at.items():
             if node == GRID_SOURCE:
-                net["check_s"][circuit, side, places[node]] = 1.0
+                net["node_s"][circuit, place, 0, places[node]] = 1.0
                 continue
-            by_w, by_s = wiring.voltage(node, *which[circuit])
-            net["check_w"][circuit, side, : len(order)] = by_w
-            for factor, source in zip(by_s, sources, strict=False):  # sinks follow
-                net["check_s"][circuit, side, places[source]] = factor
+            by_w, by_s, net["node_turn"][circuit] = wiring.voltage(node, *which[circuit])
+            net["node_w"][circuit, place, :, : len(order)] = by_w
+            for factors, source in zip(by_s.T, sources, strict=False):  # sinks follow
+                net["node_s"][circuit, place, :, places[source]] = factors
+
+
+def _nodes(net: Any, wiring: Wiring) -> dict[int, str]:
+    """The nodes whose voltage is looked at by their places in ``net``, whose entries are cleared;
+    sets which current reaches a connection point."""
+    net["node_w"] = net["node_s"] = 0.0
+    found = dict(enumerate(wiring.check.sides if wiring.check else ()))
+    for k, unit in enumerate(wiring.units if net["connections"] else ()):
+        found[CHECK_SIDES + k] = unit.connection
+        last = "beyond" if wiring.split == unit.line else unit.line
+        net["node_i"][CHECK_SIDES + k] = wiring.order.index(last)
+    return found
 
 
 def _pack_faults(net: Any, wiring: Wiring) -> None:

@@ -199,6 +199,36 @@ def read_states(n: Any, now: Any, c: int) -> None:
 
 
 @compiled
+def node_voltage(n: Any, now: Any, place: int, tick: float) -> complex:
+    """Return the voltage of a node at a tick, p.u.; see ``node_w`` in `gfm_plant.layout`."""
+    c = circuit(n, now)
+    v = _by(n, now, c, place, 0)
+    if field(n, "unbalanced")[c]:
+        v += _by(n, now, c, place, 1).conjugate() * (field(n, "node_turn")[c] * mirror_at(n, tick))
+    return v
+
+
+@compiled
+def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
+    """Return the sum of w and the sources, with the factors of a node for them or for their mirror
+    images."""
+    w, unit, emf = field(now, "w"), field(now, "unit"), field(n, "emf")
+    by_w, by_source, v = field(n, "node_w"), field(n, "node_s"), 0j
+    for i in range(n.n_states):
+        by = by_w[c, place, image, i]
+        v += complex(by * w[i].real, by * w[i].imag)
+    g = grid_source(n)
+    by = now.V_g * by_source[c, place, image, g]
+    if by != 0.0:
+        for k in range(2):  # its two sequences
+            v += complex(by * now.sequence[k].real, by * now.sequence[k].imag) * unit[g + k]
+    for k in range(g + 2, now.n_s):
+        by = by_source[c, place, image, k] * emf[k]
+        v += complex(by * unit[k].real, by * unit[k].imag)
+    return v
+
+
+@compiled
 def circuit(n: Any, now: Any) -> int:
     """Return which circuit is in force."""
     return now.row + (n.n_converters + 1) * now.faulted

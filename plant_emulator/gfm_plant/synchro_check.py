@@ -9,12 +9,11 @@ nor does it close while an unbalanced fault is there.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from gfm_plant.layout import field
 from gfm_plant.protection import LEAST_V, turn
 from gfm_plant.records import PlantRecords
-from gfm_plant.solution import circuit, grid_source
+from gfm_plant.solution import circuit, node_voltage
 from gfm_runtime.compiled import compiled
 
 NONE, WATCHING, AGREED, TIME_OVER = range(4)
@@ -27,7 +26,7 @@ _FOLLOW_S = 0.02
 def watch(plant: PlantRecords) -> None:
     """Look at the two sides after a tick, and say in ``check`` if the time has come."""
     n, now = plant.net[0], plant.now[0]
-    one, other = _voltage(n, now, 0), _voltage(n, now, 1)
+    one, other = node_voltage(n, now, 0, 0.0), node_voltage(n, now, 1, 0.0)
     a = math.sqrt(one.real * one.real + one.imag * one.imag)
     b = math.sqrt(other.real * other.real + other.imag * other.imag)
     angle = turn(other, one)
@@ -48,22 +47,3 @@ def watch(plant: PlantRecords) -> None:
         now.check = AGREED
     elif now.check_left < 0.5 * n.T_s:
         now.check = TIME_OVER
-
-
-@compiled
-def _voltage(n: Any, now: Any, side: int) -> complex:
-    """Return the voltage of a side in the common frame, p.u."""
-    c, w, unit, emf = circuit(n, now), field(now, "w"), field(now, "unit"), field(n, "emf")
-    by_w, by_source = field(n, "check_w"), field(n, "check_s")
-    v = 0j
-    for i in range(n.n_states):
-        v += complex(by_w[c, side, i] * w[i].real, by_w[c, side, i] * w[i].imag)
-    g = grid_source(n)
-    by = now.V_g * by_source[c, side, g]
-    if by != 0.0:
-        for k in range(2):  # its two sequences
-            v += complex(by * now.sequence[k].real, by * now.sequence[k].imag) * unit[g + k]
-    for k in range(g + 2, now.n_s):
-        by = by_source[c, side, k] * emf[k]
-        v += complex(by * unit[k].real, by * unit[k].imag)
-    return v

@@ -40,6 +40,7 @@ class ConverterCircuit:
         node: where its line ends.
         L_f, R_f, C_f, L_g, R_g: elements of Eq. (1)-(6), p.u. of the network.
         earthed: of the line, as of a `Branch`.
+        at_end: whether the connection point is there and not at the filter capacitor.
     """
 
     name: str
@@ -50,11 +51,17 @@ class ConverterCircuit:
     L_g: float
     R_g: float
     earthed: str = ""
+    at_end: bool = False
 
     @property
     def terminal(self) -> str:
         """The node of the filter capacitor."""
         return f"{self.name}.terminal"
+
+    @property
+    def connection(self) -> str:
+        """The node of the connection point."""
+        return self.node if self.at_end else self.terminal
 
     @property
     def bridge(self) -> str:
@@ -398,14 +405,28 @@ class Wiring:
 
     def voltage(
         self, node: str, blocked: frozenset[int], fault: FaultPlace | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The voltage of a node in a balanced circuit as factors of w and of the sources, see
-        ``find_voltage``; of a node where no current can flow, that of what it hangs on.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], complex]:
+        """The voltage of a node as factors of w and of the sources, (2, n_w) and (2, n_s): of
+        themselves, and of their mirror images times the number that comes third. The latter are
+        zero in a balanced circuit; see ``join_axes``.
 
         Args:
             blocked, fault: as for ``modes``.
         """
-        parts = self._circuit(blocked, fault, ALPHA)
+        alpha = self._voltage(node, blocked, fault, ALPHA)
+        if fault is None or fault.balanced:
+            by_w, by_s = (np.array([one, np.zeros_like(one)]) for one in alpha)
+            return by_w, by_s, 1.0
+        beta = self._voltage(node, blocked, fault, BETA)
+        by_w, by_s = (np.array([a + b, a - b]) / 2 for a, b in zip(alpha, beta, strict=True))
+        return by_w, by_s, np.exp(2j * fault.angle)
+
+    def _voltage(
+        self, node: str, blocked: frozenset[int], fault: FaultPlace | None, axis: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The voltage of a node on an axis as factors of w and of the sources, see
+        ``find_voltage``; of a node where no current can flow, that of what it hangs on."""
+        parts = self._circuit(blocked, fault, axis)
         branches, capacitors, sources, shunts, hanging = parts
         there = {end for branch in branches for end in (branch.start, branch.end)}
         there |= {part.node for part in capacitors} | {part.node for part in sources}

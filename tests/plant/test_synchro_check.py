@@ -172,7 +172,7 @@ def test_the_voltage_of_every_kind_of_node_is_that_of_its_phasors():
     expected = {"m": v["m"], "n": v["n"], "r": v["r"], "far": v["far"], "g": 1.0,
                 "end": v["n"], "dead": 0.0}  # fmt: skip
     for node, there in expected.items():
-        by_w, by_s = wiring.voltage(node, frozenset(), None)
+        (by_w, _), (by_s, _), _ = wiring.voltage(node, frozenset(), None)
         assert by_w @ w + by_s @ s == pytest.approx(there, abs=1e-9), node
 
 
@@ -189,7 +189,7 @@ def test_the_watch_sees_what_the_rows_say():
     assert until(plant, u, 2000) == 101  # the second tick gives the first speed
     assert plant.now[0]["check"] == AGREED
     w = plant.now["w"][0, : len(plant.wiring.order)]
-    by_w, _ = plant.wiring.voltage("m", frozenset(), None)
+    (by_w, _), *_ = plant.wiring.voltage("m", frozenset(), None)
     V, omega, angle = plant.now[0]["check_seen"]
     assert complex(V + 1, 0) * np.exp(1j * angle) == pytest.approx(by_w @ w, abs=1e-9)
     assert omega == pytest.approx(0.0, abs=1e-6)

@@ -275,7 +275,9 @@ def compare(
 def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -> Comparison:
     """Run scenarios of different laws, each in a folder; an interruption ends all."""
     first = next(iter(scenarios.values()))
-    run_folder.check_free(folder, first.ticks * len(scenarios), first.has_inner)
+    run_folder.check_free(
+        folder, first.ticks * len(scenarios), first.has_inner, first.has_connection
+    )
     runs: dict[str, Run] = {}
     for name, one in scenarios.items():
 

@@ -53,6 +53,11 @@ class Bench:
         """Whether frames and recording carry the signals of an inner stage."""
         return self.controller.inner
 
+    @property
+    def connection(self) -> bool:
+        """Whether the recording carries the signals of connection points."""
+        return bool(self.plant.net["connections"][0])
+
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""
         c = self.controller

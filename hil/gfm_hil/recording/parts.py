@@ -44,12 +44,14 @@ class RolePart:
     progress: NDArray[np.int64]
 
     @staticmethod
-    def create(folder: Path, role: Role, ticks: int, inner: bool = False) -> RolePart:
+    def create(
+        folder: Path, role: Role, ticks: int, inner: bool = False, connection: bool = False
+    ) -> RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
-        ``inner``: the run has an inner stage, and records its signals.
+        ``inner``, ``connection``: what the run records besides, see ``signals_of``.
         """
-        columns, times = signals_of(role, inner), kept_of(role)
+        columns, times = signals_of(role, inner, connection), kept_of(role)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -134,14 +136,19 @@ class Kept:
     Args:
         role: whose.
         ticks: of a run.
-        inner: the run has an inner stage, and records its signals.
+        inner, connection: what the run records besides, see ``signals_of``.
         only: names of the columns that are kept; None: all.
     """
 
     def __init__(
-        self, role: Role, ticks: int, inner: bool = False, only: Collection[str] | None = None
+        self,
+        role: Role,
+        ticks: int,
+        inner: bool = False,
+        connection: bool = False,
+        only: Collection[str] | None = None,
     ) -> None:
-        recorded = signals_of(role, inner)
+        recorded = signals_of(role, inner, connection)
         self._names = [name for name in recorded if only is None or name in only]
         self._places = [recorded.index(name) for name in self._names]
         self._columns = np.empty((len(self._names), ticks))
@@ -156,7 +163,11 @@ class Kept:
 
 
 def keep_in_memory(
-    folder: Path, ticks: int, notice: Callable[[str], None] = lambda text: None, inner: bool = False
+    folder: Path,
+    ticks: int,
+    notice: Callable[[str], None] = lambda text: None,
+    inner: bool = False,
+    connection: bool = False,
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.
 
@@ -170,7 +181,7 @@ def keep_in_memory(
     if not _MEMORY.is_dir():
         return
     _rescue(notice)
-    needed = bytes_per_tick(inner) * ticks
+    needed = bytes_per_tick(inner, connection) * ticks
     parts = folder / "parts"
     if not parts.is_symlink():
         if shutil.disk_usage(_MEMORY).free < 2 * needed:

@@ -1,12 +1,13 @@
 """Recording of a tick, compiled into the loops."""
 
 from gfm_hil.realtime.atomics import prefetch
-from gfm_plant import TRUTH, plant_truth
+from gfm_plant import CONNECTION, TRUTH, plant_connection, plant_truth
 from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import NU, NY, NY_INNER
 
 _TRUE, _Y_INNER = NY + NU, NY + NU + len(TRUTH)
 _U_INNER = _Y_INNER + NY_INNER - NY
+_CONNECTION = len(CONNECTION)
 _SOON = 8  # rows; a page that is new to the processor would hold up the tick that begins it
 
 
@@ -19,6 +20,8 @@ def record_sample(row, y, plant, i):
     plant_truth(plant, i, row[_TRUE:])
     for j in range(NY, len(y)):
         row[_Y_INNER + j - NY] = y[j]
+    if plant.net[0].connections != 0:
+        plant_connection(plant, i, row[len(row) - _CONNECTION :])
 
 
 @compiled

@@ -21,6 +21,7 @@ from gfm_hil.recording.columns import (
     CONTROLLER_INNER,
     HERTZ,
     PLANT_COLUMNS,
+    PLANT_CONNECTION,
     PLANT_INNER,
     TIMES_OF,
     Columns,
@@ -45,6 +46,7 @@ _TOGETHER = (
     ),
     CONTROLLER_COLUMNS,
     CONTROLLER_INNER,
+    PLANT_CONNECTION,
     *([f"{role}_{name}" for name in times] for role, times in TIMES_OF.items()),
 )
 
@@ -58,7 +60,8 @@ class Signals(Mapping[str, NDArray[Any]]):
     """The recorded signals by name, each of shape (ticks,), read when it is asked for.
 
     ``p``, ``q``, ``V``, ``v_dc``, ``omega_u``, ``i``, ``delta``, ``omega_g`` and ``V_g`` are the
-    plant's own, without sensors; ``f_hz`` is omega_u in Hz; ``t`` is in s. All columns of the
+    plant's own, without sensors, and ``p_c``, ``q_c``, ``V_c`` those at the connection point of a
+    converter with a transformer; ``f_hz`` is omega_u in Hz; ``t`` is in s. All columns of the
     recording are there under their own names too: ``y_p`` as measured, ``u_E_u``, ``ref_P_ref``;
     iterating gives those.
 

@@ -148,7 +148,7 @@ def _recorded(
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
-    check_free(folder, scenario.ticks * len(places), scenario.has_inner)
+    check_free(folder, scenario.ticks * len(places), scenario.has_inner, scenario.has_connection)
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:
@@ -229,9 +229,9 @@ def _run_here(
     benches: Sequence[Bench], places: Sequence[Path], progress: Progress, interrupt: Interrupt
 ) -> float:
     """Run both sides of each converter in this process; returns when the first tick was run."""
-    ticks, inner = benches[0].scenario.ticks, benches[0].inner
-    plant_parts = [RolePart.create(place, "plant", ticks, inner) for place in places]
-    controller_parts = [RolePart.create(place, "controller", ticks, inner) for place in places]
+    ticks, what = benches[0].scenario.ticks, (benches[0].inner, benches[0].connection)
+    plant_parts = [RolePart.create(place, "plant", ticks, *what) for place in places]
+    controller_parts = [RolePart.create(place, "controller", ticks, *what) for place in places]
     timelines = [
         Timeline(bench, place / "events_both.jsonl", ROLES)
         for bench, place in zip(benches, places, strict=True)
@@ -275,8 +275,8 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
 
 def _room(bench: Bench) -> tuple[Kept, Kept]:
     """Room for all columns of a bench."""
-    ticks, inner = bench.scenario.ticks, bench.inner
-    return Kept("plant", ticks, inner), Kept("controller", ticks, inner)
+    what = bench.scenario.ticks, bench.inner, bench.connection
+    return Kept("plant", *what), Kept("controller", *what)
 
 
 def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:

@@ -340,6 +340,13 @@ class Scenario(StrictSchema):
             for name in one.laws()
         )
 
+    @property
+    def has_connection(self) -> bool:
+        """Whether a converter has a connection point of its own, behind its transformer; the
+        recording then has its power and voltage there."""
+        each = [self.of(name) for name in self.converters] or [self]
+        return any(one.plant.lcl is not None for one in each)
+
     def _wrong_links(self) -> list[str]:
         problems = []
         own = dict(zip(self.parts or [""], self.links, strict=True))

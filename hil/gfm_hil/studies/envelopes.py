@@ -397,7 +397,8 @@ def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) ->
     """D, H and X_eff of a converter, fitted to its power after a phase jump.
 
     Args:
-        start: scenario, of which no event counts; its line is not part of X_eff.
+        start: scenario, of which no event counts; its line is not part of X_eff, but
+            its transformer is.
         degrees: of the jump; a small one, so that nothing limits and nothing bends.
         seconds: of the fit, after the jump.
 
@@ -417,7 +418,7 @@ def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) ->
     if made.status not in ("completed", "oscillating"):
         reason = made.summary["reason"]
         raise UserError(f"the run after the jump ended as {made.status}: {reason}")
-    par = make_plant(start.plant, start.T_s).par[0]
+    par, lcl = make_plant(start.plant, start.T_s).par[0], start.plant.lcl
     first, cycle = round(_REST_S / start.T_s), round(2 * math.pi / par["omega_b"] / start.T_s)
     p = made.signals["p"]
     # a mean over one cycle takes the offset of the line's current out of it
@@ -426,7 +427,7 @@ def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) ->
     every = max(1, len(t) // _SAMPLES)
     return fit_jump(
         t[::every], means[::every], math.radians(degrees), float(par["omega_b"]),
-        float(par["L_g"]), 1.5 * cycle * start.T_s,
+        float(par["L_g"]) - (lcl.L if lcl else 0.0), 1.5 * cycle * start.T_s,
     )  # fmt: skip
 
 

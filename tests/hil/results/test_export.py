@@ -15,7 +15,14 @@ from scipy.io import loadmat
 
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import CONTROLLER_INNER, INSTRUCTIONS, PLANT_INNER, TABLE, describe
+from gfm_hil.recording.columns import (
+    CONTROLLER_INNER,
+    INSTRUCTIONS,
+    PLANT_CONNECTION,
+    PLANT_INNER,
+    TABLE,
+    describe,
+)
 from gfm_hil.recording.run import Run
 from gfm_hil.results.export import FORMATS, export_run
 from gfm_hil.run.runner import run_scenario
@@ -50,7 +57,8 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def test_the_table_has_every_column_of_the_recording(table):
-    absent = {*PLANT_INNER, *CONTROLLER_INNER, INSTRUCTIONS}  # of a stage, and of a processor
+    # of a stage, a transformer, and a processor
+    absent = {*PLANT_INNER, *PLANT_CONNECTION, *CONTROLLER_INNER, INSTRUCTIONS}
     assert list(table.recorded) == [name for name in TABLE if name not in absent]
     assert len({len(x) for x in table.recorded.values()}) == 1
     assert table.recorded["plant_received"].min() > 0

@@ -51,6 +51,20 @@ def test_two_equal_ones_share_a_load_and_the_frequency():
     assert a["p"][:1900] == pytest.approx(a["p"][0], abs=1e-6)  # at rest until the load comes
 
 
+def test_the_connection_point_is_behind_the_transformer_or_at_the_filter():
+    """Of B, without one, it is the filter itself; what A loses is its transformer's."""
+    given, (L, R) = content(duration=0.3), (0.15, 0.01)
+    given["network"]["converters"]["A"]["plant"] = {"lcl": {"L": L, "R": R}}
+    run = gfmhil.run_network(given)
+    for name in ("p", "q", "V"):
+        there, here = (run["B"].signals[f"{name}{end}"] for end in ("_c", ""))
+        assert there == pytest.approx(here, abs=1e-14)
+    a = run["A"].signals
+    i2 = (a["p"][0] ** 2 + a["q"][0] ** 2) / a["V"][0] ** 2
+    assert a["p_c"][0] == pytest.approx(a["p"][0] - R * i2, abs=1e-9)
+    assert a["q_c"][0] == pytest.approx(a["q"][0] - a["omega_u"][0] * L * i2, abs=1e-9)
+
+
 def test_two_share_by_their_droops():
     """The change of power of each is that of the frequency over its droop."""
     given = content(duration=6.0)

@@ -274,6 +274,17 @@ def test_limits_may_be_parts_of_what_was_before(ramp, level, verdict, power):
     assert found.verdict == verdict
 
 
+@pytest.mark.parametrize(("there", "verdict"), [({}, PASS), ({"p_c": 0.3}, FAIL)])
+def test_powers_are_judged_at_the_connection_point(ramp, there, verdict):
+    """That of the filter stays within; that behind the transformer does not."""
+    t = np.arange(ramp.ticks) * ramp.T_s
+    run = run_of(ramp, p=np.full(len(t), 0.5))
+    for name, moved in there.items():
+        run.columns[f"true_{name}"] = 0.5 + moved * (t > 3.0)
+    (found,) = judge(run, [one("stays_within", signal="p", low=0.4, high=0.6)], UNDER)
+    assert (found.verdict, found.signal) == (verdict, "p")
+
+
 def test_a_window_that_cannot_be_judged_says_why(ramp):
     run = run_of(ramp, p=np.full(50_000, 0.5))
     for asked, why in (

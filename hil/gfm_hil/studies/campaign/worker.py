@@ -55,7 +55,8 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
 def kept(scenario: Scenario) -> tuple[Kept, Kept]:
     """Room for the columns of a run that its summary reads."""
     ticks, inner = scenario.ticks, scenario.has_inner
-    return Kept("plant", ticks, inner, READ), Kept("controller", ticks, inner, READ)
+    plant, controller = (Kept(role, ticks, inner, only=READ) for role in ("plant", "controller"))
+    return plant, controller
 
 
 def simulate(

@@ -15,6 +15,7 @@ from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
+from gfm_hil.studies.conformity.criteria.base import at_connection
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
@@ -50,7 +51,7 @@ def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> 
     T_s = run.scenario.T_s
     width = cycle_ticks(T_s, nominal_frequency(run.scenario))
     for axes, name in zip(rows, names, strict=True):
-        x = np.asarray(run.signals[name])
+        x = np.asarray(run.signals[at_connection(run, name)])
         curves = [(t, x, _LIGHT, "every tick")]
         means = np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), width)])
         if len(means):

@@ -1,8 +1,9 @@
 """What all criteria share: the clause of a test file, and the moment of a run at which it is
 judged.
 
-Powers, voltages, currents and frequencies are judged by their means over one cycle of the nominal
-frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
+p, q and V are those at the connection point: behind the converter's transformer if it has one, else
+at the filter. Powers, voltages, currents and frequencies are judged by their means over one cycle
+of the nominal frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
 """
 
 from __future__ import annotations
@@ -231,7 +232,7 @@ class Moment:
 
     def raw(self, name: str) -> Vector:
         """Every tick of a signal."""
-        return np.asarray(self.run.signals[name], np.float64)
+        return np.asarray(self.run.signals[at_connection(self.run, name)], np.float64)
 
     def means(self, name: str, first: int, last: int) -> Vector:
         """The one-cycle means of a signal that lie within some ticks."""
@@ -256,6 +257,11 @@ class Moment:
         """p, the sign of "up" or "down", and how far its one-cycle means go there, p.u."""
         w, sign = self.window("p"), 1.0 if direction == "up" else -1.0
         return w, sign, float(np.max(sign * (w.x - w.before)))
+
+
+def at_connection(run: Run, name: str) -> str:
+    """The name of a signal at the connection point, if that is another one than at the filter."""
+    return f"{name}_c" if f"{name}_c" in run.signals else name
 
 
 def judge(
