@@ -20,7 +20,7 @@ power is left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -345,26 +345,60 @@ def fit_jump(
     used = t >= skip_s
     at, p = t[used], change[used]
 
-    def off(z: Vector) -> Vector:
-        X, zero, stiff = np.exp(np.clip(z, -_FAR, _FAR))
+    def off(X: float, zero: float, stiff: float) -> Vector:
         return -radians / X * _impulse([1.0, zero], [1.0, zero, stiff], at) - p
 
     largest = float(np.abs(p).max())
     if not largest > 0:
         raise UserError("fit: the power does not change")
-    X_0 = abs(radians) / largest
-    starts = [(zero, stiff) for zero in (1.0, 10.0, 100.0) for stiff in (10.0, 300.0, 3000.0)]
-    found = [least_squares(off, np.log([X_0, *start]), x_scale=1.0) for start in starts]
-    best = min(found, key=lambda one: one.cost)
-    X, zero, stiff = (float(x) for x in np.exp(best.x))
-    rms = math.sqrt(2 * best.cost / len(p))
-    if not rms < 0.1 * largest:
-        raise UserError(f"fit: no swing equation fits: {rms:.2g} p.u. RMS are left")
+    X, zero, stiff = _fitted(off, abs(radians) / largest, largest)
     H = omega_b / (2 * stiff * X)
     X_eff = float(X - X_grid)
     if X_eff <= 0:
         raise UserError(f"fit: X = {X:.4g} p.u. in all: must be above X_grid = {X_grid:g} p.u.")
     return Unit(2 * H * zero, H, X_eff)
+
+
+def fit_nfp(hz: Vector, nfp: Response, omega_b: float) -> Unit:
+    """The unit whose swing equation fits a plot of network frequency perturbation,
+    -omega_b/X (s + D/2H)/(s^2 + D/2H s + omega_b/2HX); X_eff is all of X.
+
+    Args:
+        hz, nfp: frequencies and the change of power over that of the grid's frequency, p.u. over
+            p.u., shape (K,).
+        omega_b: rad/s.
+
+    Raises:
+        UserError: nothing fits.
+    """
+    s = 2j * np.pi * hz
+
+    def off(X: float, zero: float, stiff: float) -> Vector:
+        rest = -omega_b / X * (s + zero) / (s**2 + zero * s + stiff) - nfp
+        return np.concatenate([rest.real, rest.imag])
+
+    X, zero, stiff = _fitted(off, 0.5, float(np.abs(nfp).max()))
+    H = omega_b / (2 * stiff * X)
+    return Unit(2 * H * zero, H, X)
+
+
+def _fitted(
+    off: Callable[[float, float, float], Vector], X_0: float, largest: float
+) -> tuple[float, float, float]:
+    """X, D/2H and omega_b/2HX with which what is left is least, from a reactance to begin with.
+    Raises UserError: more than a tenth of the largest value is left."""
+
+    def at(z: Vector) -> Vector:
+        return off(*np.exp(np.clip(z, -_FAR, _FAR)))
+
+    starts = [(zero, stiff) for zero in (1.0, 10.0, 100.0) for stiff in (10.0, 300.0, 3000.0)]
+    found = [least_squares(at, np.log([X_0, *start]), x_scale=1.0) for start in starts]
+    best = min(found, key=lambda one: one.cost)
+    rms = math.sqrt(2 * best.cost / len(best.fun))
+    if not rms < 0.1 * largest:
+        raise UserError(f"fit: no swing equation fits: {rms:.2g} p.u. RMS are left")
+    X, zero, stiff = (float(x) for x in np.exp(best.x))
+    return X, zero, stiff
 
 
 def fit_ramp(t: Vector, change: Vector, rate: float, settled_s: float) -> tuple[float, float]:

@@ -17,9 +17,11 @@ from gfm_hil.studies.conformity.criteria.base import Clause
 KINDS = (
     "stays_within",
     "settles",
-    "peak_delta_p",
+    "peak_delta",
     "rise_within",
     "damped",
+    "adequately_damped",
+    "equivalent_damping",
     "energy",
     "no_trip",
     "no_oscillation",

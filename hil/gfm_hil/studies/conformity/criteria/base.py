@@ -3,16 +3,19 @@ judged.
 
 p, q and V are those at the connection point: behind the converter's transformer if it has one, else
 at the filter. Powers, voltages, currents and frequencies are judged by their means over one cycle
-of the nominal frequency (``run.cycles``); only how fast p rises, and the angle, are of every tick.
+of the nominal frequency (``run.cycles``); how fast a signal rises behind a low-pass at that
+frequency, and the angle by every tick.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
+import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -253,9 +256,16 @@ class Moment:
         t = self.T_s * (self.first + np.arange(len(x), dtype=np.float64) + 0.5 * (self.width - 1))
         return checks.Window(name, t, x, self.before(name), self.at)
 
-    def way(self, direction: str) -> tuple[checks.Window, float, float]:
-        """p, the sign of "up" or "down", and how far its one-cycle means go there, p.u."""
-        w, sign = self.window("p"), 1.0 if direction == "up" else -1.0
+    def low_passed(self, name: str, first: int, last: int) -> Vector:
+        """A signal of some ticks behind a low-pass of first order at the nominal frequency, which
+        begins at the mean before the event."""
+        x, before = self.raw(name)[first:last], self.before(name)
+        a = math.exp(-2 * math.pi * self.f_n * self.T_s)
+        return before + np.asarray(scipy.signal.lfilter([1 - a], [1, -a], x - before))
+
+    def way(self, name: str, direction: str) -> tuple[checks.Window, float, float]:
+        """A signal, the sign of "up" or "down", and how far its one-cycle means go there."""
+        w, sign = self.window(name), 1.0 if direction == "up" else -1.0
         return w, sign, float(np.max(sign * (w.x - w.before)))
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import whole_ticks
-from gfm_hil.run.modes import acting, free_from, swing
+from gfm_hil.run.modes import Oscillation, acting, free_from, swing
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 
@@ -33,8 +33,11 @@ class Damped(Windowed):
             x=m.raw("p")[m.first : m.last],
             t=m.T_s * np.arange(m.first, m.last, dtype=np.float64),
         )
+        return self.judge_swing(m, raw, swing(raw.x, m.T_s, m.f_n))
+
+    def judge_swing(self, m: Moment, raw: checks.Window, mode: Oscillation | None) -> Verdict:
+        """The verdict on p of every tick from where no event acts any more, and its swing."""
         found = checks.damped(raw, self.ratio, m.T_s, m.f_n)
-        mode = swing(raw.x, m.T_s, m.f_n)
         value = None if mode is None else mode.damping
         if found is not None:
             text = found.text

@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.conformity.criteria.base import Clause
+from gfm_hil.studies.conformity.criteria.equivalent_damping import damping_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
+from gfm_hil.studies.envelopes import fit_nfp
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 
 if TYPE_CHECKING:
@@ -51,6 +54,12 @@ class Nfp(Clause):
     unknown: str | None = Field(
         None, description="without bands: why none are known; the plot is drawn, and informative"
     )
+    damping: tuple[float, float] | None = Field(
+        None,
+        strict=False,
+        description="least and largest damping ratio of the swing equation that fits the plot "
+        "below half the nominal frequency",
+    )
 
     @model_validator(mode="after")
     def _judged_or_not(self) -> Nfp:
@@ -80,16 +89,13 @@ class Nfp(Clause):
         ]  # fmt: skip
 
     def judge_scan(self, found: FrequencyScan) -> list[Verdict]:
-        """The verdicts on a plot, one a band and gain or phase."""
+        """The verdicts on a plot: on its damping, then one a band and gain or phase."""
         made = self._made
         hz, nfp = found.frequency, found.nfp
         gain, phase = np.abs(nfp), np.degrees(np.angle(nfp))
         span = f"From {hz[0]:.3g} to {hz[-1]:.3g} Hz the gain lies between {gain.min():.4g} and "
         span += f"{gain.max():.4g} p.u./p.u."
-        if self.unknown is not None:
-            text = f"Informative: {self.unknown}. {span}"
-            return [made(INFORMATIVE, float(gain.max()), "p.u./p.u.", "", text)]
-        verdicts = []
+        verdicts = [] if self.damping is None else [self._judge_damping(found, *self.damping)]
         for band in self.bands:
             inside = (hz >= band.from_hz) & (hz <= band.to_hz)
             where = f"{band.from_hz:g} to {band.to_hz:g} Hz"
@@ -115,7 +121,23 @@ class Nfp(Clause):
                 limit = f"{' and '.join(limits)}, {where}"
                 verdict: Outcome = PASS if beyond[k] <= 0 else FAIL
                 verdicts.append(made(verdict, float(x[k]), unit, limit, text))
+        if self.unknown is not None:
+            text = f"Informative: {self.unknown}. {span}"
+            verdicts.append(made(INFORMATIVE, float(gain.max()), "p.u./p.u.", "", text))
         return verdicts
+
+    def _judge_damping(self, found: FrequencyScan, low: float, high: float) -> Verdict:
+        """The verdict on the equivalent damping ratio of a plot."""
+        omega_b = found.omega[0]
+        slow = found.frequency < 0.5 * omega_b / (2 * math.pi)
+        limit = f"{low:g} to {high:g}"
+        try:
+            unit = fit_nfp(found.frequency[slow], found.nfp[slow], omega_b)
+        except UserError as problem:
+            text = f"Cannot be judged: no swing equation fits the plot: {problem}."
+            return self._made(CANNOT, None, "", limit, text)
+        ratio, text = damping_of(unit, omega_b)
+        return self._made(PASS if low <= ratio <= high else FAIL, ratio, "", limit, text)
 
     def _made(self, *rest: Any) -> Verdict:
         return self.sourced(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
@@ -124,7 +146,7 @@ class Nfp(Clause):
         self, panels: Sequence[Axes], verdicts: Sequence[Verdict], colours: dict[str, str]
     ) -> None:
         """Draw the bands over gain and phase, each in the colour of its verdict."""
-        told = iter(verdicts)
+        told = iter(verdicts[self.damping is not None :])
         for band in self.bands:
             for axes, low, high in (
                 (panels[0], band.low, band.high),
