@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,16 +21,12 @@ class Kernel:
 
     So it starts before the other tests, and its result is checked after them. Inside, where system
     calls are slow, compiling would take ten minutes; a bus on the loopback device needs the same
-    compiled code, so the host compiles it first. Numba uses a cached function only if its source
-    has the same time, and inside times are truncated to seconds: both use a copy of the sources
-    with times in whole seconds.
+    compiled code, so the host compiles first what its own tests have not compiled yet.
     """
 
     def __init__(self) -> None:
         self._place = tempfile.TemporaryDirectory(prefix="gfmhil-uml-")
         folder = Path(self._place.name)
-        kept = ROOT / ".pytest_cache" / "uml"
-        source = _copy(kept / "source")
         job = folder / "job.sh"
         self._status, self._log, self._console = (
             folder / name for name in ("status", "log", "console")
@@ -39,10 +34,9 @@ class Kernel:
         settings = {
             "PATH": os.environ["PATH"],
             "PYTHONPATH": os.pathsep.join(
-                [*(str(source / name) for name in PACKAGES), str(_without_asammdf(folder))]
+                [*(str(ROOT / name) for name in PACKAGES), str(_without_asammdf(folder))]
             ),
             "HOME": str(folder),
-            "NUMBA_CACHE_DIR": str(kept / "cache"),
             "MPLBACKEND": "Agg",
             "OPENBLAS_NUM_THREADS": "1",
         }
@@ -51,7 +45,7 @@ class Kernel:
         inside = {**settings, "TMPDIR": "/dev/shm"}
         lines = [
             *(f"export {name}={shlex.quote(value)}" for name, value in inside.items()),
-            f"cd {shlex.quote(str(source))}",
+            f"cd {shlex.quote(str(ROOT))}",
             shlex.join([*test, "--basetemp", "/dev/shm/inside"])
             + f" >{shlex.quote(str(self._log))} 2>&1",
         ]
@@ -62,7 +56,7 @@ class Kernel:
                   "con0=null,fd:1", "con=null"]  # fmt: skip
         self._kernel = subprocess.Popen(
             ["sh", "-c", f"{shlex.join(compiling)}; exec {shlex.join(kernel)}"],
-            cwd=source,
+            cwd=ROOT,
             # its memory is a file in TMPDIR, since /dev/shm may be small
             env={
                 **os.environ, **settings, "TMPDIR": str(folder),
@@ -107,22 +101,3 @@ def _without_asammdf(folder: Path) -> Path:
     place.mkdir()
     (place / "asammdf.py").write_text('raise ImportError("asammdf is left out here")\n')
     return place
-
-
-def _copy(target: Path) -> Path:
-    """Copy our packages and tests, with times truncated to seconds; returns ``target``."""
-
-    def cut(source: str, copy: str) -> None:
-        shutil.copyfile(source, copy)
-        os.utime(copy, (0, int(Path(source).stat().st_mtime)))
-
-    shutil.rmtree(target, ignore_errors=True)
-    for name in (*PACKAGES, "tests"):
-        shutil.copytree(
-            ROOT / name,
-            target / name,
-            copy_function=cut,
-            ignore=shutil.ignore_patterns("__pycache__"),
-        )
-    shutil.copy(ROOT / "pyproject.toml", target)
-    return target

@@ -98,7 +98,7 @@ class _End:
         return int(self.loop["tick"][0])
 
     def checked(self, why: ReturnReason) -> ReturnReason:
-        """Why the loop returned. Raises PeerLost: the link is gone."""
+        """The reason for which the loop returned. Raises PeerLost: the link is gone."""
         if why == ReturnReason.GONE:
             self.link.receive()  # raises and says more
             raise PeerLost("the link is gone")

@@ -15,7 +15,7 @@ from gfm_runtime.states import RUNNING, STOPPED
 
 
 class ReturnReason(IntEnum):
-    """Why a compiled loop returned."""
+    """The reason for which a compiled loop returned."""
 
     GO_ON = 0  #: only between compiled functions: there is no reason to return
     DONE = 1  #: plant: it reached the tick it was to run to

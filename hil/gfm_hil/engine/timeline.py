@@ -272,7 +272,7 @@ class TimelineInMemory(Timeline):
 
 
 def safe_reason(ctl: Any) -> str:
-    """Why the controller is in SAFE, in words."""
+    """The reason for which the controller is in SAFE, in words."""
     reason, channel = int(ctl["reason"][0]), int(ctl["channel"][0])
     names = {BAD_Y: carried("y", True), BAD_U: carried("u", True)}.get(reason)
     return REASONS[reason] + (f": {names[channel]}" if names else "")

@@ -75,7 +75,7 @@ class LiveRun:
 
     @property
     def safe_reason(self) -> int:
-        """Why the controller is in SAFE, index into ``gfm_runtime.states.REASONS``."""
+        """The reason for which the controller is in SAFE, index into ``REASONS`` of the runtime."""
         return int(self.parts["controller"].progress[1]) if self.done("controller") else 0
 
 

@@ -333,10 +333,10 @@ class Steps:
         if before is not None and self._ran == self._tick:
             return before
         if self._tick == 0:
-            raise UserError("nothing has been run: call run(seconds) before asking for results")
+            raise UserError("nothing has been run: call run(seconds) before you read results")
         if before is not None and setting.realtime:
             raise UserError(
-                "in real time a run cannot be repeated: make all steps before asking for results, "
+                "in real time a run cannot be repeated: make all steps before you read results, "
                 "or begin anew with start()"
             )
         run = run_scenario(

@@ -129,7 +129,7 @@ class Scope:
         return _response(http.HTTPStatus.OK, kind, content)
 
     async def _full(self, control: bool) -> str:
-        """Why there is no room for another page that controls, or that only looks; or "". Pages
+        """What leaves no room for another page that controls, or that only looks; or "". Pages
         that do not read make room."""
         same = [s for s in self._sessions if bool(s.operator) == control]
         if len(same) < _PAGES:

@@ -67,7 +67,7 @@ class Access:
         self.tokens = {name: secrets.token_urlsafe(16) for name in operators}
 
     def refusal(self, headers: Headers) -> str:
-        """Why a request is refused; empty if it is accepted.
+        """The reason to refuse a request; empty if it is accepted.
 
         A foreign page in a user's browser must not reach the scope: not from its own address (the
         origin differs), and not through DNS rebinding, a foreign name that resolves to this server

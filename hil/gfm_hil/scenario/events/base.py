@@ -88,7 +88,7 @@ class Event(StrictSchema):
         return self.label()
 
     def misfits(self, scenario: Scenario) -> list[str]:
-        """Why the event has no place in a scenario, a line each; needs no plant and no laws."""
+        """What keeps the event out of a scenario, a line each; needs no plant and no laws."""
         return []
 
     def check_now(self, target: EventTarget) -> None:
