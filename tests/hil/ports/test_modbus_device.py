@@ -253,7 +253,7 @@ def test_reset_from_a_trip_and_from_nothing(how):
         assert bench.write(step) is None
     bench.row |= {"true_trip": 1.0, "state": float(SAFE)}
     assert bench.read("701.InvSt") == 6 and bench.read("701.Alrm") == 1 << 16
-    assert bench.read("715.OpCtl") == 0 and bench.read(f"{VENDOR}.Why") == "over-current"
+    assert bench.read("715.OpCtl") == 0 and bench.read(f"{VENDOR}.SafeRsn") == "over-current"
     assert bench.write(how) is None
     assert bench.told[-1] == {"type": "reset"}
     assert bench.read("701.InvSt") == 3 and bench.read("704.WSetEna") == 0

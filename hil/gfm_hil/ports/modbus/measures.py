@@ -251,7 +251,7 @@ class Measures:
             f"{VENDOR}.SlkP1": slack.p1,
             f"{VENDOR}.SlkP01": slack.p01,
             f"{VENDOR}.SlkMin": slack.least,
-            f"{VENDOR}.Why": run.reason,
+            f"{VENDOR}.SafeRsn": run.reason,
         }
 
 

@@ -236,7 +236,7 @@ function state(text, kind) {
   get("state").dataset.state = kind;
 }
 
-// Why the run is in SAFE, or how it ended if not regularly.
+// The reason for which the run is in SAFE, or how it ended if not regularly.
 function why() {
   const frame = look.frame;
   const safe = frame && about.states[frame.state] === "SAFE";
