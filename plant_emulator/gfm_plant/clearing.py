@@ -1,4 +1,4 @@
-"""The clearing of a fault: each phase opens where its current passes zero, as in a breaker.
+"""Faults that are cleared and breakers that open: each phase opens where its current passes zero.
 
 The zero lies between two ticks. The plant goes back to the beginning of the tick, or to the opening
 before, and tries the time of the zero until the current vanishes there: the circuit is solved
@@ -26,10 +26,10 @@ def begin_clearing(n: Any, now: Any) -> bool:
     """Clear the fault, or have each of its phases open as soon as it can; returns whether the fault
     is gone at once."""
     now.fault_left = math.inf
-    follows = field(n, "fault_next")[now.faulted]
+    follows = field(n, "opens_to")[now.contact]
     now.clearing = 1 if max(follows[0], follows[1], follows[2]) >= 0 else 0
     if now.clearing == 0:
-        now.faulted = 0
+        now.contact = 0
     return now.clearing == 0
 
 
@@ -43,7 +43,7 @@ def advance_clearing(plant: PlantRecords) -> None:
         after = _currents(plant, n.T_s)
         first, which = math.inf, -1
         for p in range(3):
-            if field(n, "fault_next")[now.faulted, p] >= 0 and _passes(before[p], after[p]):
+            if field(n, "opens_to")[now.contact, p] >= 0 and _passes(before[p], after[p]):
                 at = _find_zero(plant, p, begin, before[p], after[p])
                 if at < first:
                     first, which = at, p
@@ -106,28 +106,28 @@ def _enter(plant: PlantRecords, at: float) -> None:
 
 @compiled
 def _open(plant: PlantRecords, p: int, at: float) -> None:
-    """Interrupt phase p. What flows on through the fault has to be told to the circuit of what is
-    left, where it may be a state of its own."""
+    """Interrupt phase p. What flows on through the contact has to be passed to the circuit of what
+    is left, where it may be a state of its own."""
     n, now = plant.net[0], plant.now[0]
     i_a, i_b, i_c = _currents(plant, at)
-    now.faulted = field(n, "fault_next")[now.faulted, p]
-    now.clearing = 1 if now.faulted else 0
-    if n.fault_w >= 0:
+    now.contact = field(n, "opens_to")[now.contact, p]
+    now.clearing = 1 if now.contact else 0
+    if n.contact_w >= 0:
         vector = complex((2.0 * i_a - i_b - i_c) / 3.0, (i_b - i_c) / math.sqrt(3.0))
-        field(now, "w")[n.fault_w] = vector * _turn(plant, at).conjugate()
+        field(now, "w")[n.contact_w] = vector * _turn(plant, at).conjugate()
     _enter(plant, at)
 
 
 @compiled
 def _currents(plant: PlantRecords, at: float) -> tuple[float, float, float]:
-    """Return the currents of phases a, b, c through the fault at an instant of the period, p.u."""
+    """Return the currents of phases a, b, c through the contact at an instant of the period."""
     n, now = plant.net[0], plant.now[0]
-    by_w, w, turn = field(n, "fault_current"), field(now, "w"), _turn(plant, at)
+    by_w, w, turn = field(n, "contact_current"), field(now, "w"), _turn(plant, at)
     i_a = i_b = i_c = 0j
     for i in range(n.n_states):
-        i_a += by_w[now.faulted, 0, i] * w[i]
-        i_b += by_w[now.faulted, 1, i] * w[i]
-        i_c += by_w[now.faulted, 2, i] * w[i]
+        i_a += by_w[now.contact, 0, i] * w[i]
+        i_b += by_w[now.contact, 1, i] * w[i]
+        i_c += by_w[now.contact, 2, i] * w[i]
     return (i_a * turn).real, (i_b * turn).real, (i_c * turn).real
 
 

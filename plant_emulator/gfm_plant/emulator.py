@@ -129,7 +129,7 @@ def plant_step(plant: PlantRecords) -> None:
     advance_grid(now, n.T_s)
     if now.check == WATCHING:
         watch(plant)
-    if now.faulted:
+    if now.contact:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s and begin_clearing(n, now):
             _reconnect(plant)
@@ -228,7 +228,7 @@ def synchronise(plant: PlantRecords, k: int) -> None:
 @cached
 def clear(plant: PlantRecords) -> None:
     """Clear the fault, if there is one, or begin to."""
-    if plant.now[0].faulted and begin_clearing(plant.net[0], plant.now[0]):
+    if plant.now[0].contact and begin_clearing(plant.net[0], plant.now[0]):
         _reconnect(plant)
 
 

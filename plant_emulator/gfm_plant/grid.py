@@ -18,7 +18,7 @@ from gfm_plant.model import DELTA
 from gfm_plant.names import CLEARINGS, FAULTED_PHASES
 from gfm_plant.network import Network
 from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
-from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, Wiring
+from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, OpeningBreaker, Wiring
 
 LEAST_FAULT_R = 1e-4
 """p.u., at a capacitor: a metallic short circuit there would discharge it in no time."""
@@ -136,17 +136,19 @@ def fault(
     _require("R", R, least <= R, f">= {least:g} p.u. at {where}")
     if duration is not None:
         _require("duration", duration, duration > 0, "> 0 s")
-    if clearing not in CLEARINGS:
-        raise ValueError(f"clearing = {clearing!r}: must be one of {list(CLEARINGS)}")
-    place = FaultPlace(node, inside, position or 0.0, R, kind, phases, Z_0, clearing)
-    changed = replace(wiring, fault=place)
+    _require_clearing(clearing)
+    place = FaultPlace(
+        node=node, branch=inside, position=position or 0.0, R=R, kind=kind, phases=phases, Z_0=Z_0,
+        clearing=clearing,
+    )  # fmt: skip
+    changed = replace(wiring, fault=place, opening=None)
     if kind in ("LG", "LLG") and changed.zero_sequence() is None:
         raise ValueError(
             f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
             f" grid or of a transformer; an {kind} fault needs a path to ground"
         )
     plant.rewire(changed)
-    plant.now["faulted"], plant.now["clearing"] = 1, 0
+    plant.now["contact"], plant.now["clearing"] = 1, 0
     plant.now["fault_left"] = math.inf if duration is None else duration
     reconnect(plant.records)
 
@@ -282,16 +284,21 @@ def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     plant.par["L_g"][0], plant.par["R_g"][0] = new_L, new_R
 
 
-def breaker(plant: Network, closed: bool) -> None:
+def breaker(plant: Network, closed: bool, clearing: str = "zero") -> None:
     """Open or close the breaker between the grid and the local load at the far end of the line.
 
-    While it is closed the grid alone sets the load's voltage. When it opens, line and load are in
-    series, and what current they share follows from the flux that both held:
+    While it is closed the grid alone sets the load's voltage. When it opens at once, line and load
+    are in series, and what current they share follows from the flux that both held:
     (L_g i_o + L_load i_load) / (L_g + L_load). The angle delta stays that to the grid, so closing
     again meets whatever phase has built up.
 
+    Args:
+        plant: The plant.
+        closed: False opens it.
+        clearing: How it opens, see `line_breaker`.
+
     Raises:
-        ValueError: If it opens onto no load.
+        ValueError: If it opens onto no load, or there is no such clearing.
     """
     if closed == bool(plant.now[0]["closed"]):
         return
@@ -301,26 +308,49 @@ def breaker(plant: Network, closed: bool) -> None:
         raise ValueError(
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
-    plant.rewire(replace(_without_check(plant, ""), closed=closed))
+    _switch(plant, replace(_without_check(plant, ""), closed=closed), GRID_SOURCE, closed, clearing)
     plant.now["closed"] = closed
 
 
-def line_breaker(plant: Network, name: str, closed: bool) -> None:
+def line_breaker(plant: Network, name: str, closed: bool, clearing: str = "zero") -> None:
     """Open or close the breaker of a line or a load.
-
-    What opens interrupts its current; the flux that it shared with others stays in them.
 
     Args:
         plant: The plant.
         name: Of the line or load, or of the converter whose line it is.
         closed: False opens it.
+        clearing: "zero": each pole opens as soon as its current passes zero; "instant": all poles
+            open at once, and the flux that the current shared with others stays in them. At once
+            open also: resistors and constant powers, which hold no flux; every breaker during a
+            fault; and one whose poles still conduct when another one begins to open.
 
     Raises:
-        ValueError: If there is no such breaker.
+        ValueError: If there is no such breaker or clearing.
     """
     part, *_ = _breaker(plant, name)
     wiring, one = _without_check(plant, name), frozenset({part})
-    plant.rewire(replace(wiring, opened=wiring.opened - one if closed else wiring.opened | one))
+    if (part in wiring.opened) != closed:  # it stays as it is
+        plant.rewire(wiring)
+        return
+    opened = wiring.opened - one if closed else wiring.opened | one
+    _switch(plant, replace(wiring, opened=opened), part, closed, clearing)
+
+
+def _switch(plant: Network, wiring: Wiring, name: str, closed: bool, clearing: str) -> None:
+    """Go on with a breaker closed or open in the wiring, or with its poles as they open."""
+    _require_clearing(clearing)
+    faulted = plant.now[0]["contact"] > 0 and wiring.opening is None
+    at_once = name in [s.name for s in wiring.shunts] + [s.name for s in wiring.sinks]
+    if closed or clearing == "instant" or faulted or at_once:
+        plant.rewire(replace(wiring, opening=None))
+        return
+    plant.rewire(replace(wiring, fault=None, opening=OpeningBreaker(name=name)))
+    plant.now["clearing"], plant.now["fault_left"] = 1, math.inf
+
+
+def _require_clearing(clearing: str) -> None:
+    if clearing not in CLEARINGS:
+        raise ValueError(f"clearing = {clearing!r}: must be one of {list(CLEARINGS)}")
 
 
 def check_synchronism(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
 
-MOST_FAULTS = 8
+MOST_CONTACTS = 8
 """None, one of three phases, and what is left of it as these open: two of them, or one."""
 
 CHECK_SIDES = 2
@@ -35,7 +35,7 @@ _NET: _Arrays = {
     # one sampling period in stretches, between the instants at which a command begins to act; each
     # is cut into pieces for Simpson's rule, and each piece in halves. Another cut of each, n_parts
     # places further on, lets a peak-current limit look at the current; the last one is for what
-    # ends where a phase of a fault opens, see `clearing`
+    # ends where a phase of a fault or breaker opens, see `clearing`
     "stretch": (float, ("n_parts",)),  # s
     "pieces": (int, ("n_cuts",)),
     "half_h": (float, ("n_cuts",)),  # s
@@ -53,10 +53,10 @@ _NET: _Arrays = {
     "modes": (complex, ("n_c", "n_z", "n_w")),
     "unbalanced": (int, ("n_c",)),
     "mirror": (complex, ("n_c", "n_z")),  # see `circuit.Modes`
-    # of the faults: the current of each phase by w, and the fault that is left when it opens (-1:
-    # it carries none), see `Wiring.faults`
-    "fault_current": (complex, ("n_faults", 3, "n_w")),
-    "fault_next": (int, ("n_faults", 3)),
+    # of the contacts: the current of each phase by w, and what is left when it opens (-1:
+    # it carries none), see `Wiring.contacts`
+    "contact_current": (complex, ("n_contacts", 3, "n_w")),
+    "opens_to": (int, ("n_contacts", 3)),
     # of nodes whose voltage is looked at, the two sides of a synchro-check first and then the
     # connection points: their voltages by w and by the sources, and by the mirror images of both;
     # what turns the latter; and the place in w of the current that reaches the node
@@ -98,7 +98,7 @@ net_dtype = _header(
         ("n_converters", "i8"),
         ("connections", "i8"),  # whether p, q and V of the connection points are looked at
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
-        ("fault_w", "i8"),  # place of the fault's own current, -1: it has none
+        ("contact_w", "i8"),  # place of the contact's own current, -1: it has none
         # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;
         # for how long, s
         ("check_limits", "f8", (3,)),
@@ -108,7 +108,7 @@ net_dtype = _header(
 )
 """Of the parameters of a network.
 
-Circuits come in groups, one for each of `Wiring.faults`, the first of which is none: row 0 of a
+Circuits come in groups, one for each of `Wiring.contacts`, the first of which is none: row 0 of a
 group as the converters are, and row 1 + k with the bridge of converter k blocked besides. Sources
 are the bridges, then the positive and the negative sequence of the grid, then the voltages and the
 currents of components; in an unbalanced circuit their mirror images follow in the same order. Such
@@ -132,7 +132,7 @@ now_dtype = _header(
         # positive and negative sequence over V_g, and s until they are 1 and 0 again
         ("sequence", "c16", (2,)),
         ("unbalance_left", "f8"),
-        ("faulted", "i8"),  # place in `Wiring.faults`
+        ("contact", "i8"),  # place in `Wiring.contacts`
         ("fault_left", "f8"),  # s until the fault is cleared
         ("clearing", "i8"),  # whether each of its phases opens as soon as its current passes zero
         # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
@@ -164,8 +164,8 @@ def make_net_and_now(
     """
     lengths = {
         "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
-        "n_phasors": 2 * sources, "n_faults": MOST_FAULTS,
-        "n_c": MOST_FAULTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
+        "n_phasors": 2 * sources, "n_contacts": MOST_CONTACTS,
+        "n_c": MOST_CONTACTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)

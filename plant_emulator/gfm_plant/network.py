@@ -18,7 +18,7 @@ from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords
-from gfm_plant.wiring import GRID_SOURCE, Wiring
+from gfm_plant.wiring import CONTACT, GRID_SOURCE, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
@@ -144,17 +144,20 @@ class Network:
         Raises:
             ValueError: as ``connect``; the plant is then unchanged.
         """
-        before, w = self.wiring, self.now["w"][0].copy()
-        fault = before.faults[int(self.now["faulted"][0])]
+        before, w, now = self.wiring, self.now["w"][0].copy(), self.now
+        contact = before.contacts[int(now["contact"][0])]
+        if wiring.opening is not before.opening:
+            contact = wiring.opening
         self.connect(wiring)
-        if fault is not None:  # what is left of it may be another kind, for want of a way to ground
-            phases = ["" if one is None else one.phases for one in wiring.faults]
-            self.now["faulted"] = phases.index(fault.phases) if fault.phases in phases else 0
+        # what is left may be another kind, for want of a path of the zero sequence
+        phases = ["" if one is None else one.phases for one in (contact, *wiring.contacts)]
+        now["contact"] = phases.index(phases[0], 1) - 1 if phases[0] in phases[1:] else 0
+        now["clearing"] *= now["contact"] > 0
         if wiring.split is not None and wiring.split != before.split:
             there = wiring.order.index(wiring.split)
             self.now["w"][0, wiring.order.index("beyond")] = w[there]
-        if "fault" in wiring.order and wiring.fault != before.fault:
-            self.now["w"][0, wiring.order.index("fault")] = 0.0
+        if CONTACT in wiring.order and wiring.fault != before.fault:
+            self.now["w"][0, wiring.order.index(CONTACT)] = 0.0
         if before.grid is None and self._leader() is None:  # the last machine is gone
             self.now["omega_g_slope"] = 0.0
         reconnect(self.records)
@@ -193,10 +196,10 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     found, which = {}, {}
     for k in range(N + 1):
         blocked = frozenset(wiring.blocked | ({k - 1} if k > 0 else set()))
-        for j, fault in enumerate(wiring.faults):
-            which[k + (N + 1) * j] = blocked, fault
-            found[k + (N + 1) * j] = wiring.modes(blocked, fault)
-    _pack_faults(net, wiring)
+        for j, contact in enumerate(wiring.contacts):
+            which[k + (N + 1) * j] = blocked, contact
+            found[k + (N + 1) * j] = wiring.modes(blocked, contact)
+    _pack_contacts(net, wiring)
     _pack_pieces(plant, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
     places = wiring.sources()
     looked_at = _nodes(net, wiring)
@@ -235,19 +238,19 @@ def _nodes(net: Any, wiring: Wiring) -> dict[int, str]:
     return found
 
 
-def _pack_faults(net: Any, wiring: Wiring) -> None:
-    """Set what the phases of a fault carry, and what is left of it when one of them opens."""
-    faults, order = wiring.faults, wiring.order
-    to_ground = wiring.zero_sequence() is not None
-    net["fault_next"] = -1
-    net["fault_w"] = order.index("fault") if "fault" in order else -1
-    for j, fault in enumerate(faults):
-        if fault is not None:
-            net["fault_current"][j, :, : len(order)] = wiring.fault_current(fault)
+def _pack_contacts(net: Any, wiring: Wiring) -> None:
+    """Set what the phases of a fault or breaker carry, and what is left when one of them opens."""
+    contacts, order = wiring.contacts, wiring.order
+    zero_sequence = wiring.zero_sequence() is not None
+    net["opens_to"] = -1
+    net["contact_w"] = order.index(CONTACT) if CONTACT in order else -1
+    for j, one in enumerate(contacts):
+        if one is not None:
+            net["contact_current"][j, :, : len(order)] = wiring.contact_current(one)
             for p, phase in enumerate("abc"):
-                carries = phase in fault.phases and fault.clearing == "zero"
-                net["fault_next"][j, p] = (
-                    faults.index(fault.opened(phase, to_ground)) if carries else -1
+                carries = phase in one.phases and one.clearing == "zero"
+                net["opens_to"][j, p] = (
+                    contacts.index(one.opened(phase, zero_sequence)) if carries else -1
                 )
 
 

@@ -231,7 +231,7 @@ def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
 @compiled
 def circuit(n: Any, now: Any) -> int:
     """Return which circuit is in force."""
-    return now.row + (n.n_converters + 1) * now.faulted
+    return now.row + (n.n_converters + 1) * now.contact
 
 
 @compiled

@@ -6,8 +6,10 @@ A wiring never changes: an event makes another one. Elements are in p.u. of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from gfm_plant.components.part import Fed, emf
 from gfm_plant.names import FAULTED_PHASES
 
 GRID_SOURCE = "grid"
+CONTACT = "contact"  # the branch through which a zero sequence lets a fault, or the grid, conduct
 ALPHA, BETA = 0, 1
 """The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
@@ -79,30 +82,23 @@ class ConverterCircuit:
         return f"{self.name}.i_o"
 
 
-@dataclass(frozen=True)
-class FaultPlace:
-    """Where phases are shorted, which, and through what.
+@dataclass(frozen=True, kw_only=True)
+class Contact:
+    """Which phases conduct where they do not always do: those of a fault to ground, or the poles of
+    a breaker between its two sides.
 
     Attributes:
-        node: the node, or the one at which the faulted branch starts.
-        branch: name of the branch with the fault inside, or None: at the node itself.
-        position: on that branch, in (0, 1).
-        R: from each phase to ground, of kind LL from one phase to the other; p.u. of the network.
         kind: a key of `FAULTED_PHASES`.
         phases: one of that kind.
-        Z_0: R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the
-            grid, see `Wiring.zero_sequence`.
         clearing: of `CLEARINGS`.
+        R: of a fault from each phase to ground, of kind LL from one phase to the other; p.u. of the
+            network.
     """
 
-    node: str
-    branch: str | None
-    position: float
-    R: float
     kind: str = "3ph"
     phases: str = "abc"
-    Z_0: complex | None = None
-    clearing: str = "instant"
+    clearing: str = "zero"
+    R: float = 0.0
 
     @property
     def balanced(self) -> bool:
@@ -114,20 +110,20 @@ class FaultPlace:
         """The axis of the phase that differs, rad."""
         return 2 * math.pi / 3 * FAULTED_PHASES[self.kind].index(self.phases)
 
-    def opened(self, phase: str, to_ground: bool) -> FaultPlace | None:
+    def opened(self, phase: str, zero_sequence: bool) -> Self | None:
         """What is left where the current of a phase has been interrupted; None: nothing.
 
         Args:
-            to_ground: whether a zero sequence has a path. Without one, one phase carries nothing.
+            zero_sequence: whether it has a path. Without one, one phase carries nothing.
         """
         left = self.phases.replace(phase, "")
-        if self.kind == "LL" or not left or (len(left) == 1 and not to_ground):
+        if self.kind == "LL" or not left or (len(left) == 1 and not zero_sequence):
             return None
-        kind = "LG" if len(left) == 1 else "LLG" if to_ground else "LL"
+        kind = "LG" if len(left) == 1 else "LLG" if zero_sequence else "LL"
         return replace(self, kind=kind, phases="ca" if left == "ac" else left)
 
     def phase_current(self, phase: str) -> tuple[float, float]:
-        """The current of a phase as factors of those that the fault takes on the two axes.
+        """The current of a phase as factors of those on the two axes.
 
         A zero sequence comes with them: i_0 = i_alpha / 2 for LG, -i_alpha for LLG.
         """
@@ -138,12 +134,11 @@ class FaultPlace:
         return math.cos(behind) + zero, math.sin(behind)
 
     def seen(self, axis: int, Z_0: complex | None) -> complex | None:
-        """The impedance that the fault puts between the circuit of an axis and ground, p.u.; None:
-        it puts none there.
+        """The impedance that it puts into the circuit of an axis, p.u.; None: nothing flows there.
 
-        It follows from Clarke's transform of the currents and voltages at the fault, with v_0 =
-        -Z_0 i_0. LG, phase a: v_alpha + v_0 = R i_a, i_b = i_c = 0. LL, b to c: i_a = 0,
-        i_b = -i_c, v_b - v_c = R i_b. LLG, b and c: i_a = 0, v_b = R i_b, v_c = R i_c.
+        It follows from Clarke's transform of the currents and voltages, with v_0 = -Z_0 i_0. LG,
+        phase a: v_alpha + v_0 = R i_a, i_b = i_c = 0. LL, b to c: i_a = 0, i_b = -i_c,
+        v_b - v_c = R i_b. LLG, b and c: i_a = 0, v_b = R i_b, v_c = R i_c.
 
         Args:
             Z_0: impedance of the zero sequence's path; None: it has none, and no current.
@@ -158,6 +153,35 @@ class FaultPlace:
             case ("3ph", _) | ("LLG", 1):
                 return complex(self.R)
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultPlace(Contact):
+    """A fault: where phases are shorted, which, and through what.
+
+    Attributes:
+        node: the node, or the one at which the faulted branch starts.
+        branch: name of the branch with the fault inside, or None: at the node itself.
+        position: on that branch, in (0, 1).
+        Z_0: R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the
+            grid, see `Wiring.zero_sequence`.
+    """
+
+    node: str
+    branch: str | None
+    position: float
+    Z_0: complex | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningBreaker(Contact):
+    """The poles of an open breaker that still conduct, each until its current passes zero.
+
+    Attributes:
+        name: of its branch, or GRID_SOURCE.
+    """
+
+    name: str
 
 
 @dataclass(frozen=True)
@@ -188,6 +212,8 @@ class Wiring:
         closed: whether the grid's breaker is closed.
         opened: names of branches whose breakers are open.
         fault: where one is, or may be again, or None.
+        opening: the breaker, open by ``closed`` or ``opened``, whose poles may still conduct; there
+            is no fault then.
         blocked: indices of converters whose bridges are out of every circuit.
         check: the synchro-check that waits to close a breaker, or None.
     """
@@ -202,6 +228,7 @@ class Wiring:
     closed: bool = True
     opened: frozenset[str] = frozenset()
     fault: FaultPlace | None = None
+    opening: OpeningBreaker | None = None
     blocked: frozenset[int] = frozenset()
     check: Check | None = None
 
@@ -209,11 +236,13 @@ class Wiring:
     def order(self) -> tuple[str, ...]:
         """Names of the states as w has them: three a converter, the branches, the banks' voltages,
         and what a fault adds: the current beyond it within a branch, and its own through the
-        inductance of the zero sequence's path, which a fault of three phases has as they open."""
+        inductance of the zero sequence's path, which a fault of three phases has as they open; the
+        same of the grid's breaker."""
         own = tuple(name for unit in self.units for name in unit.states)
         beyond: tuple[str, ...] = () if self.split is None else ("beyond",)
-        if any(one is not None and one.kind in ("LG", "LLG") for one in self.faults):
-            beyond += ("fault",)
+        grounded = any(one is not None and one.kind in ("LG", "LLG") for one in self.contacts)
+        if grounded and (self.opening is None or self.opening.name == GRID_SOURCE):
+            beyond += (CONTACT,)
         others = [part.name for part in (*self.branches, *self.fed_branches)]
         others += [bank.name for bank in self.capacitors]
         return (*own, *others, *beyond)
@@ -302,83 +331,104 @@ class Wiring:
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
     @property
-    def faults(self) -> tuple[FaultPlace | None, ...]:
-        """No fault, the fault, and what may be left of it while its phases open one by one."""
-        found: list[FaultPlace | None] = [None]
-        if self.fault is None:
-            return (None,)
-        waiting: list[FaultPlace | None] = [self.fault]
-        to_ground = self.zero_sequence() is not None
+    def contacts(self) -> tuple[Contact | None, ...]:
+        """None, the fault or the opening breaker, and what may be left of it while its phases open
+        one by one."""
+        found: list[Contact | None] = [None]
+        waiting: list[Contact | None] = [self.opening or self.fault]
+        zero_sequence = waiting != [None] and self.zero_sequence() is not None
         while waiting:
             one = waiting.pop(0)
             if one in found or one is None:
                 continue
             found.append(one)
             if one.clearing == "zero":
-                waiting += [one.opened(phase, to_ground) for phase in one.phases]
+                waiting += [one.opened(phase, zero_sequence) for phase in one.phases]
         return tuple(found)
 
-    def fault_current(self, fault: FaultPlace) -> NDArray[np.complex128]:
-        """The currents of phases a, b, c through a fault, (3, n_w): each is the real part of what
-        this gives with w, in the frame that stands still."""
-        place = "beyond" if self.split else fault.node
+    def contact_current(self, contact: Contact) -> NDArray[np.complex128]:
+        """The currents of phases a, b, c through a fault or a breaker, (3, n_w): each is the real
+        part of what this gives with w, in the frame that stands still."""
         to_axis = np.zeros((2, len(self.order)))
         for axis in (ALPHA, BETA):
-            seen = fault.seen(axis, self.zero_sequence())
-            if seen is None:
-                continue
-            if seen.imag > 0:
-                to_axis[axis, self.order.index("fault")] = 1.0
-                continue
-            branches, capacitors, _, shunts, _ = self._circuit(frozenset(), fault, axis)
-            bank = next((one.name for one in capacitors if one.node == place), None)
-            if bank is not None:
-                to_axis[axis, self.order.index(bank)] = 1 / seen.real
-                continue
-            R = next(one.R for one in shunts if one.node == place)  # with what else is there
-            for branch in branches:
-                for end, sign in ((branch.end, 1.0), (branch.start, -1.0)):
-                    if end == place:
-                        share = R / seen.real if seen.real > 0 else 1.0
-                        to_axis[axis, self.order.index(branch.name)] += sign * share
-        factors = [fault.phase_current(phase) for phase in "abc"]
-        turn = np.exp(-1j * fault.angle)
+            seen = contact.seen(axis, self.zero_sequence())
+            if seen is not None:
+                for name, factor in self._through(contact, axis, seen).items():
+                    to_axis[axis, self.order.index(name)] += factor
+        factors = [contact.phase_current(phase) for phase in "abc"]
+        turn = np.exp(-1j * contact.angle)
         return np.array([turn * (a * to_axis[ALPHA] - 1j * b * to_axis[BETA]) for a, b in factors])
 
-    def modes(self, blocked: frozenset[int], fault: FaultPlace | None) -> tuple[Modes, list[str]]:
+    def _through(self, contact: Contact, axis: int, seen: complex) -> dict[str, float]:
+        """What each state brings to the current through a contact on an axis, as a factor."""
+        if isinstance(contact, OpeningBreaker) and contact.name != GRID_SOURCE:
+            return {contact.name: 1.0}
+        if seen.imag > 0:
+            return {CONTACT: 1.0}
+        branches, capacitors, _, shunts, _ = self._circuit(frozenset(), contact, axis)
+        place, share = str(self.grid), -1.0  # towards the network
+        if isinstance(contact, FaultPlace):
+            place = "beyond" if self.split else contact.node
+            bank = next((one.name for one in capacitors if one.node == place), None)
+            if bank is not None:
+                return {bank: 1 / seen.real}
+            R = next(one.R for one in shunts if one.node == place)  # with what else is there
+            share = R / seen.real if seen.real > 0 else 1.0
+        return {
+            branch.name: share if branch.end == place else -share
+            for branch in branches
+            if place in (branch.start, branch.end)
+        }
+
+    def modes(self, blocked: frozenset[int], contact: Contact | None) -> tuple[Modes, list[str]]:
         """The modes of a circuit, and the names of its sources and sinks in their order.
 
         Args:
             blocked: indices of the converters whose bridges block.
-            fault: one of ``faults``.
+            contact: one of ``contacts``.
 
         Raises:
             ValueError: as ``find_modes``.
         """
         sinks = [sink for sink in self.sinks if sink.name not in self.opened]
-        unbalanced = fault is not None and not fault.balanced
+        unbalanced = contact is not None and not contact.balanced
         found = []
         for axis in (ALPHA, BETA) if unbalanced else (ALPHA,):
-            branches, capacitors, sources, shunts, _ = self._circuit(blocked, fault, axis)
+            branches, capacitors, sources, shunts, _ = self._circuit(blocked, contact, axis)
             parts = branches, capacitors, sources
             found.append(find_modes(*parts, self.omega_b, self.order, shunts, sinks))
         names = [part.name for part in sources] + [part.name for part in sinks]
-        if fault is None or fault.balanced:
+        if contact is None or contact.balanced:
             return found[0], names
         alpha, beta = found
-        return join_axes(alpha, beta, fault.angle), names
+        return join_axes(alpha, beta, contact.angle), names
 
     def zero_sequence(self) -> complex | None:
         """The impedance between the place of the fault and ground for a zero sequence at nominal
-        frequency, p.u.; None: there is no path.
+        frequency, or that of the loop through an opening breaker, p.u.; None: there is no path.
 
         It is the fault's own ``Z_0``, or that of the closed lines between the fault and the earthed
         star points of the grid and of transformers; lines have the same impedance for all
         sequences. Converters, machines and loads have three wires: behind the delta winding of a
         transformer a zero sequence finds no path.
         """
+        if self.opening is not None:
+            if self.opening.name == GRID_SOURCE:
+                return self._zero_sequence_between(str(self.grid), GROUND)
+            lines = {one.name: one for one in self.branches if not one.earthed}
+            line = lines.get(self.opening.name)
+            if line is None or line.end == GROUND:
+                return None
+            at_ground = {self.grid} if self.closed else set()
+            start, end = (GROUND if n in at_ground else n for n in (line.start, line.end))
+            around = self._zero_sequence_between(start, end)
+            return None if around is None else complex(line.R, line.L) + around
         if self.fault is None or self.fault.Z_0 is not None:
             return None if self.fault is None else self.fault.Z_0
+        return self._zero_sequence_between("beyond" if self.split else self.fault.node, GROUND)
+
+    def _zero_sequence_between(self, one: str, other: str) -> complex | None:
+        """The impedance of closed lines and star points between two nodes."""
         found = []
         for branch in self._whole((*self.units_lines, *self.branches)):
             if branch.end == GROUND or branch.earthed == "none":
@@ -386,47 +436,46 @@ class Wiring:
             ends = {"end": {branch.start}, "start": {branch.end}}.get(
                 branch.earthed, {self.grid} if self.closed else set()
             )  # which of its ends are at ground
-            one, other = (GROUND if end in ends else end for end in (branch.start, branch.end))
-            found.append((one, other, 1 / complex(branch.R, branch.L)))
-        reached = {GROUND}
+            a, b = (GROUND if end in ends else end for end in (branch.start, branch.end))
+            found.append((a, b, 1 / complex(branch.R, branch.L)))
+        reached = {other}
         while more := {end for a, b, _ in found if {a, b} & reached for end in (a, b)} - reached:
             reached |= more
-        place = "beyond" if self.split else self.fault.node
-        if place not in reached:
+        if one not in reached:
             return None
-        nodes = sorted(reached - {GROUND})
+        nodes = sorted(reached - {other})
         Y = np.zeros((len(nodes), len(nodes)), complex)
         for a, b, y in found:
             if a in reached:
-                at = [nodes.index(end) for end in (a, b) if end != GROUND]
+                at = [nodes.index(end) for end in (a, b) if end != other]
                 sign = np.array([1.0, -1.0][: len(at)])
                 Y[np.ix_(at, at)] += np.outer(sign, sign) * y
-        return complex(np.linalg.inv(Y)[nodes.index(place), nodes.index(place)])
+        return complex(np.linalg.inv(Y)[nodes.index(one), nodes.index(one)])
 
     def voltage(
-        self, node: str, blocked: frozenset[int], fault: FaultPlace | None
+        self, node: str, blocked: frozenset[int], contact: Contact | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], complex]:
         """The voltage of a node as factors of w and of the sources, (2, n_w) and (2, n_s): of
         themselves, and of their mirror images times the number that comes third. The latter are
         zero in a balanced circuit; see ``join_axes``.
 
         Args:
-            blocked, fault: as for ``modes``.
+            blocked, contact: as for ``modes``.
         """
-        alpha = self._voltage(node, blocked, fault, ALPHA)
-        if fault is None or fault.balanced:
+        alpha = self._voltage(node, blocked, contact, ALPHA)
+        if contact is None or contact.balanced:
             by_w, by_s = (np.array([one, np.zeros_like(one)]) for one in alpha)
             return by_w, by_s, 1.0
-        beta = self._voltage(node, blocked, fault, BETA)
+        beta = self._voltage(node, blocked, contact, BETA)
         by_w, by_s = (np.array([a + b, a - b]) / 2 for a, b in zip(alpha, beta, strict=True))
-        return by_w, by_s, np.exp(2j * fault.angle)
+        return by_w, by_s, np.exp(2j * contact.angle)
 
     def _voltage(
-        self, node: str, blocked: frozenset[int], fault: FaultPlace | None, axis: int
+        self, node: str, blocked: frozenset[int], contact: Contact | None, axis: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The voltage of a node on an axis as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on."""
-        parts = self._circuit(blocked, fault, axis)
+        parts = self._circuit(blocked, contact, axis)
         branches, capacitors, sources, shunts, hanging = parts
         there = {end for branch in branches for end in (branch.start, branch.end)}
         there |= {part.node for part in capacitors} | {part.node for part in sources}
@@ -443,20 +492,26 @@ class Wiring:
         return np.zeros(len(self.order)), np.zeros(len(sources))
 
     def _circuit(
-        self, blocked: frozenset[int], fault: FaultPlace | None, axis: int
+        self, blocked: frozenset[int], contact: Contact | None, axis: int
     ) -> tuple[list[Branch], list[Capacitor], list[VoltageSource], list[Shunt], list[Branch]]:
         """The parts of a circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
-        through_fault = []
-        if fault is not None:
-            node = "beyond" if self.split else fault.node
-            seen = fault.seen(axis, self.zero_sequence())
-            if seen is not None and seen.imag > 0:
-                through_fault.append(Branch("fault", node, GROUND, seen.imag, seen.real))
-            elif seen is not None:
+        through, poles, grid = [], {}, self.grid if self.closed else None
+        seen = None if contact is None else contact.seen(axis, self.zero_sequence())
+        if isinstance(contact, FaultPlace) and seen is not None:
+            node = "beyond" if self.split else contact.node
+            if seen.imag > 0:
+                through.append(Branch(CONTACT, node, GROUND, seen.imag, seen.real))
+            else:
                 shunts.append(Shunt("fault", node, seen.real))
+        elif isinstance(contact, OpeningBreaker) and contact.name == GRID_SOURCE:
+            grid = self.grid if seen == 0 else GRID_SOURCE
+            if seen:
+                through.append(Branch(CONTACT, GRID_SOURCE, str(self.grid), seen.imag, seen.real))
+        elif isinstance(contact, OpeningBreaker) and seen is not None:
+            poles = {contact.name: seen}
         shunts = _in_parallel(shunts)
         for k, unit in enumerate(self.units):
             if k not in blocked:
@@ -464,16 +519,16 @@ class Wiring:
                 filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
                 sources.append(VoltageSource(unit.bridge, unit.bridge))
         branches = [
-            *self._whole(self.units_lines),
+            *self._whole(self.units_lines, poles),
             *filters,
-            *self._whole((*self.branches, *self.fed_branches)),
-            *through_fault,
+            *self._whole((*self.branches, *self.fed_branches), poles),
+            *through,
         ]
         sources += [VoltageSource(emf(name), emf(name)) for name, one in self.fed if one.is_voltage]
         capacitors = [Capacitor(unit.states[1], unit.terminal, unit.C_f) for unit in self.units]
         capacitors += self.capacitors
-        if self.grid is not None and self.closed:
-            sources.append(VoltageSource(GRID_SOURCE, self.grid))
+        if grid is not None:
+            sources.append(VoltageSource(GRID_SOURCE, grid))
         whole, held = branches, {GROUND} | {source.node for source in sources}
         held |= {one.node for one in capacitors} | {one.node for one in shunts}
         if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may
@@ -484,9 +539,15 @@ class Wiring:
         hanging = [branch for branch in whole if branch not in branches]
         return branches, capacitors, sources, shunts, hanging
 
-    def _whole(self, branches: Sequence[Branch]) -> Iterator[Branch]:
-        """Those that are closed; a split one as two."""
+    def _whole(
+        self, branches: Sequence[Branch], poles: Mapping[str, complex] = MappingProxyType({})
+    ) -> Iterator[Branch]:
+        """Those that are closed; a split one as two; and one whose poles still conduct, with the
+        impedance that they see."""
         for branch in branches:
+            if branch.name in poles:
+                Z = poles[branch.name]
+                yield replace(branch, L=branch.L + Z.imag, R=branch.R + Z.real)
             if branch.name in self.opened:
                 continue
             if self.fault is None or branch.name != self.split:

@@ -95,7 +95,7 @@ def test_a_machine_that_is_lost_runs_up_by_itself():
     """Without load: 2 H d(omega)/dt = P_turbine - D (omega - 1), the current is zero at once."""
     plant = make(g=MACHINE, h={**MACHINE, "S": 1.0})
     u = rest(plant, [0.05, 0.03])
-    line_breaker(plant, "h", closed=False)
+    line_breaker(plant, "h", closed=False, clearing="instant")
     now, k = plant.now[0], plant.wiring.order.index("h")
     g, h = plant.of(Machine)
     P = float(h["P_turbine"])
@@ -106,7 +106,7 @@ def test_a_machine_that_is_lost_runs_up_by_itself():
     assert now["w"][k] == 0.0
     assert h["omega"] - 1 == pytest.approx(P * ticks * T_S / (2 * 0.8), rel=0.1)
     assert g["omega"] != h["omega"] and now["omega_g"] == g["omega"]
-    line_breaker(plant, "g", closed=False)
+    line_breaker(plant, "g", closed=False, clearing="instant")
     last = float(now["omega_g"])
     plant_step(plant.records)
     assert now["omega_g"] == last and g["omega"] > last  # the last machine is gone

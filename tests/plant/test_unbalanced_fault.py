@@ -143,7 +143,7 @@ def test_fault_and_clearing_against_three_phases(rest, at, R, kind, which):
     exact = np.array([vector(x) * back for x in s.reshape(4, 3)])
     exact[2] = at * exact[2] + (1 - at) * exact[3]  # the line keeps its flux
     found = plant.now["w"][0, [I_F, V, I_O]]
-    assert plant.now["faulted"][0] == 0
+    assert plant.now["contact"][0] == 0
     assert found == pytest.approx(exact[:3], abs=1e-9)
 
 
@@ -168,7 +168,7 @@ def test_each_phase_opens_where_its_current_passes_zero(rest, at, R, kind, which
     model = Phases(plant, at, R, kind, which)
     fault(plant.plant, at, R, duration=0.0123, kind=kind, phases=which)
     plant.advance(600)
-    assert plant.now["faulted"][0] == plant.now["clearing"][0] == 0
+    assert plant.now["contact"][0] == plant.now["clearing"][0] == 0
     s = np.concatenate([phases(x) for x in w])
     tight = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
     s = solve_ivp(model.slope, (t, 0.0123), s, **tight).y[:, -1]
@@ -245,7 +245,7 @@ def test_the_sources_give_what_the_resistances_take(rest):
     given, taken = np.empty(200), np.empty(200)
     for k in range(200):
         i_f, i_o, i_g, through = (
-            plant.phasor(name) for name in ("converter.i_f", "converter.i_o", "beyond", "fault")
+            plant.phasor(name) for name in ("converter.i_f", "converter.i_o", "beyond", "contact")
         )
         v_g = np.exp(-1j * plant.st["x"][0, 6])
         turn = cmath.exp(1j * (W * (40_000 + k) * 1e-4 + plant.x[6])) / AXES[1]
@@ -308,7 +308,7 @@ def test_a_line_that_changes_takes_the_path_of_the_zero_sequence_with_it(rest):
     assert plant.st["x"][0] == pytest.approx(other.st["x"][0], abs=1e-12)
     clear_fault(plant.plant)
     plant.advance(20_000)
-    assert plant.now["w"][0, plant.plant.wiring.order.index("fault")] == 0.0
+    assert plant.now["w"][0, plant.plant.wiring.order.index("contact")] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -338,4 +338,4 @@ def test_an_island_needs_a_path_to_ground(rest):
         fault(plant.plant, 0.5, 0.1, kind="LG")
     fault(plant.plant, 0.5, 0.1, kind="LG", Z_0=0.3j)
     plant.advance(100)
-    assert abs(plant.phasor("fault")) > 0.1
+    assert abs(plant.phasor("contact")) > 0.1

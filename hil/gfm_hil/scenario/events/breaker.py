@@ -45,10 +45,18 @@ class Switch(PlantEvent):
         None, description="closes once both sides agree, by a synchro-check; at once if none"
     )
 
+    clearing: Literal["zero", "instant"] = Field(
+        "zero",
+        description="of one that opens; zero: each pole opens where its current next passes zero; "
+        "instant: all poles open at once",
+    )
+
     @model_validator(mode="after")
-    def _checks_what_closes(self) -> Switch:
+    def _goes_with_the_direction(self) -> Switch:
         if self.check is not None and not self.closed:
             raise ValueError("check: goes with closed = true")
+        if self.closed and self.clearing == "instant":
+            raise ValueError("clearing = 'instant': goes with closed = false")
         return self
 
     def when(self) -> str:
@@ -89,7 +97,7 @@ class LineBreaker(Switch):
         return f"{self.name} " + ("on" if self.closed else "off") + self.when()
 
     def switch(self, plant: gfm_plant.Network) -> None:
-        gfm_plant.line_breaker(plant, self.name, self.closed)
+        gfm_plant.line_breaker(plant, self.name, self.closed, self.clearing)
 
 
 class GridBreaker(Switch):
@@ -106,4 +114,4 @@ class GridBreaker(Switch):
         return ["the breaker needs plant.grid.load_R and load_L"] if alone else []
 
     def switch(self, plant: gfm_plant.Network) -> None:
-        gfm_plant.breaker(plant, self.closed)
+        gfm_plant.breaker(plant, self.closed, self.clearing)
