@@ -54,6 +54,17 @@ def _silent(*_: object) -> None:
     """Neither progress nor notices."""
 
 
+def _explained(run: Run | NetworkRun) -> None:
+    """The figures and the report of a run; if it did not last because its linear loop is unstable,
+    its summary says so."""
+    if isinstance(run, Run) and run.status not in ("completed", "interrupted"):
+        from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
+
+        if why := why_it_ended(run):
+            run.summary["unstable_mode"] = why
+    write_report(run)
+
+
 def run(
     scenario: str | Path | Scenario | dict[str, Any],
     law: str | Path | Law | None = None,
@@ -94,7 +105,7 @@ def run(
             raise UserError(f"law = {law!r}: save it first, as the folder names its file")
         checked = _checked(scenario, {**changes, "law": law})
         command = _external_command(checked, controller, ports, notice)
-        report = write_report if figures else None
+        report = _explained if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
         raise UserError("controller, ports: take a folder")
@@ -286,7 +297,7 @@ def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -
             said = f"{name}: {ticks * one.T_s:.2f} s simulated{late}"
             watch.progress(len(runs) * one.ticks + ticks, len(scenarios) * one.ticks, said)
 
-        runs[name] = runner.run_scenario(one, folder / name, tell, watch.notice, write_report)
+        runs[name] = runner.run_scenario(one, folder / name, tell, watch.notice, _explained)
         if runs[name].status == "interrupted":
             break
     made = Comparison(runs)

@@ -11,12 +11,14 @@ from gfm_hil.api.law import Law, law_files
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.scenario.schema import laws_digest
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
 from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
+from gfm_hil.studies.conformity.hashes import file_hashes
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test
+from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test, under_test_file
 from gfm_hil.studies.envelopes import Unit
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
 from gfm_hil.studies.workers import SILENT, Watch, check_workers
@@ -84,8 +86,8 @@ def conform(
     Args:
         law: name, law file or ``Law``, or several of them; none with a controller.
         against: shipped sets, ``all`` of them, or paths of your own.
-        folder: where to write the report with figures, results.json and junit.xml; None writes
-            nothing.
+        folder: where to write the report with figures, as a page and, if reportlab is installed,
+            as PDF, results.json and junit.xml; None writes nothing.
         inner: inner stage of every law; each law's own if None.
         converter: file of the converter under test; the shipped one if None.
         controller: a model to test beside the laws, ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``. It
@@ -120,10 +122,13 @@ def conform(
         converters = Path(temporary) if place is None else place / "converters"
         jobs = make_jobs(files, cases, inner, under, converters, place, figures, external)
         found = execute(jobs, workers, watch)
+        digests = {name: laws_digest([file], inner) for name, file in files.items()}
+        own = under_test_file(converter)
+        hashes = file_hashes(files, inner, own, under.plant.converter, cases, external)
     names = [*files, *([external.name] if external else [])]
-    made = Conformity(names, inner, under, cases, found, place)
+    made = Conformity(names, inner, under, cases, found, place, hashes, digests)
     if place is not None:
-        made.write(place)
+        made.write(place, watch.notice)
     return made
 
 

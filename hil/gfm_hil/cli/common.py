@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import shlex
 import time
 import tomllib
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ from rich.progress import (
 )
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import target_of
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.processes import Progress as TellProgress
@@ -215,35 +213,6 @@ def progress_bar(
         yield tell, above(bar)
 
 
-def why_unstable(scenario: Scenario, named: str | Path) -> str:
-    """The unstable mode of a scenario's linear loop in one sentence, with the command that shows
-    its modes; empty if there is none.
-
-    Args:
-        scenario: whose loop it is.
-        named: what that command calls the scenario.
-    """
-    from gfm_hil.studies.linear_loop import unstable_mode  # a second of imports
-
-    found = unstable_mode(scenario)
-    if found is None:
-        return ""
-    law, words = found
-    more = ["--law", law] if law else []
-    return f"{words} ({shlex.join(['gfmhil', 'design', 'poles', *more, '--scenario', str(named)])})"
-
-
-def why_it_ended(run: Run | NetworkRun) -> str:
-    """As ``why_unstable``, of a run that did not last, or still oscillated at its end, under laws
-    of ours."""
-    each = [*run.values()] if isinstance(run, NetworkRun) else [run]
-    early = [one for one in each if one.status not in ("completed", "interrupted")]
-    if run.folder is None or not any(one.summary["ticks"] for one in early):  # none ever began
-        return ""
-    ours = all(target_of(one.summary["controller"]) is not None for one in each)
-    return why_unstable(run.scenario, run.folder / "scenario.toml") if ours else ""
-
-
 def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
     """The short table that ends a run; ``why`` is a sentence more on its end."""
     console = terminal()
@@ -283,7 +252,13 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
 
 def print_run(run: Run | NetworkRun, folder: Path, why: bool = False) -> None:
     """The tables that end a run; with ``why`` also what made it unstable, see ``why_it_ended``."""
-    reason = why_it_ended(run) if why or isinstance(run, NetworkRun) else ""
+    reason = ""
+    if isinstance(run, Run) and "unstable_mode" in run.summary:
+        reason = run.summary["unstable_mode"]
+    elif why or isinstance(run, NetworkRun):
+        from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
+
+        reason = why_it_ended(run)
     if isinstance(run, Run):
         print_summary(run.summary, folder, reason)
         return

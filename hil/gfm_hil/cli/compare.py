@@ -43,7 +43,7 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(found.summaries, indent=2))
     else:
         _print(found.summaries, found.events)
-        for why in filter(None, map(common.why_it_ended, found.values())):
+        for why in filter(None, (s.get("unstable_mode") for s in found.summaries.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
         terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
     return max(common.exit_code(run) for run in found.values())

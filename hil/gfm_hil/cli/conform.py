@@ -182,5 +182,8 @@ def _print(result: Conformity, wall_s: float) -> None:
     count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
+    if not result.under.plant.model_fields_set - {"converter"}:
+        text = f"converter under test: {result.under.plant.converter}, {result.under.instruments}"
+        console.print(text, highlight=False, soft_wrap=True)
     report = Path(result.folder or ".") / "report.html"
     console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)

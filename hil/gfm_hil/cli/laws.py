@@ -112,7 +112,7 @@ def call_show(options: argparse.Namespace) -> int:
 
 def _unstable(options: argparse.Namespace, grid: HomeGrid) -> str:
     """The mode that makes the law's loop on its own grid unstable; empty if none does."""
-    from gfm_hil.cli.common import why_unstable  # a second of imports, which the list does without
+    from gfm_hil.studies.linear_loop import why_unstable  # a second of imports
 
     factors = {"L_g": grid.L_g, "R_g": grid.R_g}
     try:

@@ -9,13 +9,27 @@ from rich.console import Console
 _ANY = 100_000  # columns; more than any table takes
 
 
+class _Pipe(Console):
+    """A console that is no terminal: rows of a table end where their text ends."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As ``Console.print``."""
+        with self.capture() as printed:
+            super().print(*objects, **options)
+        self.file.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
+
+
 def terminal(**options: Any) -> Console:
-    """A console with rich's ``options``, which wraps and cuts nothing where it is no terminal.
+    """A console with rich's ``options``, which wraps, cuts and fills up nothing where it is no
+    terminal.
 
     As everywhere, the variable COLUMNS says another width.
     """
     console = Console(**options)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
+    if console.is_terminal:
+        return console
+    console = _Pipe(**options)
+    if "COLUMNS" not in os.environ:
         console.width = _ANY
     return console
 

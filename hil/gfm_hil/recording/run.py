@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from gfm_hil.recording.columns import (
     Columns,
     Described,
     describe,
+    pieces,
 )
 from gfm_hil.recording.log import most_bytes, read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
@@ -206,6 +208,18 @@ class Run:
     def ticks(self) -> int:
         """How many ticks were recorded."""
         return len(self.columns["tick"])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all columns of signals.npz, each with its name, in hexadecimal digits. It is
+        the same if a run in lockstep is repeated by the same version on the same kind of processor.
+        """
+        found = hashlib.sha256()
+        for name, column in self.columns.items():
+            found.update(name.encode())
+            for piece in pieces(column, 0, len(column)):
+                found.update(np.ascontiguousarray(piece).tobytes())
+        return found.hexdigest()
 
     def blocks(self, ticks: int) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
         """Rows in blocks of at most ``ticks``: the first tick, and all columns from there on."""

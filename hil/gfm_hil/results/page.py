@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gfm_hil.core.files import write_text
 from gfm_hil.results.table import shown
@@ -34,6 +35,24 @@ def render(template: str, **values: Any) -> str:
 
     values["style"] = Markup(values.get("style", ""))
     return _environment().get_template(template).render(values)
+
+
+class PlotScript(NamedTuple):
+    """What a page needs to draw its plots: style and code, each once a page."""
+
+    style: str
+    code: str
+
+
+def plot_script() -> PlotScript:
+    """uPlot, of which the scope serves the same files, and what draws our plots with it."""
+    from markupsafe import Markup
+
+    vendor = files("gfm_hil").joinpath("ports/scope/static/vendor")
+    style = vendor.joinpath("uPlot.min.css").read_text("utf-8")
+    code = vendor.joinpath("uPlot.iife.min.js").read_text("utf-8")
+    own = (_PAGES / "plots.js").read_text("utf-8")
+    return PlotScript(Markup(style), Markup(f"{code}\n{own}"))
 
 
 def write_page(path: Path, template: str, **values: Any) -> None:

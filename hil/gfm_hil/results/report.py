@@ -116,6 +116,7 @@ def _write_page(run: Run, folder: Path, pictures: Sequence[Picture], diagram: Pa
         look="expected" if as_expected(summary) else summary["status"],
         reason=summary["reason"],
         unmet=summary["unmet"],
+        unstable=summary.get("unstable_mode", ""),
         facts=Table(
             (), [(Cell(name, "head"), value) for name, value in _facts(summary)], text=None
         ),

@@ -29,6 +29,7 @@ _SPAN = 1.0  # s at the end that are judged, at most
 _LEAST = 0.1  # s, at least: five cycles
 _SLOWEST = 2.0  # periods in a span: a slower swing looks like a trend
 _NEAR = 2.5  # lines of the spectrum on each side over which a sinusoid spreads
+_ROUNDING = 1e-9  # p.u.; the plant is solved to it
 _NOISE = 50.0  # of a sensor's standard deviation; the rig's ripple is up to 36 times that
 _EQUAL = GridUnbalance(type="grid-unbalance", tick=0).label()
 
@@ -84,6 +85,7 @@ def remaining_ripple(
     columns = {name: signals[f"true_{name}"] for name in _SIGNALS}
     last = np.array([column[done - n : done] for column in columns.values()])
     sizes, lines = _sinusoids(last, T_s, explained)
+    sizes[sizes < _ROUNDING] = 0.0
     size = dict(zip(columns, sizes.tolist(), strict=True))
     hertz = dict(zip(columns, lines.tolist(), strict=True))
     worst = ""

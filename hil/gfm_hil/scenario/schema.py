@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, Literal
 
@@ -69,6 +70,14 @@ class LinkSettings(StrictSchema):
 def file_hash(file: str) -> str:
     """Hash of the content of a file, wherever it lies."""
     return hashlib.sha256(read_regular(file, LARGEST_FILE)).hexdigest()[:16]
+
+
+def laws_digest(laws: Iterable[str], inner: str | None) -> str:
+    """Hash of the content of laws, by name or path, with their bases, and of the inner stage that
+    replaces theirs unless it is None."""
+    spec = None if inner is None else named_inner(inner)
+    stage = [inner is not None, spec and spec.model_dump()]
+    return _hash([stage, *(law_file(name).model_dump() for name in laws)])
 
 
 def _hash(content: Any) -> str:
@@ -325,9 +334,7 @@ class Scenario(StrictSchema):
 
     def laws_digest(self) -> str:
         """Hash of the content of every law that the run uses."""
-        spec = None if self.inner is None else named_inner(self.inner)
-        inner = [self.inner is not None, spec and spec.model_dump()]
-        return _hash([inner, *(law_file(name).model_dump() for name in self.laws())])
+        return laws_digest(self.laws(), self.inner)
 
     @cached_property
     def has_inner(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +12,9 @@ from typing import Any
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.core.roles import target_of
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario, load_scenario, plant_of
 from gfm_plant import NoEquilibrium
 from gfm_runtime import BuiltLaw, DiscreteLaw, discretise, law_titles, load_law
@@ -76,6 +79,33 @@ def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
             words = f"the linear loop{of} has an unstable mode: {hz}, {worst.sigma:+.3g} 1/s"
             return law, words + (_current_loop_too_fast(under) if alone else "")
     return None
+
+
+def why_unstable(scenario: Scenario, named: str | Path) -> str:
+    """The unstable mode of a scenario's linear loop in one sentence, with the command that shows
+    its modes; empty if there is none.
+
+    Args:
+        scenario: whose loop it is.
+        named: what that command calls the scenario.
+    """
+    found = unstable_mode(scenario)
+    if found is None:
+        return ""
+    law, words = found
+    more = ["--law", law] if law else []
+    return f"{words} ({shlex.join(['gfmhil', 'design', 'poles', *more, '--scenario', str(named)])})"
+
+
+def why_it_ended(run: Run | NetworkRun) -> str:
+    """As ``why_unstable``, of a run that did not last, or still oscillated at its end, under laws
+    of ours."""
+    each = [*run.values()] if isinstance(run, NetworkRun) else [run]
+    early = [one for one in each if one.status not in ("completed", "interrupted")]
+    if run.folder is None or not any(one.summary["ticks"] for one in early):  # none ever began
+        return ""
+    ours = all(target_of(one.summary["controller"]) is not None for one in each)
+    return why_unstable(run.scenario, run.folder / "scenario.toml") if ours else ""
 
 
 def _current_loop_too_fast(scenario: Scenario) -> str:

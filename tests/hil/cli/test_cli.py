@@ -354,6 +354,13 @@ def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     options = ["--laws", f"{own},vsg-2", "--out", str(tmp_path / "compared"), "--quiet"]
     assert main(["compare", "pref_step", *options]) == 3
     assert len(re.findall(words, capsys.readouterr().out)) == 1
+    compared = tmp_path / "compared" / "mine"
+    summary = json.loads((compared / "summary.json").read_text())
+    assert re.match(words + command, summary["unstable_mode"])
+    assert re.search(f"T{words[1:]}", (compared / "report.html").read_text())
+    assert "unstable_mode" not in json.loads(
+        (tmp_path / "compared" / "vsg-2" / "summary.json").read_text()
+    )
     assert main(["laws", "show", own]) == 0
     shown = capsys.readouterr().out
     assert re.search(words + command + r"pref_step\)", shown)

@@ -571,7 +571,7 @@ def test_command_writes_report_results_and_junit(lab, capsys):
     assert {(c["source"], c["known"]) for c in part["clauses"]} == {("Our lab, jump, 1", "ours")}
     report = (out / "report.html").read_text("utf-8")
     assert all(word in report for word in ("Our lab, jump, 1", "opposes", "at least 0.05 p.u."))
-    assert 'aria-label="lab/jump"' in report and report.count("<svg") >= 4
+    assert report.count('class="plot"') == 4
     suite = ElementTree.parse(out / "junit.xml").getroot()[0]
     assert suite.attrib["tests"] == "2" and suite.attrib["failures"] == "0"
     # the scenario that the report names repeats the run
@@ -819,7 +819,7 @@ def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path):
     (part,) = found.parts
     assert [v.verdict for v in part.verdicts] == [PASS, FAIL, FAIL]
     report = (tmp_path / "out" / "report.html").read_text("utf-8")
-    assert report.count("<figure") == 1 and report.count("<svg") == 2
+    assert report.count('class="plot"') == 2
     assert "gfmhil scan" in report
 
 

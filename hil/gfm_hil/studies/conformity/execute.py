@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core import temporary as scratch
@@ -26,14 +26,13 @@ from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
+from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
 from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
-
-if TYPE_CHECKING:
-    from gfm_hil.results.figures import Picture
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,8 @@ class PartResult:
     reason: str
     verdicts: list[Verdict]  # one a clause and time
     again: str = ""  # the command that repeats the run; empty if no scenario was written
-    figure: Picture | None = None  # if one was drawn
+    recording: str = ""  # SHA-256 of all that the run recorded; empty of a plot
+    figure: PartFigure | None = None  # if one was drawn
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""
@@ -104,6 +104,7 @@ class PartResult:
             "verdict": self.verdict,
             "status": self.status,
             "reason": self.reason,
+            "recording": self.recording,
             "cause": self.cause and {"clause": self.cause.clause, "text": self.cause.text},
             "clauses": [v.plain() for v in self.verdicts],
         }
@@ -273,14 +274,16 @@ def _run_part(job: Job) -> PartResult:
             reason = f"Cannot be judged: there is no such run: {text}"
             return PartResult(*names, "none", reason, cannot(criteria, reason))
         if plot is not None:
-            status, reason, verdicts = "completed", "", plot.judge_scan(found)
+            status, reason, recording = "completed", "", ""
+            verdicts = plot.judge_scan(found)
         else:
             under = job.under
             if external is None:  # a controller that is not ours runs over a link alone
                 for criterion in criteria:
                     under = criterion.declared(under, scenario)
             status, reason = run.status, str(run.summary["reason"])
-            verdicts = judge(run, criteria, under, others)
+            recording = run.digest
+            verdicts = marked(run, judge(run, criteria, under, others), external is None)
         again, figure = list[str](), None
         if job.folder is not None:
             place = job.folder / "runs" / slug(job.law) / slug(job.name)
@@ -288,16 +291,17 @@ def _run_part(job: Job) -> PartResult:
             write_scenario(place, scenario)
             again = _again(str(place / "scenario.toml"), plot, external)
             if job.figures and (plot is not None or run.ticks):
-                # half a second to import
-                from gfm_hil.studies.conformity.figure import draw_part, draw_plot
+                from gfm_hil.studies.conformity.figure import draw_panels  # half a second to import
 
-                path = place / "figure.png"
-                title = f"{job.law} · {job.name} · {scenario.title}"
                 if plot is not None:
-                    figure = draw_plot(path, title, found, plot, verdicts)
+                    panels = panels_of_plot(found, verdicts)
                 else:
-                    figure = draw_part(path, title, run, verdicts)
-        return PartResult(*names, status, reason, verdicts, shlex.join(again), figure)
+                    panels = panels_of_run(run, verdicts)
+                path = place / "figure.png"
+                draw_panels(path, f"{job.law} · {job.name} · {scenario.title}", panels)
+                figure = PartFigure(path, panels)
+        again_text = shlex.join(again)
+        return PartResult(*names, status, reason, verdicts, again_text, recording, figure)
 
 
 def _again(scenario: str, plot: Nfp | None, external: ControllerUnderTest | None) -> list[str]:

@@ -1,113 +1,80 @@
-"""Figures of a part: the judged signals with windows and limits; and the matrix of all verdicts."""
+"""The picture of a part, and that of the matrix of all verdicts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import printed, unit_of
-from gfm_hil.recording.run import Run, nominal_frequency
-from gfm_hil.results.figures import COLOURS, Picture, draw_panel, headline, panels
-from gfm_hil.run.cycles import cycle_means, cycle_ticks
-from gfm_hil.studies.conformity.criteria.base import at_connection
-from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.verdict import (
-    CANNOT,
-    CONSISTENT,
-    FAIL,
-    INFORMATIVE,
-    LIMITED,
-    PASS,
-    SIGNS,
-    Verdict,
-)
-from gfm_hil.studies.scan import FrequencyScan
-from gfm_hil.studies.scan_figures import nfp
+from gfm_hil.results.figures import COLOURS, dress, headline
+from gfm_hil.studies.conformity.panels import VERDICT_COLOURS, Mark, Panel
+from gfm_hil.studies.conformity.verdict import SIGNS
 
-#: of Okabe and Ito, and a grey
-VERDICT_COLOURS = {
-    PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999", LIMITED: COLOURS[4],
-    CONSISTENT: COLOURS[3], INFORMATIVE: COLOURS[0],
-}  # fmt: skip
-_ALWAYS = ("p", "V", "i", "f_hz")
-_TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "frequency f"}
 _LIGHT = "#c9d6e2"
+_LEAST, _LINE = 1.45, 0.125  # inches: height of a panel, and of a line of text beside it
 
 
-def draw_part(path: Path, title: str, run: Run, verdicts: Sequence[Verdict]) -> Picture:
-    """Draw one run: every tick in light grey, one-cycle means in blue, the limits that were judged
-    in the colour of their verdict, and at the bottom of each panel the windows without limits."""
-    judged = [v.signal for v in verdicts if v.signal and v.signal != "omega_u"]
-    names = list(dict.fromkeys([*_ALWAYS, *judged]))
-    figure = Figure(figsize=(9.0, 0.6 + 1.45 * len(names)), layout="constrained")
-    rows = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    t = np.asarray(run.columns["t"][:])
-    T_s = run.scenario.T_s
-    width = cycle_ticks(T_s, nominal_frequency(run.scenario))
-    for axes, name in zip(rows, names, strict=True):
-        x = np.asarray(run.signals[at_connection(run, name)])
-        curves = [(t, x, _LIGHT, "every tick")]
-        means = np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), width)])
-        if len(means):
-            middle = (np.arange(len(means)) + 0.5 * (width - 1)) * T_s
-            curves.append((middle, means, COLOURS[0], "one-cycle mean"))
-        shown, factor = (unit_of(name) or "–"), 1.0
-        if shown == "rad":
-            shown, factor = "°", 180 / np.pi
-        draw_panel(
-            axes, f"{_TITLES.get(name, printed(name))} [{shown}]", curves, factor, styles=("-",)
-        )
-        _limits(axes, [v for v in verdicts if v.signal == name])
-        for event in run.summary["events"]:
-            axes.axvline(event["t"], color="#888888", lw=0.7, ls=(0, (4, 3)), zorder=0)
+def draw_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
+    """Draw the panels of one run below each other: the first curve in light grey, the second in
+    blue, limits and windows in the colour of their verdict, and beside each panel the number,
+    limit and window of each clause."""
+    heights = [max(_LEAST, 0.3 + _LINE * len(panel.marks)) for panel in panels]
+    figure = Figure(figsize=(8.8, 0.6 + sum(heights)), layout="constrained")
+    rows = figure.subplots(
+        len(panels), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
+    )[:, 0]
+    for axes, panel in zip(rows, panels, strict=True):
+        dots = panel.log[0]
+        for (label, y), colour in zip(panel.curves.items(), (_LIGHT, COLOURS[0]), strict=False):
+            style = "o" if dots and label == "measured" else "-"
+            axes.plot(panel.x, y, style, color=colour, lw=1.1, ms=3.5, label=label)
+        dress(axes, panel.title)
+        axes.set_xscale("log" if panel.log[0] else "linear")
+        axes.set_yscale("log" if panel.log[1] else "linear")
+        if not panel.log[1]:
+            axes.ticklabel_format(axis="y", useOffset=False)
+        for k, mark in enumerate(panel.marks):
+            _draw_mark(axes, mark, k)
+        for t in panel.events:
+            axes.axvline(t, color="#888888", lw=0.7, ls=(0, (4, 3)), zorder=0)
+        low, high = axes.get_ylim()
+        least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise
+        if high - low < least:
+            axes.set_ylim((low + high - least) / 2, (low + high + least) / 2)
     rows[0].legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
-    rows[-1].set_xlim(0, run.scenario.duration)
-    rows[-1].set_xlabel("t [s]", fontsize=9)
-    return _finish(figure, path, title)
-
-
-def draw_plot(
-    path: Path, title: str, found: FrequencyScan, asked: Nfp, verdicts: Sequence[Verdict]
-) -> Picture:
-    """Draw the network-frequency-perturbation plot with the limits of its bands."""
-    figure = Figure(figsize=(7.6, 5.6), layout="constrained")
-    asked.draw_limits(nfp(found, figure), verdicts, VERDICT_COLOURS)
-    return _finish(figure, path, title)
-
-
-def _finish(figure: Figure, path: Path, title: str) -> Picture:
+    rows[-1].set_xlim(*panels[-1].ends)
+    rows[-1].set_xlabel(panels[-1].over, fontsize=9)
     headline(figure, title, 10)
     _save(figure, path)
-    return Picture(path, panels(figure))
 
 
-def _limits(axes: Axes, verdicts: Sequence[Verdict]) -> None:
-    row = 0
-    for v in verdicts:
-        colour = VERDICT_COLOURS[v.verdict]
-        if v.curve is not None:
-            t, low, high = v.curve
-            axes.fill_between(t, low, high, color=colour, alpha=0.12, lw=0)
-            for edge in (low, high):
-                axes.plot(t, edge, color=colour, lw=1.2, ls=(0, (3, 1.5)))
-        elif v.limited is not None:
-            for limit in (v.low, v.high):
-                if limit is not None:
-                    axes.plot(v.limited, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
-            if v.low is not None and v.high is not None:
-                axes.fill_between(v.limited, v.low, v.high, color=colour, alpha=0.12, lw=0)
-        elif v.stop > v.start:
-            axes.plot(
-                [v.start, v.stop], [0.03 + 0.06 * (row % 4)] * 2, color=colour, lw=2.5,
-                transform=axes.get_xaxis_transform(), solid_capstyle="butt",
-            )  # fmt: skip
-            row += 1
+def _draw_mark(axes: Axes, mark: Mark, row: int) -> None:
+    colour = mark.colour
+    axes.annotate(
+        f"{mark.number} {SIGNS.get(mark.verdict, '•')} {mark.words}", (1.0, 1.0),
+        (6, -9 * row), xycoords="axes fraction", textcoords="offset points", va="top",
+        fontsize=7, color=colour, fontfamily="DejaVu Sans",
+    )  # fmt: skip
+    for x, y in mark.lines:
+        axes.plot(x, y, color=colour, lw=1.4, ls=(0, (3, 1.5)))
+    if len(mark.lines) == 2:
+        (x, low), (_, high) = mark.lines
+        axes.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
+    if mark.lines:
+        x, y = mark.lines[-1]
+        axes.annotate(
+            str(mark.number), (x[0], y[0]), (1, 1), textcoords="offset points", fontsize=7,
+            color=colour, annotation_clip=True,
+        )  # fmt: skip
+    elif mark.window[1] > mark.window[0]:
+        axes.plot(
+            mark.window, [0.03 + 0.06 * (row % 4)] * 2, color=colour, lw=2.5,
+            transform=axes.get_xaxis_transform(), solid_capstyle="butt",
+        )  # fmt: skip
 
 
 def draw_matrix(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import platform
 import re
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
@@ -15,12 +17,14 @@ from xml.etree import ElementTree
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
+from gfm_hil.realtime.environment import environment
 from gfm_hil.recording.columns import printed
-from gfm_hil.results.page import render
+from gfm_hil.results.page import plot_script, render
 from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.criteria.base import KNOWN, UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
+from gfm_hil.studies.conformity.panels import Curves
 from gfm_hil.studies.conformity.sets import Case
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
@@ -55,6 +59,10 @@ class Conformity:
         cases: the tests, in order.
         parts: one a law and part that ran, in any order.
         folder: with the report; None without one.
+        hashes: SHA-256 by file: the laws' own, those of the stage and of the converter under test,
+            and the tests'.
+        digests: by law, the digest of all that its file, the file's bases and the inner stage say,
+            which the two sides of a link compare as well.
     """
 
     laws: list[str]
@@ -63,6 +71,8 @@ class Conformity:
     cases: list[Case]
     parts: list[PartResult]
     folder: Path | None = None
+    hashes: dict[str, str] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -109,6 +119,9 @@ class Conformity:
             "inner": self.inner,
             "under_test": self.under.model_dump(mode="json", exclude_unset=True),
             "passed": self.passed,
+            "machine": self.machine,
+            "hashes": self.hashes,
+            "digests": self.digests,
             "tests": {case.id: case.test.model_dump(include=about) for case in self.cases},
             "laws": {
                 law: {
@@ -123,26 +136,78 @@ class Conformity:
         }
         return finite(content)
 
-    def write(self, folder: Path) -> None:
-        """Write report.html, results.json and junit.xml, and with several laws a report for each
-        and matrix.png.
+    @cached_property
+    def machine(self) -> str:
+        """The machine in words: its name, processor, kernel, and the versions of what computes."""
+        badge = environment()
+        packages = ", ".join(f"{name} {badge[name]}" for name in ("python", "numpy", "numba"))
+        return f"{platform.node()}, {badge['cpu']}, Linux {badge['kernel']}, {packages}"
+
+    def counts(self, law: str) -> dict[str, Counter[str]]:
+        """How many clauses of a law have each verdict, by how the limit is known; a clause that
+        is judged at several times counts as often."""
+        found: dict[str, Counter[str]] = {}
+        for case in self.cases:
+            for part in self.of(law, case.id):
+                for v in part.verdicts:
+                    found.setdefault(v.known, Counter()).update([v.verdict])
+        return found
+
+    def saturated(self, law: str) -> int:
+        """How many clauses of a law are judged while a limiter of its stage acts."""
+        each = [part for case in self.cases for part in self.of(law, case.id)]
+        return sum(bool(v.saturated) for part in each for v in part.verdicts)
+
+    def verdict_of(self, law: str) -> Outcome:
+        """The worst of all tests under a law."""
+        return worst([self.matrix[law, case.id] for case in self.cases])
+
+    def about(self, law: str | None) -> list[tuple[str, str]]:
+        """What a first page says of a law, or of all, and of the tests, line by line."""
+        under = self.under
+        own = [] if law is None else [("law", law), ("digest", self.digests.get(law, "–"))]
+        return [
+            *own,
+            ("inner stage", "the law's own" if self.inner is None else self.inner),
+            ("converter under test", f"{under.plant.converter}, {under.instruments}"),
+            (
+                "declared",
+                f"droop {100 * under.droop:g} %, power {under.P_min:g} to {under.P_max:g} p.u.",
+            ),
+            ("gfmhil", version("gfmhil")),
+            ("machine", self.machine),
+            ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
+        ]
+
+    def write(self, folder: Path, notice: Callable[[str], None] = lambda text: None) -> None:
+        """Write report.html, report.pdf, results.json and junit.xml, and with several laws a report
+        for each and matrix.png. Without the package that makes PDF, ``notice`` is told how to get
+        it.
 
         Raises:
             UserError: the folder cannot be written.
         """
+        from gfm_hil.studies.conformity.document import write_document
+
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
             write_text(folder / "junit.xml", self._junit())
-            if len(self.laws) == 1:
-                write_text(folder / "report.html", self._page(self.laws[0]))
-                return
-            from gfm_hil.studies.conformity.figure import draw_matrix
-
-            draw_matrix(folder / "matrix.png", self.laws, [c.id for c in self.cases], self.matrix)
+            alone = len(self.laws) == 1
             for law in self.laws:
-                write_text(folder / f"report-{slug(law)}.html", self._page(law))
-            write_text(folder / "report.html", self._page(None))
+                path = folder / ("report" if alone else f"report-{slug(law)}")
+                write_text(path.with_name(f"{path.name}.html"), self._page(law))
+                try:
+                    write_document(path.with_name(f"{path.name}.pdf"), self, law)
+                except ModuleNotFoundError:
+                    if law == self.laws[0]:
+                        notice("no PDF was written; it needs: pip install 'gfmhil[pdf]'")
+            if not alone:
+                from gfm_hil.studies.conformity.figure import draw_matrix
+
+                tests = [case.id for case in self.cases]
+                draw_matrix(folder / "matrix.png", self.laws, tests, self.matrix)
+                write_text(folder / "report.html", self._page(None))
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
 
@@ -178,9 +243,11 @@ class Conformity:
         """A page about a law, or about all of them."""
         template = "conformity_matrix.html" if law is None else "conformity.html"
         title = "Conformity of laws" if law is None else f"{law}: conformity"
+        curves = Curves()
         return render(
             template, title=title, found=self, law=law, slug=slug, known=KNOWN, signs=SIGNS,
-            row=_row, version=version("gfmhil"), date=datetime.now(UTC).date(),
+            row=row, heads=HEADS, saturation=saturation, curves=curves, script=plot_script(),
+            tally=None if law is None else tally(self, law),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -189,9 +256,34 @@ class Conformity:
         return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
 
 
-def _row(v: Verdict) -> list[str]:
-    """What a page says of a clause, after its verdict."""
+#: of the table of a part, after number and verdict
+HEADS = ("clause", "signal", "window [s]", "measured", "limit", "in words", "source")
+
+
+def row(v: Verdict) -> list[str]:
+    """What a report says of a clause, under ``HEADS``."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
     source = f"{v.source}; {KNOWN[v.known]}" if v.known else "–"
-    return [v.clause, printed(v.signal) or "–", window, measured, v.limit, v.text, source]
+    signal = printed(v.signal) or "–"
+    return [v.clause, signal, window, measured, v.limit or "–", v.text, source]
+
+
+def saturation(v: Verdict) -> str:
+    """The limiters that act in the window of a clause, and in which part of it; empty if none."""
+    return ", ".join(
+        f"{name} {100 * part:.0f} %" if part >= 0.01 else f"{name} under 1 %"
+        for name, part in v.saturated.items()
+    )
+
+
+def tally(found: Conformity, law: str) -> list[list[str]]:
+    """The table of counts of the first page: a head, a row for each way to know a source, a sum."""
+    counts = found.counts(law)
+    verdicts = [*dict.fromkeys([*SIGNS, *(v for of in counts.values() for v in of)])]
+    ways = [known for known in KNOWN if known in counts]
+    rows = [[KNOWN[known], *(str(counts[known][v]) for v in verdicts)] for known in ways]
+    every = Counter[str]()
+    for of in counts.values():
+        every.update(of)
+    return [["limit known", *verdicts], *rows, ["all", *(str(every[v]) for v in verdicts)]]

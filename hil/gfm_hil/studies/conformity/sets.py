@@ -209,13 +209,18 @@ def counted(limits: Sequence[Mapping[str, str]]) -> str:
     return f"{len(limits)} limits: {told}."
 
 
+def under_test_file(given: str | Path | None) -> Path:
+    """The file of the converter under test; the shipped one if None."""
+    if given is not None:
+        return Path(given)
+    shipped = [root / _FOLDER / _UNDER_TEST for root in SCENARIO_FOLDERS]
+    return next(path for path in shipped if path.is_file())
+
+
 def load_under_test(given: str | Path | None) -> UnderTest:
     """The converter under test, of a file; the shipped one if None. Raises UserError: one line per
     mistake."""
-    if given is None:
-        shipped = [root / _FOLDER / _UNDER_TEST for root in SCENARIO_FOLDERS]
-        given = next(path for path in shipped if path.is_file())
-    path = Path(given)
+    path = under_test_file(given)
     under = _read(path, UnderTest)
     beside = path.parent / under.plant.converter
     if under.plant.converter.endswith(".toml") and beside.is_file():

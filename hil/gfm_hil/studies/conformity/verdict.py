@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -46,6 +46,9 @@ class Verdict:
     curve: tuple[Vector, Vector, Vector] | None = None
     source: str = ""  # document, clause and revision that ask for it
     known: str = ""  # how the limit is known: read, summary, memory or ours
+    # part of the window in which each limiter of the controller acts, by the name of what it
+    # limits; those that never act are not there
+    saturated: dict[str, float] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
         """As data for JSON."""

@@ -30,6 +30,7 @@ from gfm_hil.studies.envelopes import Unit
 from gfm_plant import Plant
 
 Vector = NDArray[np.float64]
+_ROUNDING = 1e-9  # p.u., s or Hz; the plant is solved to it
 
 
 Known = Literal["read", "summary", "memory", "ours"]
@@ -81,6 +82,12 @@ class UnderTest(StrictSchema):
         made = self.model_copy(update={"unit": unit})
         made._measured = True
         return made
+
+    @property
+    def instruments(self) -> str:
+        """What its file says of the plant besides the converter, in words."""
+        words = ", ".join(sorted(self.plant.model_fields_set - {"converter"}))
+        return words or "an ideal plant: its file gives no delay, modulation, limit or protection"
 
 
 class Clause(StrictSchema):
@@ -206,7 +213,10 @@ class Moment:
         high: float | None = None,
         limited: tuple[float, float] | None = None,
     ) -> Verdict:
-        """A verdict on the window; arguments as the attributes of ``Verdict``."""
+        """A verdict on the window; arguments as the attributes of ``Verdict``. A value within
+        rounding is 0."""
+        if value is not None and abs(value) < _ROUNDING:
+            value = 0.0
         return Verdict(
             self.clause.clause, self.clause.kind, signal,
             round(self.first * self.T_s, 9), round(self.last * self.T_s, 9),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,9 +17,6 @@ from gfm_hil.studies.conformity.criteria.equivalent_damping import damping_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.envelopes import fit_nfp
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 class Band(StrictSchema):
@@ -120,7 +117,8 @@ class Nfp(Clause):
                 )
                 limit = f"{' and '.join(limits)}, {where}"
                 verdict: Outcome = PASS if beyond[k] <= 0 else FAIL
-                verdicts.append(made(verdict, float(x[k]), unit, limit, text))
+                over = band.from_hz, band.to_hz
+                verdicts.append(made(verdict, float(x[k]), unit, limit, text, low, high, over))
         if self.unknown is not None:
             text = f"Informative: {self.unknown}. {span}"
             verdicts.append(made(INFORMATIVE, float(gain.max()), "p.u./p.u.", "", text))
@@ -141,22 +139,6 @@ class Nfp(Clause):
 
     def _made(self, *rest: Any) -> Verdict:
         return self.sourced(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
-
-    def draw_limits(
-        self, panels: Sequence[Axes], verdicts: Sequence[Verdict], colours: dict[str, str]
-    ) -> None:
-        """Draw the bands over gain and phase, each in the colour of its verdict."""
-        told = iter(verdicts[self.damping is not None :])
-        for band in self.bands:
-            for axes, low, high in (
-                (panels[0], band.low, band.high),
-                (panels[1], band.phase_low, band.phase_high),
-            ):
-                limits = [x for x in (low, high) if x is not None]
-                colour = colours[next(told).verdict] if limits else ""
-                for limit in limits:
-                    span = [band.from_hz, band.to_hz]
-                    axes.plot(span, [limit, limit], color=colour, lw=1.4, ls=(0, (3, 1.5)))
 
 
 CRITERION = Nfp

@@ -1,0 +1,118 @@
+"use strict";
+// Draws the plots of a page with uPlot when they come into view. Drag to zoom in on a time, in all
+// plots of the run; double-click to see all of it again.
+(async () => {
+  const read = (id) => document.getElementById(id).textContent;
+  const bytes = Uint8Array.from(atob(read("curves")), (c) => c.charCodeAt(0));
+  const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const view = new DataView(await new Response(plain).arrayBuffer());
+  const plots = JSON.parse(read("plots"));
+  const COLOURS = ["#c9d6e2", "#0072B2"], LEVELS = 4094, NO_VALUE = 0xffff;
+
+  const curve = (first, count, low, high) => {
+    const found = new Array(count);
+    for (let k = 0, level = 0; k < count; k++) {
+      level = (level + view.getUint16(2 * (first + k), true)) & 0xffff;
+      found[k] = level === NO_VALUE ? null : low + ((high - low) * level) / LEVELS;
+    }
+    return found;
+  };
+
+  const mark = (of) => (u) => {
+    const c = u.ctx, { left, top, width, height } = u.bbox, px = devicePixelRatio;
+    const x = (t) => u.valToPos(t, "x", true), y = (v) => u.valToPos(v, "y", true);
+    c.save();
+    c.beginPath();
+    c.rect(left, top, width, height);
+    c.clip();
+    c.font = `${10 * px}px system-ui`;
+    c.setLineDash([4 * px, 3 * px]);
+    c.strokeStyle = "#888";
+    for (const t of of.events) {
+      c.beginPath();
+      c.moveTo(x(t), top);
+      c.lineTo(x(t), top + height);
+      c.stroke();
+    }
+    c.lineWidth = 1.5 * px;
+    of.limits.forEach(([ts, vs, colour, number], k) => {
+      const [, below, , same] = of.limits[k - 1] ?? [];
+      if (same === number) {
+        c.globalAlpha = 0.1;
+        c.fillStyle = colour;
+        c.beginPath();
+        ts.forEach((t, j) => c.lineTo(x(t), y(vs[j])));
+        [...ts].reverse().forEach((t, j) => c.lineTo(x(t), y(below[ts.length - 1 - j])));
+        c.fill();
+        c.globalAlpha = 1;
+      }
+      c.strokeStyle = c.fillStyle = colour;
+      c.beginPath();
+      ts.forEach((t, k) => c.lineTo(x(t), y(vs[k])));
+      c.stroke();
+      const at = Math.min(Math.max(x(ts[0]), left), left + width - 12 * px);
+      c.fillText(number, at + 2 * px, y(vs[0]) - 3 * px);
+    });
+    c.setLineDash([]);
+    of.bars.forEach(([from, to, colour, number], k) => {
+      const row = top + height - (4 + 6 * (k % 4)) * px;
+      c.strokeStyle = c.fillStyle = colour;
+      c.beginPath();
+      c.moveTo(x(from), row);
+      c.lineTo(x(to), row);
+      c.stroke();
+      c.fillText(number, Math.max(x(from), left) + 2 * px, row - 2 * px);
+    });
+    c.restore();
+  };
+
+  const draw = (place) => {
+    const of = plots[place.dataset.plot];
+    const data = [curve(...of.x), ...of.curves.map(([, ...packed]) => curve(...packed))];
+    const limits = of.limits.flatMap(([, vs]) => vs);
+    const range = (u, low, high) => {
+      low = Math.min(low ?? Infinity, ...limits);
+      high = Math.max(high ?? -Infinity, ...limits);
+      const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high), 1e-3);
+      const pad = Math.max(0.05 * (high - low), least / 2);
+      return of.log[1] ? [low / 1.3, high * 1.3] : [low - pad, high + pad];
+    };
+    const isMeasured = (label) => of.log[0] && label === "measured";
+    const axis = (more) => ({ stroke: "#666", grid: { stroke: "#8884", width: 1 }, ...more });
+    new uPlot({
+      width: place.clientWidth,
+      height: 190,
+      scales: {
+        x: { time: false, distr: of.log[0] ? 3 : 1, min: of.ends[0], max: of.ends[1] },
+        y: { distr: of.log[1] ? 3 : 1, range },
+      },
+      cursor: { sync: { key: place.dataset.group, scales: ["x", null] } },
+      axes: [axis({ label: of.over, labelSize: 18, size: 28 }), axis({
+        size: 56,
+        values: (u, ticks) => ticks.map((v) => (v === null ? null : Number(v.toPrecision(6)))),
+      })],
+      series: [
+        { label: of.over },
+        ...of.curves.map(([label], k) => ({
+          label,
+          stroke: COLOURS[of.curves.length === 1 ? 1 : k],
+          width: 1.2,
+          points: { show: isMeasured(label), size: 5 },
+          paths: isMeasured(label) ? () => null : undefined,
+          value: (u, v) => (v === null ? "–" : Number(v.toPrecision(4)).toString()),
+        })),
+      ],
+      hooks: { draw: [mark(of)] },
+    }, data, place);
+  };
+
+  const seen = new IntersectionObserver((found) => {
+    for (const { isIntersecting, target } of found) {
+      if (isIntersecting) {
+        seen.unobserve(target);
+        draw(target);
+      }
+    }
+  }, { rootMargin: "600px" });
+  document.querySelectorAll(".plot").forEach((place) => seen.observe(place));
+})();

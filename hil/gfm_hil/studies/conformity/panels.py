@@ -1,0 +1,210 @@
+"""What the figures of a part show: the judged signals with windows and limits, as few points as
+the eye needs, for the picture and for the page that lets a reader zoom."""
+
+from __future__ import annotations
+
+import base64
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.recording.columns import printed, unit_of
+from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.results.figures import COLOURS
+from gfm_hil.run.cycles import cycle_means, cycle_ticks
+from gfm_hil.studies.conformity.criteria.base import at_connection
+from gfm_hil.studies.conformity.verdict import (
+    CANNOT,
+    CONSISTENT,
+    FAIL,
+    INFORMATIVE,
+    LIMITED,
+    PASS,
+    Vector,
+    Verdict,
+)
+from gfm_hil.studies.scan import FrequencyScan
+
+#: of Okabe and Ito, and a grey
+VERDICT_COLOURS = {
+    PASS: COLOURS[2], FAIL: COLOURS[1], CANNOT: "#999999", LIMITED: COLOURS[4],
+    CONSISTENT: COLOURS[3], INFORMATIVE: COLOURS[0],
+}  # fmt: skip
+OTHER_COLOUR = COLOURS[6]  # of any other verdict
+_ALWAYS = ("p", "V", "i", "f_hz")
+_TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "frequency f"}
+# Columns of a curve, each with its least and its largest value: over the whole run, and from
+# before to after each event, where what is judged goes on.
+_COLUMNS, _NEAR, _AROUND_S = 300, 90, (-0.02, 0.4)
+_LEVELS = 4094  # of a curve in a page: steps of a quarter of a thousandth of its height
+_NO_VALUE = 0xFFFF
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A clause in a panel."""
+
+    number: int  # of the clause in the table of its part
+    verdict: str
+    words: str  # limit and window
+    window: tuple[float, float]  # from when to when it is judged, s, or from what to what Hz
+    lines: list[tuple[Vector, Vector]]  # its limits, shape (K,) each: abscissa and value
+
+    @property
+    def colour(self) -> str:
+        """That of its verdict."""
+        return VERDICT_COLOURS.get(self.verdict, OTHER_COLOUR)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A quantity over time or frequency."""
+
+    title: str  # quantity and unit
+    x: Vector  # s or Hz, ascending, shape (K,)
+    curves: dict[str, Vector]  # by label, shape (K,) each; NaN where there is no value
+    marks: list[Mark]
+    events: list[float]  # s
+    ends: tuple[float, float]  # of the axis
+    over: str = "t [s]"  # the abscissa
+    log: tuple[bool, bool] = (False, False)  # whether abscissa and ordinate are logarithmic
+
+
+class PartFigure(NamedTuple):
+    """The picture of a part, and what it shows."""
+
+    path: Path
+    panels: list[Panel]
+
+
+def panels_of_run(run: Run, verdicts: Sequence[Verdict]) -> list[Panel]:
+    """A panel for each signal that was judged, and for power, voltage, current and frequency:
+    every tick, and the one-cycle means by which most clauses are judged."""
+    judged = [v.signal for v in verdicts if v.signal and v.signal != "omega_u"]
+    T_s, ticks = run.scenario.T_s, run.ticks
+    width = cycle_ticks(T_s, nominal_frequency(run.scenario))
+    events = [float(e["t"]) for e in run.summary["events"]]
+    edges = _edges(ticks, T_s, events)
+    x = np.column_stack([edges, np.append(edges[1:], ticks) - 1]).ravel() * T_s
+    numbered, found = [*enumerate(verdicts, 1)], []
+    for name in dict.fromkeys([*_ALWAYS, *judged]):
+        unit, factor = unit_of(name) or "–", 1.0
+        if unit == "rad":
+            unit, factor = "°", math.degrees(1.0)
+        values = factor * np.asarray(run.signals[at_connection(run, name)], np.float64)
+        means = np.full(ticks, np.nan)
+        inside = np.concatenate([np.empty(0), *cycle_means(values, 0, ticks, width)])
+        first = round(0.5 * (width - 1))
+        means[first : first + len(inside)] = inside[: ticks - first]
+        found.append(
+            Panel(
+                f"{_TITLES.get(name, printed(name))} [{unit}]", x,
+                {"every tick": _thin(values, edges), "one-cycle mean": _thin(means, edges)},
+                _marks([(k, v) for k, v in numbered if v.signal == name], factor), events,
+                (0.0, run.scenario.duration),
+            )
+        )  # fmt: skip
+    return found
+
+
+def panels_of_plot(found: FrequencyScan, verdicts: Sequence[Verdict]) -> list[Panel]:
+    """Gain and phase of a network-frequency-perturbation plot."""
+    hz, model = found.frequency, found.nfp_model
+    panels = []
+    for title, of, unit in (
+        ("gain |Δp / Δω_g| [p.u./p.u.]", np.abs, "p.u./p.u."),
+        ("phase of Δp / Δω_g [°]", lambda z: np.degrees(np.angle(z)), "°"),
+    ):
+        curves = {} if model is None else {"linear model": np.asarray(of(model), np.float64)}
+        curves["measured"] = np.asarray(of(found.nfp), np.float64)
+        marks = _marks([(k, v) for k, v in enumerate(verdicts, 1) if v.unit == unit], 1.0)
+        ends = float(hz[0]), float(hz[-1])
+        over = "frequency of the perturbation [Hz]"
+        panels.append(Panel(title, hz, curves, marks, [], ends, over, (True, unit != "°")))
+    return panels
+
+
+def _marks(numbered: Iterable[tuple[int, Verdict]], factor: float) -> list[Mark]:
+    marks = []
+    for number, v in numbered:
+        lines, start, stop = list[tuple[Vector, Vector]](), v.start, v.stop
+        if v.curve is not None:
+            t, *limits = v.curve
+            lines = [(t, factor * limit) for limit in limits]
+        elif v.limited is not None:
+            start, stop = min(start, v.limited[0]) if stop > start else v.limited[0], v.limited[1]
+            limits = [np.full(2, factor * x) for x in (v.low, v.high) if x is not None]
+            lines = [(np.array(v.limited), limit) for limit in limits]
+        window = f"{v.start:g} … {v.stop:g} s" if v.stop > v.start else ""
+        words = "; ".join(filter(None, [v.limit, window])) or v.verdict
+        marks.append(Mark(number, v.verdict, words, (start, stop), lines))
+    return marks
+
+
+def _edges(ticks: int, T_s: float, events: Iterable[float]) -> NDArray[np.intp]:
+    """The first tick of each column that is drawn."""
+    around = np.linspace(*_AROUND_S, _NEAR)
+    parts = [np.linspace(0, ticks, _COLUMNS, endpoint=False), *((t + around) / T_s for t in events)]
+    found = np.unique(np.concatenate(parts).round().astype(np.intp))
+    return found[(found >= 0) & (found < ticks)]
+
+
+def _thin(x: Vector, edges: NDArray[np.intp]) -> Vector:
+    """Least and largest value of each column, in the order in which they come."""
+    low, high = np.fmin.reduceat(x, edges), np.fmax.reduceat(x, edges)
+    falls = x[np.append(edges[1:], len(x)) - 1] < x[edges]
+    return np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
+
+
+class Curves:
+    """The curves of all panels of a page: in ``levels`` of their own height, each as what it
+    changes from point to point, compressed together."""
+
+    def __init__(self) -> None:
+        self.plots = list[dict[str, Any]]()  # one a panel, for the page's script
+        self._parts, self._count = list[bytes](), 0
+
+    def add(self, panel: Panel) -> int:
+        """Take a panel; returns its number in the page."""
+        limits = [
+            [x.tolist(), y.tolist(), m.colour, m.number] for m in panel.marks for x, y in m.lines
+        ]
+        bars = [
+            [*m.window, m.colour, m.number]
+            for m in panel.marks
+            if not m.lines and m.window[1] > m.window[0]
+        ]
+        self.plots.append(
+            {
+                "x": self._packed(panel.x),
+                "curves": [[label, *self._packed(y)] for label, y in panel.curves.items()],
+                "limits": limits,
+                "bars": bars,
+                "events": panel.events,
+                "ends": panel.ends,
+                "over": panel.over,
+                "log": panel.log,
+            }
+        )
+        return len(self.plots) - 1
+
+    def _packed(self, x: Vector) -> list[float]:
+        """Where its levels begin, how many there are, and what the least and the largest mean."""
+        known = x[np.isfinite(x)]
+        low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+        level = np.full(len(x), _NO_VALUE)
+        level[np.isfinite(x)] = np.rint((known - low) / ((high - low) or 1.0) * _LEVELS)
+        steps = np.diff(level, prepend=0) & 0xFFFF
+        self._parts.append(steps.astype("<u2").tobytes())
+        self._count += len(x)
+        return [self._count - len(x), len(x), float(f"{low:.6g}"), float(f"{high:.6g}")]
+
+    def packed(self) -> str:
+        """All levels, little-endian, as zlib compresses them, in base 64."""
+        return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode()
