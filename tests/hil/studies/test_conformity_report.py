@@ -45,7 +45,7 @@ plant = { grid = { scr = 5.0, x_over_r = 6.0 } }
 events = [{ t = 0.5, type = "grid-phase-jump", degrees = -5.0 }]
 
 [[criteria]]
-kind = "peak_delta_p"
+kind = "peak_delta"
 clause = "opposes <b>"
 least = 0.05
 direction = "up"
