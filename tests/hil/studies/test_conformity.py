@@ -297,7 +297,7 @@ def test_powers_are_judged_at_the_connection_point(ramp, there, verdict):
 def test_a_window_that_cannot_be_judged_says_why(ramp):
     run = run_of(ramp, p=np.full(50_000, 0.5))
     for asked, why in (
-        (one("rise_within", within=0.01, direction="up"), "by 0 p.u. only"),
+        (one("rise_within", within=0.01, direction="up"), "by 0 only"),
         (one("damped", ratio=0.1, window=[0.0, 0.02]), "shorter than two cycles"),
         (one("damped", ratio=0.1, at=[0.01]), "no whole cycle"),
         (one("settles", to=0.5, tolerance=0.1, within=2.0, window=[0.0, 1.0]), "window ends"),
