@@ -373,6 +373,74 @@ def test_adequate_damping_is_the_halving_time_below_0_6_hz_and_the_ratio_above(
 
 
 @pytest.mark.parametrize(
+    ("current", "lead", "verdict"),
+    [
+        (1.05 * 0.2, 95.0, PASS),
+        (0.95 * 0.2, 95.0, FAIL),  # 5 % less than is asked
+        (0.3, 105.0, FAIL),
+        (0.3, 85.0, FAIL),
+        (0.3, 265.0, FAIL),
+    ],
+)
+def test_the_current_of_the_negative_sequence_is_a_phasor(ramp, current, lead, verdict):
+    """Phases from phasors of both sequences: x_a = Re(X_1 e^jwt) + Re(X_2 e^jwt), and in b and c
+    the second sequence turns the other way; the space vector is 2/3 (x_a + a x_b + a^2 x_c)."""
+    t = np.arange(50_000) * 1e-4
+    a, turn = np.exp(2j * math.pi / 3), np.exp(1j * OMEGA_B * t)
+    V_2 = 0.1 * np.exp(0.7j)
+
+    def vector(X_1: complex, X_2: complex) -> dict[str, Vector]:
+        phases = [(X_1 * a**-k + X_2 * a**k) * turn for k in range(3)]
+        x = 2 / 3 * sum(a**k * phase.real for k, phase in enumerate(phases)) / turn
+        return {"re": x.real, "im": x.imag}
+
+    parts = {
+        "v": vector(1.0, V_2),
+        "i": vector(0.5 + 0.1j, current * V_2 / abs(V_2) * np.exp(1j * math.radians(lead))),
+    }
+    columns = {f"{name}_{part}": x for name, both in parts.items() for part, x in both.items()}
+    run = run_of(ramp, p=np.full(len(t), 0.5))
+    made = Run(
+        run.scenario, run.summary, {**run.columns, **{f"true_{k}": x for k, x in columns.items()}}
+    )
+    asked = one("negative_sequence", least=0.2, leads_low=90.0, leads_high=100.0)
+    (found,) = judge(made, [asked], UNDER)
+    assert found.verdict == verdict
+    assert found.value == pytest.approx(lead if current > 0.2 else current, abs=1e-6)
+    still = {name: x for name, x in made.columns.items() if not name.startswith("true_v_")}
+    balanced = {f"true_v_{k}": x for k, x in vector(1.0, 0.0).items()}
+    (none,) = judge(Run(run.scenario, run.summary, {**still, **balanced}), [asked], UNDER)
+    assert none.verdict == CANNOT and "negative sequence is only" in none.text
+
+
+@pytest.mark.parametrize(("at_end", "verdict"), [(49.5, PASS), (49.521, FAIL), (50.0, FAIL)])
+def test_the_frequency_at_the_end_is_that_of_the_grid(ramp, at_end, verdict):
+    t = np.arange(50_000) * 1e-4
+    ramped = np.clip(t - 2.0, 0.0, 0.5)
+    run = run_of(
+        ramp, p=np.full(len(t), 0.5), omega_g=1.0 - 0.02 * ramped,
+        omega_u=1.0 + (at_end / 50 - 1.0) * ramped / 0.5,
+    )  # fmt: skip
+    asked = one("settles", signal="f_hz", to="grid", tolerance=0.02, within=1.0)
+    (found,) = judge(run, [asked], UNDER)
+    assert found.verdict == verdict
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.05, PASS), (0.95, FAIL)])
+def test_reactive_power_and_current_are_judged_as_power_is(ramp, factor, verdict):
+    t = np.arange(50_000) * 1e-4
+    x = np.where(t >= 2.0, 0.1 * factor, 0.0)
+    run = run_of(ramp, p=np.full(len(t), 0.5), q=x, i=0.5 + x)
+    for signal in ("q", "i"):
+        asked = one("peak_delta", signal=signal, least=0.1, direction="up")
+        late = one("rise_within", signal=signal, within=0.005, part=0.5, direction="up")
+        moved, risen = judge(run, [asked, late], UNDER)
+        assert (moved.verdict, moved.signal) == (verdict, signal)
+        assert moved.value == pytest.approx(0.1 * factor) and risen.verdict == PASS
+        assert f"of {signal} rises by" in moved.text and risen.text.startswith(f"{signal} has done")
+
+
+@pytest.mark.parametrize(
     ("D", "H", "verdict"),
     [(100.0, 8.0, PASS), (30.0, 8.0, FAIL), (100.0, 0.5, PASS), (100.0, 0.05, FAIL)],
 )
@@ -482,7 +550,10 @@ def test_a_converter_of_ones_own_lies_beside_its_file(tmp_path, monkeypatch):
 
 def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path):
     cases = load_cases(["all"])
-    sets = {"miso", "aemo", "ercot", "gb", "ieee1547", "openibr", "rte", "withstand"}
+    sets = {
+        "miso", "aemo", "ercot", "gb", "ieee1547", "ieee2800", "fingrid", "openibr", "rte",
+        "withstand",
+    }  # fmt: skip
     assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
     for case in cases:
         for part in case.test.runs():

@@ -23,6 +23,7 @@ KINDS = (
     "adequately_damped",
     "equivalent_damping",
     "energy",
+    "negative_sequence",
     "no_trip",
     "no_oscillation",
     "stays_in_step",

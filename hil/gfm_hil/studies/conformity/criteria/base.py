@@ -249,8 +249,11 @@ class Moment:
 
     def means(self, name: str, first: int, last: int) -> Vector:
         """The one-cycle means of a signal that lie within some ticks."""
-        parts = cycle_means(self.raw(name), first, last, self.width)
-        return np.concatenate([np.empty(0), *parts])
+        return self.mean_of(self.raw(name)[first:last])
+
+    def mean_of(self, x: Vector) -> Vector:
+        """The one-cycle means of some ticks."""
+        return np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), self.width)])
 
     def before(self, name: str) -> float:
         """The mean of the last cycle before the event."""

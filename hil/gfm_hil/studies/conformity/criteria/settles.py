@@ -20,9 +20,10 @@ class Settles(Windowed):
 
     kind: Literal["settles"] = Field(description="kind of criterion")
     signal: str = Field("p", description="as for stays_within")
-    to: float | Literal["before", "droop"] = Field(
+    to: float | Literal["before", "droop", "grid"] = Field(
         description="value; before: the mean of the last cycle before at; droop: where the "
-        "declared droop and power limits put p at the frequency that the converter has"
+        "declared droop and power limits put p at the frequency that the converter has; grid: for "
+        "f_hz, the frequency of the grid at the end"
     )
     tolerance: float = Field(gt=0, description="in the unit of the signal")
     within: float = Field(gt=0, description="s after at")
@@ -56,6 +57,8 @@ class Settles(Windowed):
         """Where it must settle, why there, and whether that is at a limit of the power."""
         if self.to == "before":
             return w.before, "its value before", False
+        if self.to == "grid":
+            return m.ending("omega_g") * m.f_n, "the frequency of the grid", False
         if self.to != "droop":
             return self.to, "the value asked for", False
         omega_u, under = m.ending("omega_u"), m.under
