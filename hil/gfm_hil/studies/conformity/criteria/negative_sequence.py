@@ -43,7 +43,7 @@ class NegativeSequence(Windowed):
         )
         ok = size >= self.least and self.leads_low <= lead <= self.leads_high
         value, unit = (lead, "°") if size >= self.least else (size, "p.u.")
-        return m.says(ok, value, unit, limit, text)
+        return m.says(ok, value, unit, limit, text, "i")
 
 
 def phasor(m: Moment, name: str) -> Vector:
