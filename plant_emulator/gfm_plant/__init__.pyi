@@ -4,8 +4,8 @@ from .components import NetworkParts
 from .emulator import (
     plant_advance,
     plant_command,
-    plant_connection,
     plant_is_delayed,
+    plant_options,
     plant_step,
     plant_truth,
 )
@@ -26,7 +26,7 @@ from .grid import (
     start_again,
     take_out,
 )
-from .names import CONNECTION, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
+from .names import BATTERY, CONNECTION, CONTROLLER_SAFE, NO_FRESH_U, TRIP_REASONS, TRUTH
 from .network import Network
 from .options import Plant
 from .parameters import ConverterParameters, load_converter
@@ -36,6 +36,7 @@ from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
 
 __all__ = [
+    "BATTERY",
     "CONNECTION",
     "CONTROLLER_SAFE",
     "NO_FRESH_U",
@@ -66,9 +67,9 @@ __all__ = [
     "phase_jump",
     "plant_advance",
     "plant_command",
-    "plant_connection",
     "plant_equilibrium",
     "plant_is_delayed",
+    "plant_options",
     "plant_sample",
     "plant_step",
     "plant_truth",

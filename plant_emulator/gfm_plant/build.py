@@ -134,6 +134,7 @@ def _make(
     if grid.finite is not None and grid_node is not None:
         dynamic.append(("plant.grid.finite", "", grid.finite))
     network = _network(par, st, wiring, T_s, dynamic, measured)
+    network.net["batteries"] = par["energy"].any()
     now = network.now
     st["x"][:, V_DC] = 1.0
     now["unit"] = now["sequence"][:, 0] = 1.0
@@ -250,6 +251,12 @@ def _pack_converter_circuit(
     source = options.dc_source
     par["tau_dc"] = source.tau_s or 0.0
     par["i_max"] = math.inf if source.i_max is None else source.i_max
+    if (battery := source.battery) is not None:
+        par["energy"], par["R_battery"] = battery.energy_s, battery.R
+        par["soc"] = battery.soc, battery.soc_min, battery.soc_max
+        par["P_most"] = battery.P_discharge, battery.P_charge
+    if (chopper := source.chopper) is not None:
+        par["chopper"] = chopper.P, chopper.v_on, chopper.v_off
     if source.mode == "controlled":
         par["i_u_gain"] = 1.0
     else:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gfm_plant.clearing import advance_clearing, begin_clearing
 from gfm_plant.components import every_at_rest, every_tick
+from gfm_plant.dc_link import limit_dc_source
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
@@ -50,6 +51,8 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
         if r.i_u_gain == 0.0:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
+        s.soc, s.i_most[0], s.i_most[1] = r.soc[0], r.i_max, -r.i_max
+        limit_dc_source(r, s)
     every_at_rest(plant, circuit(n, now), 0)
 
 
@@ -111,6 +114,7 @@ def plant_step(plant: PlantRecords) -> None:
     worst, largest = 0, 0.0
     for k in range(n.n_converters):
         plant.st[k].tick += 1
+        limit_dc_source(plant.par[k], plant.st[k])
         size = _size(plant, k)
         if not size < largest:
             worst, largest = k, size
@@ -170,23 +174,26 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
         out[10] = s.i_source
     else:
         i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
-        i_max = r.i_max if s.trip == 0 else 0.0
-        out[10] = min(max(i_dc, -i_max), i_max)
+        out[10] = min(max(i_dc, s.i_most[1]), s.i_most[0]) if s.trip == 0 else 0.0
     v, i = field(now, "w")[own(k) + V], field(now, "w")[own(k) + I_F]
     out[11], out[12] = v.real, v.imag
     out[13], out[14] = r.current * i.real, r.current * i.imag
 
 
 @compiled
-def plant_connection(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
-    """Write p, q and V at the connection point at this tick to out (3,), in the order of
-    `CONNECTION`: behind the second inductor or the transformer of a converter that has one, else at
-    the filter capacitor. Only for a plant whose ``net`` has ``connections``."""
+def plant_options(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
+    """Write what a plant with options has besides `TRUTH` at this tick to out: with ``connections``
+    p, q and V at the connection point, in the order of `CONNECTION`, which is behind the second
+    inductor or the transformer of a converter that has one, else at the filter capacitor; with
+    ``batteries`` the state of charge."""
     n, now = plant.net[0], plant.now[0]
-    place, scale = CHECK_SIDES + k, plant.par[k].current
-    v = node_voltage(n, now, place, plant.st[k].tick)
-    i = field(now, "w")[field(n, "node_i")[place]]
-    out[0], out[1], out[2] = terminal(v.real, v.imag, scale * i.real, scale * i.imag)
+    if n.connections != 0:
+        place, scale = CHECK_SIDES + k, plant.par[k].current
+        v = node_voltage(n, now, place, plant.st[k].tick)
+        i = field(now, "w")[field(n, "node_i")[place]]
+        out[0], out[1], out[2] = terminal(v.real, v.imag, scale * i.real, scale * i.imag)
+    if n.batteries != 0:
+        out[len(out) - 1] = plant.st[k].soc
 
 
 @compiled

@@ -96,7 +96,9 @@ net_dtype = _header(
         ("T_s", "f8"),
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
-        ("connections", "i8"),  # whether p, q and V of the connection points are looked at
+        # whether p, q and V of the connection points, and the charge of batteries, are recorded
+        ("connections", "i8"),
+        ("batteries", "i8"),
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
         ("contact_w", "i8"),  # place of the contact's own current, -1: it has none
         # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;

@@ -65,5 +65,7 @@ the capacitor's voltage and the bridge's current in the common frame, which turn
 grid's voltage lies on its real axis at tick 0."""
 
 CONNECTION = ("p_c", "q_c", "V_c")
-"""What `plant_connection` writes, in this order, in p.u.: active and reactive power and voltage at
-the connection point."""
+"""Active and reactive power and voltage at the connection point, p.u."""
+
+BATTERY = ("soc",)
+"""State of charge of a battery behind the DC source, in [0, 1]."""

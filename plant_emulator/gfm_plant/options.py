@@ -33,6 +33,46 @@ COMMANDS = cast("tuple[Command, ...]", carried("u", inner=True))
 """The channels, in the order of the records."""
 
 
+class Battery(Options):
+    """What feeds the DC source: its power and its charge limit the source's current, as the control
+    of a DC/DC converter does that samples v_dc and the state of charge at each tick."""
+
+    energy_s: Positive = Field(
+        description="energy from empty to full over S_n, s: 3600 is an hour at rated power"
+    )
+    soc: float = Field(0.5, ge=0, le=1, description="state of charge at the start")
+    soc_min: float = Field(0.05, ge=0, lt=1, description="it gives nothing at this charge or less")
+    soc_max: float = Field(0.95, gt=0, le=1, description="it takes nothing at this charge or more")
+    P_discharge: Positive = Field(1.0, description="power that it gives at most, p.u.")
+    P_charge: Positive = Field(1.0, description="power that it takes at most, p.u.")
+    R: NonNegative = Field(
+        0.0, description="resistance, p.u. of V_dcref^2/S_n, whose loss its charge covers"
+    )
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Battery:
+        if not self.soc_min < self.soc_max:
+            raise ValueError(f"soc_min = {self.soc_min:g}: must be less than {self.soc_max:g}")
+        if 4 * self.R * self.P_discharge >= 1:
+            most = 1 / (4 * self.R)
+            raise ValueError(f"P_discharge = {self.P_discharge:g}: with this R at most {most:.4g}")
+        return self
+
+
+class Chopper(Options):
+    """A resistor across C_dc that takes what the source cannot; switched at ticks."""
+
+    P: Positive = Field(1.0, description="what it takes at v_dc = 1, p.u.")
+    v_on: Positive = Field(1.15, description="v_dc above which it is turned on, p.u.")
+    v_off: Positive = Field(1.1, description="v_dc below which it is turned off, p.u.")
+
+    @model_validator(mode="after")
+    def _has_a_band(self) -> Chopper:
+        if not self.v_off < self.v_on:
+            raise ValueError(f"v_off = {self.v_off:g}: must be less than v_on = {self.v_on:g}")
+        return self
+
+
 class DcSource(Options):
     """The current source that feeds C_dc, Eq. (8)."""
 
@@ -49,6 +89,8 @@ class DcSource(Options):
         description="lag between the current that is asked for, within i_max, and the current that "
         "flows, s; none if not given",
     )
+    battery: Battery | None = Field(None, description="what feeds it; no limit if none")
+    chopper: Chopper | None = Field(None, description="a brake of the DC link; none if not given")
 
 
 class Grid(Options):

@@ -49,6 +49,7 @@ def keep(plant: PlantRecords) -> None:
         for j in range(4):
             s.before[4 + j] = s.sensed[j]
         s.before[8], s.before[9], s.before[10] = s.E_most, s.E_commanded[0], s.E_commanded[1]
+        s.before[11] = s.soc
     unit, unit_before = field(now, "unit"), field(now, "unit_before")
     for k in range(now.n_s):
         unit_before[k] = unit[k]
@@ -70,6 +71,7 @@ def go_back(plant: PlantRecords) -> None:
         for j in range(4):
             s.sensed[j] = s.before[4 + j]
         s.E_most, s.E_commanded[0], s.E_commanded[1] = s.before[8], s.before[9], s.before[10]
+        s.soc = s.before[11]
     unit, unit_before = field(now, "unit"), field(now, "unit_before")
     for k in range(now.n_s):
         unit[k] = unit_before[k]

@@ -61,6 +61,14 @@ converter_par_dtype = np.dtype(
         ("k_i", "f8"),
         ("i_max", "f8"),
         ("tau_dc", "f8"),  # its lag, s (0: none)
+        # the battery behind it: energy over S_n, s (0: none), charge at the start and its limits,
+        # power that it gives and takes at most, resistance
+        ("energy", "f8"),
+        ("soc", "f8", (3,)),
+        ("P_most", "f8", (2,)),
+        ("R_battery", "f8"),
+        # the chopper: its conductance (0: none), v_dc that turns it on and off
+        ("chopper", "f8", (3,)),
         ("dc_steps", "i8"),  # of the DC link in a piece, see `net`
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
@@ -102,6 +110,11 @@ converter_state_dtype = np.dtype(
         ("x", "f8", (8,)),  # the state of Eq. (1)-(8), in the converter's frame
         ("i_reg", "f8"),  # integral part of the regulated DC source's current
         ("i_source", "f8"),  # current of a DC source with a lag
+        # in this period: limits of its current, and the conductance of the chopper; the battery's
+        # state of charge
+        ("i_most", "f8", (2,)),
+        ("chopper", "f8"),
+        ("soc", "f8"),
         ("E", "f8", (2,)),  # the bridge's voltage at this instant, d and q
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
@@ -112,8 +125,8 @@ converter_state_dtype = np.dtype(
         ("seen", "f8", (3, 3)),
         ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
-        # when kept: delta, v_dc, DC source (2), sensors (4), and what the bridge was commanded (3)
-        ("before", "f8", (11,)),
+        # when kept: delta, v_dc, DC source (3), sensors (4), and what the bridge was commanded (3)
+        ("before", "f8", (12,)),
         # protection: ticks in a row that each threshold was crossed, and the latched trip
         ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
         # one cycle: ticks looked at; sums over them of i^2 and of the turn of the capacitor's

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gfm_plant import CONNECTION, clear_fault, fault, grid_unbalance, plant_connection
+from gfm_plant import CONNECTION, clear_fault, fault, grid_unbalance, plant_options
 from gfm_plant.solution import I_O, V
 
 L, R, T_s = 0.15, 0.004, 2e-6
@@ -38,7 +38,7 @@ def walk(made: Any, ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     v, i = np.empty(ticks, complex), np.empty(ticks, complex)
     turn = np.exp(1j * made.par["omega_b"][0] * T_s * (made.st["tick"][0] + np.arange(ticks)))
     for k in range(ticks):
-        plant_connection(made.plant.records, 0, out[k])
+        plant_options(made.plant.records, 0, out[k])
         v[k], i[k] = made.now["w"][0, V], made.now["w"][0, I_O]
         made.advance()
     return out, v * turn, i * turn
@@ -47,7 +47,7 @@ def walk(made: Any, ticks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_at_rest_the_transformer_takes_its_reactive_power_alone(rest: Callable[..., Any]) -> None:
     made = rest(1e-4, P=0.6, grid=GRID, lcl={"L": L, "R": R})
     out = np.empty(3)
-    plant_connection(made.plant.records, 0, out)
+    plant_options(made.plant.records, 0, out)
     truth, i = made.truth(), made.phasor("converter.i_o")
     v = made.phasor("converter.v") - complex(R, L) * i
     assert out == pytest.approx(

@@ -1,4 +1,4 @@
-"""The DC source's lag and the bridge's modulation limit."""
+"""The DC source's lag, its battery and chopper, and the bridge's modulation limit."""
 
 import math
 from typing import Any
@@ -109,3 +109,70 @@ def test_a_stage_and_the_bridge_have_the_same_limit_of_space_vector_modulation()
     assert VirtualStator().m == plant.par[0]["m_max"]
     m = VirtualStator().m
     assert m == pytest.approx(700 / 380 * math.sqrt(3 / 2) / math.sqrt(3), rel=1e-15)
+
+
+BATTERY = {"energy_s": 5.0, "P_discharge": 0.52, "P_charge": 0.4, "R": 0.05}
+
+
+def test_a_battery_limits_the_source_and_is_drained_by_what_it_gives(rest):
+    """Against SciPy in steps of a tick, as the limit samples v_dc; R i^2 - i + P = 0."""
+    plant = rest(dc_source={"mode": "regulated", "battery": BATTERY})
+    r, u = plant.par[0], plant.near(omega_u=2e-3, E_u=1e-2)
+    z = np.concatenate([plant.x, [plant.u[0], 0.5]])
+    limited = 0
+    for _ in range(300):
+        most = 0.52 / z[V_DC]
+
+        def slope(_: float, z: Any, most: float = most) -> Any:
+            error = 1.0 - z[V_DC]
+            asked = r["k_p"] * error + z[8]
+            i, di = min(asked, most), r["k_i"] * error
+            if asked > most:
+                di = min(di, 0.0)
+            dx = f(z[:8].copy(), np.array([i, *u[1:]]), np.ones(2), plant.par)
+            drained = (1 - math.sqrt(1 - 4 * 0.05 * i * z[V_DC])) / (2 * 0.05)
+            return np.concatenate([dx, [di, -drained / 5.0]])
+
+        step = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12, "max_step": 1e-5}
+        z = solve_ivp(slope, (0, T_S), z, **step).y[:, -1]
+        plant.advance(u=u)
+        limited += plant.truth()["i_dc"] == plant.st["i_most"][0, 0]
+        assert plant.truth()["v_dc"] == pytest.approx(z[V_DC], abs=1e-7)
+        assert plant.st["soc"][0] == pytest.approx(z[9], abs=1e-7)
+    assert 50 < limited < 300 and plant.st["soc"][0] < 0.497
+
+
+@pytest.mark.parametrize(("P", "soc", "end"), [(0.5, 0.051, 0.05), (-0.5, 0.949, 0.95)])
+def test_an_empty_battery_gives_nothing_and_a_full_one_takes_nothing(rest, P, soc, end):
+    off = {name: {"enabled": False} for name in ("dc_under_voltage", "dc_over_voltage")}
+    battery = {"energy_s": 5.0, "soc": soc}
+    plant = rest(P=P, protection=off, dc_source={"mode": "regulated", "battery": battery})
+    plant.advance(110)
+    assert plant.st["soc"][0] == pytest.approx(end, abs=2e-5)
+    assert plant.truth()["i_dc"] == 0.0
+    charge = float(plant.st["soc"][0])
+    plant.advance(20)
+    assert plant.st["soc"][0] == charge
+
+
+def test_a_chopper_holds_the_link_in_its_band(rest):
+    """A source that goes on giving raises v_dc until the resistor takes more than it gives."""
+    off = {"dc_over_voltage": {"enabled": False}}
+    chopper = {"P": 2.0, "v_on": 1.2, "v_off": 1.1}
+    plant = rest(P=0.0, protection=off, dc_source={"chopper": chopper})
+    r = plant.par[0]
+    v, on = [], []
+    for _ in range(3000):
+        plant.advance(u=plant.near(i_u=0.5))
+        v.append(plant.truth()["v_dc"])
+        on.append(plant.st["chopper"][0])
+    rate = r["omega_b"] / r["C_dc"] * T_S
+    assert set(on) == {0.0, 2.0}
+    assert 1.2 < max(v) < 1.2 + 1.1 * rate * 0.5
+    first = on.index(2.0)
+    settled = v[first:]
+    assert min(settled) > 1.1 - 1.1 * rate * (2.0 * 1.2 - 0.5)
+    # C v' = omega_b (i - p / v - g v), and the bridge draws nearly nothing
+    for k in (first - 2, first + 2):
+        step = v[k + 1] - v[k]
+        assert step == pytest.approx(rate * (0.5 - on[k] * v[k]), rel=0.05)

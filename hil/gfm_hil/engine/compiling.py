@@ -140,7 +140,7 @@ def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     def compile_it() -> None:
         parts = [
             RolePart(
-                rows(1, 1, bench.inner, bench.connection)[role == "controller"][0],
+                rows(1, 1, bench.inner, bench.options)[role == "controller"][0],
                 np.empty((0, len(kept_of(role))), np.int64),
                 np.zeros(2, np.int64),
             )

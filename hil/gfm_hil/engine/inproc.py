@@ -136,7 +136,7 @@ def run_inproc(
     survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
     chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
     controllers = stack(benches)
-    plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.connection)
+    plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
     sides = (plant_rows, plant_parts), (controller_rows, controller_parts)
     while k < ticks and any(timeline.running for timeline in timelines):
         for timeline in timelines:
@@ -167,17 +167,15 @@ def run_inproc(
 
 
 def rows(
-    converters: int, ticks: int, inner: bool, connection: bool
+    converters: int, ticks: int, inner: bool, options: tuple[str, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Room for what the loop records: of the plant and of the controllers, each of shape
     (converters, ticks, columns)."""
-    plant, controller = (
-        len(signals_of(role, inner, connection)) for role in ("plant", "controller")
-    )
+    plant, controller = (len(signals_of(role, inner, options)) for role in ("plant", "controller"))
     return np.empty((converters, ticks, plant)), np.empty((converters, ticks, controller))
 
 
 def compile_loop(benches: Sequence[Bench]) -> None:
     """Compile (or load from cache) the loop without running a tick."""
-    room = rows(len(benches), 1, benches[0].inner, benches[0].connection)
+    room = rows(len(benches), 1, benches[0].inner, benches[0].options)
     run_ticks(benches[0].plant.records, stack(benches), *room, 0, 0)

@@ -127,8 +127,8 @@ class _SideResources:
         self.scenario = scenario = bench.scenario
         _begin(folder, scenario)
         if scenario.mode == "realtime":
-            keep_in_memory(folder, scenario.ticks, notice, bench.inner, bench.connection)
-        self.part = RolePart.create(folder, role, scenario.ticks, bench.inner, bench.connection)
+            keep_in_memory(folder, scenario.ticks, notice, bench.inner, bench.options)
+        self.part = RolePart.create(folder, role, scenario.ticks, bench.inner, bench.options)
         self.timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         stack.callback(self.timeline.close)
 

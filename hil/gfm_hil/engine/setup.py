@@ -16,7 +16,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.gains import gains_of
-from gfm_plant import Network, NoEquilibrium, start_again, take_out
+from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
 from gfm_plant.names import MAY_START
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
@@ -54,9 +54,10 @@ class Bench:
         return self.controller.inner
 
     @property
-    def connection(self) -> bool:
-        """Whether the recording carries the signals of connection points."""
-        return bool(self.plant.net["connections"][0])
+    def options(self) -> tuple[str, ...]:
+        """What the recording has by the plant's options."""
+        n = self.plant.net[0]
+        return (CONNECTION if n["connections"] else ()) + (BATTERY if n["batteries"] else ())
 
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_plant import CONNECTION, TRUTH
+from gfm_plant import BATTERY, CONNECTION, TRUTH
 from gfm_plant.names import TRIP_REASONS
 from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES, names
 from gfm_runtime.states import STATES
@@ -28,8 +28,8 @@ PLANT_COLUMNS = (
 )
 #: a run with an inner stage records these after the plant's and the controller's
 PLANT_INNER = (*(f"y_{n}" for n in names("y_inner")), *(f"u_{n}" for n in names("u_inner")))
-#: a run with a transformer of a converter's own records these last
-PLANT_CONNECTION = tuple(f"true_{n}" for n in CONNECTION)
+#: a run records those of its plant's options last: of a converter's own transformer, of a battery
+PLANT_OPTIONS = tuple(f"true_{n}" for n in (*CONNECTION, *BATTERY))
 I_REF = ("i_ref_d", "i_ref_q")
 CONTROLLER_INNER = ("E_law", *I_REF, "limited")
 CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
@@ -46,16 +46,17 @@ INSTRUCTIONS = "controller_instructions"
 _INNER_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_INNER, "controller": CONTROLLER_INNER}
 
 
-def signals_of(role: Role, inner: bool, connection: bool = False) -> tuple[str, ...]:
+def signals_of(role: Role, inner: bool, options: tuple[str, ...] = ()) -> tuple[str, ...]:
     """The columns that a role records, without times; ``inner``: the run has an inner stage;
-    ``connection``: it has connection points of their own, see ``Scenario.has_connection``."""
+    ``options``: what its plant has by options, see ``Scenario.optional_signals``."""
     found = SIGNALS_OF[role] + (_INNER_OF[role] if inner else ())
-    return found + (PLANT_CONNECTION if connection and role == "plant" else ())
+    return found + (tuple(f"true_{n}" for n in options) if role == "plant" else ())
 
 
 def recorded_in(role: Role, width: int) -> tuple[str, ...]:
     """The columns of a recording of so many of them; empty if no run records so many."""
-    each = (signals_of(role, *which) for which in product((False, True), repeat=2))
+    options = ((), CONNECTION, BATTERY, CONNECTION + BATTERY)
+    each = (signals_of(role, *which) for which in product((False, True), options))
     return {len(names): names for names in each}.get(width, ())
 
 
@@ -64,9 +65,9 @@ def kept_of(role: Role) -> tuple[str, ...]:
     return TIMES_OF[role] + COUNTS_OF[role]
 
 
-def bytes_per_tick(inner: bool = False, connection: bool = False) -> int:
+def bytes_per_tick(inner: bool = False, options: tuple[str, ...] = ()) -> int:
     """What a tick takes in the parts of a run."""
-    signals = [signals_of(role, inner, connection) for role in SIGNALS_OF]
+    signals = [signals_of(role, inner, options) for role in SIGNALS_OF]
     return 8 * sum(map(len, [*signals, *map(kept_of, SIGNALS_OF)]))
 
 
@@ -206,6 +207,7 @@ def _table() -> dict[str, Described]:
                 strict=True,
             )
         ),
+        Described("true_soc", "SoC", "p.u. (energy_s)", "state of charge of the battery", _TRUE),
         Described("law", "", "", "law in force"),  # index into `laws` of signals.npz
         Described("state", "", "", "state of the controller", "", tuple(enumerate(STATES))),
         Described(
@@ -226,7 +228,7 @@ def _table() -> dict[str, Described]:
     ]  # fmt: skip
     found = {row.name: row for row in rows}
     times = [f"{role}_{name}" for role in TIMES_OF for name in kept_of(role)]
-    inner = (*PLANT_INNER, *PLANT_CONNECTION, *CONTROLLER_INNER)
+    inner = (*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER)
     return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *inner, *times)}
 
 

@@ -45,13 +45,13 @@ class RolePart:
 
     @staticmethod
     def create(
-        folder: Path, role: Role, ticks: int, inner: bool = False, connection: bool = False
+        folder: Path, role: Role, ticks: int, inner: bool = False, options: tuple[str, ...] = ()
     ) -> RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
-        ``inner``, ``connection``: what the run records besides, see ``signals_of``.
+        ``inner``, ``options``: what the run records besides, see ``signals_of``.
         """
-        columns, times = signals_of(role, inner, connection), kept_of(role)
+        columns, times = signals_of(role, inner, options), kept_of(role)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -136,7 +136,7 @@ class Kept:
     Args:
         role: whose.
         ticks: of a run.
-        inner, connection: what the run records besides, see ``signals_of``.
+        inner, options: what the run records besides, see ``signals_of``.
         only: names of the columns that are kept; None: all.
     """
 
@@ -145,10 +145,10 @@ class Kept:
         role: Role,
         ticks: int,
         inner: bool = False,
-        connection: bool = False,
+        options: tuple[str, ...] = (),
         only: Collection[str] | None = None,
     ) -> None:
-        recorded = signals_of(role, inner, connection)
+        recorded = signals_of(role, inner, options)
         self._names = [name for name in recorded if only is None or name in only]
         self._places = [recorded.index(name) for name in self._names]
         self._columns = np.empty((len(self._names), ticks))
@@ -167,7 +167,7 @@ def keep_in_memory(
     ticks: int,
     notice: Callable[[str], None] = lambda text: None,
     inner: bool = False,
-    connection: bool = False,
+    options: tuple[str, ...] = (),
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.
 
@@ -181,7 +181,7 @@ def keep_in_memory(
     if not _MEMORY.is_dir():
         return
     _rescue(notice)
-    needed = bytes_per_tick(inner, connection) * ticks
+    needed = bytes_per_tick(inner, options) * ticks
     parts = folder / "parts"
     if not parts.is_symlink():
         if shutil.disk_usage(_MEMORY).free < 2 * needed:

@@ -1,7 +1,7 @@
 """Recording of a tick, compiled into the loops."""
 
 from gfm_hil.realtime.atomics import prefetch
-from gfm_plant import CONNECTION, TRUTH, plant_connection, plant_truth
+from gfm_plant import CONNECTION, TRUTH, plant_options, plant_truth
 from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import NU, NY, NY_INNER
 
@@ -20,8 +20,9 @@ def record_sample(row, y, plant, i):
     plant_truth(plant, i, row[_TRUE:])
     for j in range(NY, len(y)):
         row[_Y_INNER + j - NY] = y[j]
-    if plant.net[0].connections != 0:
-        plant_connection(plant, i, row[len(row) - _CONNECTION :])
+    n = plant.net[0]
+    if n.connections + n.batteries != 0:
+        plant_options(plant, i, row[len(row) - n.batteries - n.connections * _CONNECTION :])
 
 
 @compiled

@@ -22,7 +22,6 @@ from gfm_hil.recording.columns import (
     CONTROLLER_INNER,
     HERTZ,
     PLANT_COLUMNS,
-    PLANT_CONNECTION,
     PLANT_INNER,
     TIMES_OF,
     Columns,
@@ -34,7 +33,7 @@ from gfm_hil.recording.log import most_bytes, read_events, read_summary
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.recording.waveforms import three_phase
 from gfm_hil.scenario import Scenario, look_beside
-from gfm_plant import Bases, load_converter
+from gfm_plant import CONNECTION, Bases, load_converter
 from gfm_runtime.toml_file import read_toml
 
 _NOT_METRICS = ("t", "tick", "type", "label")
@@ -48,7 +47,7 @@ _TOGETHER = (
     ),
     CONTROLLER_COLUMNS,
     CONTROLLER_INNER,
-    PLANT_CONNECTION,
+    tuple(f"true_{n}" for n in CONNECTION),
     *([f"{role}_{name}" for name in times] for role, times in TIMES_OF.items()),
 )
 

@@ -42,10 +42,12 @@ _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 
 
-def check_free(folder: Path, ticks: int, inner: bool = False, connection: bool = False) -> None:
+def check_free(
+    folder: Path, ticks: int, inner: bool = False, options: tuple[str, ...] = ()
+) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
 
-    ``inner``, ``connection``: what the run records besides, see ``signals_of``. Raises UserError:
+    ``inner``, ``options``: what the run records besides, see ``signals_of``. Raises UserError:
     it holds something, cannot be made or written, or the disk is too full; a memory-mapped file on
     a full disk would end the process without a word.
     """
@@ -57,7 +59,7 @@ def check_free(folder: Path, ticks: int, inner: bool = False, connection: bool =
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * (bytes_per_tick(inner, connection) + 16) * ticks  # with tick and t
+    needed = 2 * (bytes_per_tick(inner, options) + 16) * ticks  # with tick and t
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(
@@ -317,7 +319,7 @@ def merge_roles(first: Path, second: Path, folder: Path, report: Report | None =
     if names[0] != names[1]:
         raise UserError(f"{first}, {second}: are of different converters: {names[0]}, {names[1]}")
     done = plant.summary["ticks"]
-    check_free(folder, done, "inner" in plant.summary, plant.scenario.has_connection)
+    check_free(folder, done, "inner" in plant.summary, plant.scenario.optional_signals)
     log = read_log(*(run.file("events.jsonl") for run in roles.values()))
     links = {
         role: _link_end(role, roles[role].summary)

@@ -148,7 +148,7 @@ def _recorded(
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
-    check_free(folder, scenario.ticks * len(places), scenario.has_inner, scenario.has_connection)
+    check_free(folder, scenario.ticks * len(places), scenario.has_inner, scenario.optional_signals)
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:
@@ -229,7 +229,7 @@ def _run_here(
     benches: Sequence[Bench], places: Sequence[Path], progress: Progress, interrupt: Interrupt
 ) -> float:
     """Run both sides of each converter in this process; returns when the first tick was run."""
-    ticks, what = benches[0].scenario.ticks, (benches[0].inner, benches[0].connection)
+    ticks, what = benches[0].scenario.ticks, (benches[0].inner, benches[0].options)
     plant_parts = [RolePart.create(place, "plant", ticks, *what) for place in places]
     controller_parts = [RolePart.create(place, "controller", ticks, *what) for place in places]
     timelines = [
@@ -275,7 +275,7 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
 
 def _room(bench: Bench) -> tuple[Kept, Kept]:
     """Room for all columns of a bench."""
-    what = bench.scenario.ticks, bench.inner, bench.connection
+    what = bench.scenario.ticks, bench.inner, bench.options
     return Kept("plant", *what), Kept("controller", *what)
 
 

@@ -18,7 +18,7 @@ from gfm_hil.scenario.events.base import Event
 from gfm_hil.scenario.events.grid_profile import LARGEST_FILE
 from gfm_hil.scenario.events.reference import check_reference, reference_field
 from gfm_hil.scenario.expectation import check_expectation
-from gfm_plant import NetworkParts, Plant, load_converter
+from gfm_plant import BATTERY, CONNECTION, NetworkParts, Plant, load_converter
 from gfm_runtime import LawError, law_file
 from gfm_runtime.errors import meant
 from gfm_runtime.inner_file import named_inner
@@ -348,11 +348,13 @@ class Scenario(StrictSchema):
         )
 
     @property
-    def has_connection(self) -> bool:
-        """Whether a converter has a connection point of its own, behind its transformer; the
-        recording then has its power and voltage there."""
-        each = [self.of(name) for name in self.converters] or [self]
-        return any(one.plant.lcl is not None for one in each)
+    def optional_signals(self) -> tuple[str, ...]:
+        """What the recording has by options of a plant, which are power and voltage at the
+        connection point behind a transformer, and the charge of a battery."""
+        plants = [self.of(name).plant for name in self.converters] or [self.plant]
+        connection = any(one.lcl is not None for one in plants)
+        battery = any(one.dc_source.battery is not None for one in plants)
+        return (CONNECTION if connection else ()) + (BATTERY if battery else ())
 
     def _wrong_links(self) -> list[str]:
         problems = []

@@ -18,8 +18,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import (
     CONTROLLER_INNER,
     INSTRUCTIONS,
-    PLANT_CONNECTION,
     PLANT_INNER,
+    PLANT_OPTIONS,
     TABLE,
     describe,
 )
@@ -58,7 +58,7 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 def test_the_table_has_every_column_of_the_recording(table):
     # of a stage, a transformer, and a processor
-    absent = {*PLANT_INNER, *PLANT_CONNECTION, *CONTROLLER_INNER, INSTRUCTIONS}
+    absent = {*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER, INSTRUCTIONS}
     assert list(table.recorded) == [name for name in TABLE if name not in absent]
     assert len({len(x) for x in table.recorded.values()}) == 1
     assert table.recorded["plant_received"].min() > 0
