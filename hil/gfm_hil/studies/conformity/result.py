@@ -138,7 +138,7 @@ class Conformity:
 
     @cached_property
     def machine(self) -> str:
-        """The machine in words: its name, processor, kernel, and the versions of what computes."""
+        """The name of the machine, its processor, kernel, and the versions of what computes."""
         badge = environment()
         packages = ", ".join(f"{name} {badge[name]}" for name in ("python", "numpy", "numba"))
         return f"{platform.node()}, {badge['cpu']}, Linux {badge['kernel']}, {packages}"
