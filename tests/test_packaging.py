@@ -30,7 +30,7 @@ FOLDERS = {
 RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 _FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "toml_file")
-_STAGES = ("kinds", "stage", "virtual_stator", "voltage_loop")  # their options
+_STAGES = ("dual_sequence", "kinds", "stage", "virtual_stator", "voltage_loop")  # their options
 BESIDE_THE_LOOP = {
     **{f"{name}.py": {"pydantic", "pydantic_core"} for name in (*_FILES, *_STAGES)},
     "elf.py": {"elftools"},  # the extra "calibration"

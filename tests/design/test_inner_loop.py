@@ -34,7 +34,7 @@ PLANT: dict[str, Any] = {
     "delay": {"samples": 1, "fraction": 0.3},
     "modulation": "space-vector",
 }
-SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance")
+SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance", "dual-sequence")
 #: every block of the stage once with and once without its states
 STAGES = {
     **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},
@@ -68,7 +68,8 @@ class Kernel:
 
     def places(self) -> list[tuple[str, int]]:
         """Where the states of ``LinearStage.states`` are kept; an angle has no place of its own."""
-        short = {"v_f": "v_f", "i*": "x_v", "x_v": "x_v", "x_c": "x_c"}
+        short = {name: name for name in ("v_f", "x_v", "x_c", "v_p", "v_n", "i_p", "i_n", "x_n")}
+        short["i*"] = "x_v"
         assert self.loop.stage is not None
         names = [name.split()[0] for name in self.loop.stage.states]
         both = [name for name in names if name in short]

@@ -1,3 +1,4 @@
+from .dual_sequence import DualSequence
 from .kinds import (
     INNER_CONSTANTS,
     INNER_NUMBERS,
@@ -36,6 +37,7 @@ __all__ = [
     "PRIORITIES",
     "STAGES",
     "Cascaded",
+    "DualSequence",
     "Inner",
     "InnerStage",
     "PowerLimiter",

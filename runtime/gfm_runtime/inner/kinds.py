@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
 from gfm_runtime.inner.stage import (
     I_D,
     I_Q,
@@ -30,6 +31,7 @@ from gfm_runtime.inner.stage import (
     current_loop,
     faded,
     follow,
+    limit_current,
     limit_power,
     take_measurements,
 )
@@ -42,13 +44,15 @@ from gfm_runtime.inner.voltage_loop import (
 )
 from gfm_runtime.signals import NU
 
-Inner = Annotated[VirtualStator | Cascaded | ThresholdImpedance, Field(discriminator="type")]
+Inner = Annotated[
+    VirtualStator | Cascaded | ThresholdImpedance | DualSequence, Field(discriminator="type")
+]
 
 STAGES: dict[str, type[InnerStage]] = {
     str(one.model_fields["type"].default): one for one in get_args(get_args(Inner)[0])
 }
 KINDS = {name: code for code, name in enumerate(("none", *STAGES))}
-NONE, STATOR = KINDS["none"], KINDS["virtual-stator"]
+NONE, STATOR, DUAL = KINDS["none"], KINDS["virtual-stator"], KINDS["dual-sequence"]
 
 #: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
 INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
@@ -100,9 +104,15 @@ def shape(law, state):
         follow(law, state)
         if law.inner == STATOR:
             stator(law, state, E_d, E_q)
+            limit_current(law, state)
+        elif law.inner == DUAL:
+            dual_sequence(law, state, E_d, E_q)
         else:
             voltage_loop(law, state, E_d, E_q)
         current_loop(law, state)
+        if law.inner == DUAL:
+            state.e_now[0] += state.x_n[0]
+            state.e_now[1] += state.x_n[1]
         most = law.m * state.m[V_DC]
         size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
         if size > most * most:  # the limit of the modulation
@@ -131,7 +141,8 @@ def settle_inner(law, state, e_d, e_q):
     state.x_high, state.x_low, state.limited = 0, 0, 0
     for k in range(2):
         state.v_f[k], state.i_f[k], state.i_ref[k] = m[V_D + k], m[I_D + k], m[I_D + k]
-        state.x_c[k] = state.x_v[k] = 0
+        state.v_p[k], state.i_p[k] = m[V_D + k], m[I_D + k]
+        state.x_c[k] = state.x_v[k] = state.v_n[k] = state.i_n[k] = state.x_n[k] = 0
     state.e[0], state.e[1] = e_d, e_q
     need_d, need_q = state.e[0], state.e[1]  # in the law's own precision
     if law.inner != NONE:
@@ -145,7 +156,7 @@ def settle_inner(law, state, e_d, e_q):
         through_d, through_q = state.i_ref[0], state.i_ref[1]
         state.x_v[0], state.x_v[1] = through_d, through_q
         state.drop[0] = state.drop[1] = 0
-        if law.inner != STATOR:
+        if law.inner != STATOR and law.inner != DUAL:
             through_d, through_q = settle_voltage_loop(law, state)
         X = state.omega * law.X_v
         need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]

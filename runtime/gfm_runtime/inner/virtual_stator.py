@@ -16,7 +16,7 @@ from typing import Literal
 from pydantic import Field
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.inner.stage import V_D, V_Q, InnerStage, limit_current
+from gfm_runtime.inner.stage import V_D, V_Q, InnerStage
 from gfm_runtime.toml_file import NotNegative, Positive
 
 
@@ -42,7 +42,8 @@ class VirtualStator(InnerStage):
 
 @inlined
 def stator(law, state, E_d, E_q):
-    """One tick of the virtual stator by the trapezoidal rule on its own pole: i* from E - v."""
+    """One tick of the virtual stator by the trapezoidal rule on its own pole: i* from E - v, not
+    limited."""
     m = state.m
     b = state.omega * law.half_turn
     keep, lose = law.one - law.stator_a, law.one + law.stator_a
@@ -52,4 +53,3 @@ def stator(law, state, E_d, E_q):
     size = lose * lose + b * b
     state.x_v[0], state.x_v[1] = (r_d * lose + r_q * b) / size, (r_q * lose - r_d * b) / size
     state.i_ref[0], state.i_ref[1] = state.x_v[0], state.x_v[1]
-    limit_current(law, state)
