@@ -12,6 +12,7 @@ from gfm_design.model.linear import Mode
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.figures import COLOURS, dress
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
+from gfm_hil.scenario import load_scenario
 from gfm_hil.scenario.expectation import reason_name
 from gfm_plant import Plant
 from gfm_runtime import load_law
@@ -122,6 +123,32 @@ def loops() -> None:
     write_table("inner_modes", ["stage", "law", *heads], rows)
 
 
+def unbalance() -> None:
+    """The negative sequence, and the largest current of a phase, in unbalanced faults."""
+    rows = []
+    for kind in ("LL", "LG", "LLG"):
+        for scr in _SCRS:
+            for stage in ("virtual-stator", "dual-sequence"):
+                fault = {"t": 0.5, "type": "fault", "kind": kind, "position": 0.5, "R": 0.0}
+                plant = {**_PLANT, "grid": {"scr": scr, "x_over_r": 6.0}}
+                content = {"title": "unbalanced fault", "duration": 2.0, "law": "vsg-2"}
+                content |= {"plant": plant, "events": [{**fault, "duration": 0.5}]}
+                one = run(load_scenario(content, in_process=True, inner=stage))
+                turn = np.exp(1j * 2 * np.pi * nominal_frequency(one.scenario) * one.signals["t"])
+                v, i = (
+                    one.columns[f"true_{x}_re"] + 1j * one.columns[f"true_{x}_im"] for x in "vi"
+                )
+                late, stays = slice(9000, 10_000), slice(6000, 10_000)
+                V2, I2 = (np.conj(np.mean(z[late] * turn[late] ** 2)) for z in (v, i))
+                phases = i[stays] * turn[stays] * np.exp(-2j * np.pi / 3 * np.arange(3)[:, None])
+                lead = np.degrees(np.angle(I2 / V2)) % 360.0
+                peak = float(np.max(np.abs(phases.real)))
+                cells = [f"{lead:.1f}°", number(abs(I2), 2), number(peak, 2), one.status]
+                rows.append([kind, f"{scr:g}", f"`{stage}`", *cells])
+    head = ["fault", "SCR", "stage", "$I_2$ leads $V_2$ by", "$\\lvert I_2\\rvert$"]
+    write_table("inner_unbalance", [*head, "largest current of a phase", "run"], rows)
+
+
 def _least_damped(modes: list[Mode], low: float, high: float, digits: int) -> str:
     """The oscillation between two frequencies [Hz] that lasts longest, if there is one."""
     for mode in modes:  # in this order
@@ -135,3 +162,4 @@ def inner_stage() -> None:
     blocks()
     loops()
     faults()
+    unbalance()

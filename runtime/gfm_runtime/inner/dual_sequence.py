@@ -89,7 +89,7 @@ def dual_sequence(law, state, E_d, E_q):
     v_d, v_q = state.v_n[0], state.v_n[1]
     X = state.omega * law.X_n
     size = law.R_n * law.R_n + X * X
-    ref_d, ref_q = (X * v_q - law.R_n * v_d) / size, (0 - X * v_d - law.R_n * v_q) / size
+    ref_d, ref_q = (X * v_q - law.R_n * v_d) / size, -(X * v_d + law.R_n * v_q) / size
     size = math.sqrt(ref_d * ref_d + ref_q * ref_q)
     full = size > law.I_n
     if full:
