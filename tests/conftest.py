@@ -25,6 +25,9 @@ pytest_plugins = ["tests.support.attacks"]
 # One thread in BLAS: small matrices, and both processors are busy (see gfm_hil.core.blas).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Tables have no width of a terminal, which xdist sets for its workers.
+os.environ.pop("COLUMNS", None)
+
 # Figures are drawn without a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
