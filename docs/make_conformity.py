@@ -6,7 +6,9 @@ runs/conformity, and from there writes
     docs/tables/conformity_laws.md                  what each law passes and fails
     docs/tables/conformity_causes.md                why, by test and clause
     docs/tables/conformity_stages.md                two laws behind each inner stage
+    docs/tables/conformity_grid.md                  the laws for grid codes, droop of 5 %
     docs/_static/figures/conformity_matrix.png      laws x tests
+    docs/_static/figures/conformity_grid.png        the same of the laws for grid codes
     docs/_static/figures/conformity_part.png        one run with its windows and limits
 
 Usage: python docs/make_conformity.py    (less than 10 minutes on two processors)
@@ -22,6 +24,7 @@ from typing import Any
 from gfm_hil.cli import main as gfmhil
 from gfm_hil.core.terminal import markdown
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, SIGNS
+from gfm_runtime import grid_names
 
 DOCS = Path(__file__).resolve().parent
 FOLDER = DOCS.parent / "runs" / "conformity"
@@ -95,6 +98,10 @@ def main() -> None:
     (DOCS / "tables" / "conformity_laws.md").write_text(table(laws) + "\n", "utf-8")
     (DOCS / "tables" / "conformity_causes.md").write_text(causes(laws) + "\n", "utf-8")
     (DOCS / "tables" / "conformity_stages.md").write_text(stages() + "\n", "utf-8")
+    names = [x for law in grid_names() for x in ("--law", law)]
+    grid = conform(FOLDER / "grid", *names, "--no-figures")
+    (DOCS / "tables" / "conformity_grid.md").write_text(table(grid) + "\n", "utf-8")
+    shutil.copy(FOLDER / "grid" / "matrix.png", FIGURES / "conformity_grid.png")
     shutil.copy(FOLDER / "laws" / "matrix.png", FIGURES / "conformity_matrix.png")
     conform(FOLDER / "one", "--law", LAW, "--against", "miso")
     part = FOLDER / "one" / "runs" / LAW / "miso-3-phase-jump" / "figure.png"

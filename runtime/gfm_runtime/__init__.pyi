@@ -1,4 +1,13 @@
-from .catalogue import LawSet, get_law, law_file, law_names, law_titles, load_law, tuned_names
+from .catalogue import (
+    LawSet,
+    get_law,
+    grid_names,
+    law_file,
+    law_names,
+    law_titles,
+    load_law,
+    tuned_names,
+)
 from .elements import Element
 from .errors import LawError
 from .kernel import law_dtype, pack_law, state_dtype, step
@@ -25,6 +34,7 @@ __all__ = [
     "change_law",
     "discretise",
     "get_law",
+    "grid_names",
     "law_dtype",
     "law_file",
     "law_names",

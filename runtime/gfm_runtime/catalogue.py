@@ -1,7 +1,8 @@
 """The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``.
 
 ``laws/tuned`` holds the same laws with the gains that the law comparison found for the paper's
-converter. They load by name like the others, but ``law_names`` does not list them.
+converter, ``laws/grid`` those for grid codes, with a declared droop of 5 %. They load by name like
+the others, but ``law_names`` does not list them.
 """
 
 from __future__ import annotations
@@ -65,6 +66,13 @@ def tuned_names() -> tuple[str, ...]:
     return _names("tuned")
 
 
+@cache
+def grid_names() -> tuple[str, ...]:
+    """Names of the laws for grid codes, with a droop of 5 %, e.g. ``vsg-7-grid``, in natural
+    order."""
+    return _names("grid")
+
+
 def _names(group: str) -> tuple[str, ...]:
     folder = files("gfm_runtime").joinpath("laws", group)
     found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
@@ -91,11 +99,11 @@ def law_file(name: str) -> LawFile:
         return read_law_file(name)
     if (shipped := _shipped(name)) is not None:
         return shipped
-    close = meant(name, [*law_names(), *tuned_names()])
+    close = meant(name, [*law_names(), *tuned_names(), *grid_names()])
     with contextlib.suppress(OSError, ValueError):  # of what can be no path
         if Path(f"{name}.toml").is_file():
             close = f"; did you mean '{name}.toml'?"
-    known = f"one of {list(law_names())}, or of these with -tuned (gfmhil laws --tuned)"
+    known = f"one of {list(law_names())}, or with -tuned or -grid (gfmhil laws --tuned, --grid)"
     raise LawError(f"law {name!r}", f"unknown{close or ';'} use a .toml file or {known}")
 
 

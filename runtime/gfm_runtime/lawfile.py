@@ -259,8 +259,8 @@ def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
 
 
 def shipped_law(name: str) -> str | None:
-    """The text of a law of the catalogue, tuned or not; None if no law has this name."""
-    for group in ("", "tuned"):
+    """The text of a law that ships, whatever its group; None if no law has this name."""
+    for group in ("", "tuned", "grid"):
         path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
         if re.fullmatch("[a-z0-9-]{1,64}", name) and path.is_file():
             return path.read_text(encoding="utf-8")

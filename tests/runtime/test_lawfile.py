@@ -15,6 +15,7 @@ from gfm_runtime import (
     Limits,
     build_law,
     discretise,
+    grid_names,
     law_file,
     law_names,
     load_law,
@@ -430,7 +431,7 @@ def test_a_number_alone_is_a_parameter():
     assert "parameters.D_p: must be a table with value, not True" in line
 
 
-@pytest.mark.parametrize("name", [*law_names(), *tuned_names()])
+@pytest.mark.parametrize("name", [*law_names(), *tuned_names(), *grid_names()])
 def test_the_catalogue_says_unit_and_source_of_every_parameter(name):
     for parameter in law_file(name).parameters.values():
         assert {"unit", "source"} <= parameter.model_fields_set and parameter.source.strip()

@@ -20,7 +20,7 @@ in the gains.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -147,6 +147,7 @@ class PaperProblem:
 
     ``among`` gives the loop of a law where else it is to be judged, sampled; as that of
     ``NetworkLoop.converter``. Plant, references and T_s are then those of that loop.
+    ``others`` are more such loops: gamma is the largest of all, and every loop must be stable.
     """
 
     file: LawFile
@@ -157,12 +158,14 @@ class PaperProblem:
     T_s: float = T_S
     among: Callable[[BuiltLaw], ClosedLoop] | None = None
     decay: float = 0.0
+    others: tuple[Callable[[BuiltLaw], ClosedLoop], ...] = ()
 
     def __post_init__(self) -> None:
         judged = LATE if self.file.inner is not None else Plant()
         update = {"sensors": judged.sensors, "delay": judged.delay}
         self._judged = self.plant.model_copy(update=update)
         self._screen = Screen(self.weights)
+        self._others = [replace(self, among=one, others=()) for one in self.others]
         self.move_to({g.name: g.start for g in self.gains})
 
     def move_to(self, named: dict[str, float]) -> None:
@@ -179,6 +182,8 @@ class PaperProblem:
             controlled = self._rest.dc_control
         self.late = self._rest if self.is_sampled else self._rest.sampled(self.T_s, self.T_s)
         self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
+        for other in self._others:
+            other.move_to(named)
 
     @property
     def is_sampled(self) -> bool:
@@ -230,6 +235,10 @@ class PaperProblem:
 
     def many(self, values: Vector) -> Vector:
         """Costs of several sets of gains, one a row."""
+        return np.max([one.own(values) for one in self._each], axis=0)
+
+    def own(self, values: Vector) -> Vector:
+        """``many`` without the other loops."""
         costs = np.full(len(values), 1.99 * UNSTABLE)
         A, B, C, D = self.loops(values)
         good = np.flatnonzero(np.all([np.isfinite(m).all(axis=(1, 2)) for m in (A, B, C, D)], 0))
@@ -239,18 +248,38 @@ class PaperProblem:
         return costs
 
     def polish(self, code: Encoding, point: Vector) -> Vector:
-        """A lower gamma nearby, by its active peaks."""
+        """A lower gamma nearby, by the active peaks of the loop in which it is largest."""
+        worst = max(self._each, key=lambda one: one.own(code.values(point)[None])[0])
         try:
-            return polish(
-                lambda x: self.loops(code.values(x)), self.weights, point, code.low, code.high
+            found = polish(
+                lambda x: worst.loops(code.values(x)), self.weights, point, code.low, code.high
             )
         except np.linalg.LinAlgError:
             return point
+        lower = not self.others or self(code.values(found)) < self(code.values(point))
+        return found if lower else point
+
+    @property
+    def _each(self) -> list[PaperProblem]:
+        """The problems of the loop and of the others."""
+        return [self, *self._others]
 
     def channels(self, values: Vector) -> tuple[WeightedChannel, ...]:
-        """Every channel's norm, guaranteed, with the decay if there is one. Raises ``Unstable``."""
-        loop = self.closed_loop(values)
-        return channel_norms(self._shifted(loop.performance()), self.weights, loop.T_s)
+        """Every channel's norm, guaranteed, with the decay if there is one, in the loop in which it
+        is largest. Raises ``Unstable``."""
+        return worst_channels(
+            channel_norms(self._shifted(loop.performance()), self.weights, loop.T_s)
+            for loop in self.all_loops(values)
+        )
+
+    def all_loops(self, values: Vector) -> list[ClosedLoop]:
+        """``closed_loop`` in each loop, the others included."""
+        return [one.closed_loop(values) for one in self._each]
+
+
+def worst_channels(each: Iterable[tuple[WeightedChannel, ...]]) -> tuple[WeightedChannel, ...]:
+    """Of several loops with the same weights, each channel in the loop in which it is largest."""
+    return tuple(max(same, key=lambda c: c.norm) for same in zip(*each, strict=True))
 
 
 EVALUATIONS = 240  # of each start, before its polish

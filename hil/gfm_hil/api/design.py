@@ -3,8 +3,9 @@ law file with the gains that a synthesis found."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +24,12 @@ from gfm_design.tuning.paper import (
     PaperProblem,
     starts_for,
     tune_paper,
+    worst_channels,
 )
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.scenario import Scenario, load_scenario, toml_text
+from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant
@@ -183,6 +185,7 @@ def tune(
     on: str | Path | Scenario | None = None,
     converter: str | None = None,
     decay: float = 0.0,
+    scr: Sequence[float] = (),
     seed: int = 0,
     evaluations: int = EVALUATIONS,
     starts: int | None = None,
@@ -202,6 +205,8 @@ def tune(
         on, converter: as for the function ``gamma``.
         decay: how fast every mode of the loop, and so of the whole network, must decay at least,
             1/s: the search then minimises the norm of W_ij(s) T_ij(s - decay).
+        scr: short-circuit ratios of the scenario's grid; gamma is the largest of all, and every
+            loop must be stable, and decay so fast.
         seed: of the search, >= 0; the same seed gives the same gains.
         evaluations: of each start, before its polish.
         starts: the given start and random ones; 6, and one more a gain, if None.
@@ -219,19 +224,25 @@ def tune(
         if not 0 <= number < np.inf:
             raise UserError(f"{what} = {number}: must be finite and not negative")
     law = as_law(law)
-    file, among = law.file, None
+    file = law.file
+    among: Callable[[BuiltLaw], ClosedLoop] | None = None
+    others: Sequence[Callable[[BuiltLaw], ClosedLoop]] = ()
     if on is not None:
         scenario = on if isinstance(on, Scenario) else load_scenario(on)
         file = law.staged(scenario, converter)
-
-        def among(built: BuiltLaw) -> ClosedLoop:
-            return loop_under(built, scenario, converter)
+        among, *others = (
+            partial(loop_under, scenario=one, converter=converter) for one in _at(scenario, scr)
+        )
+    elif scr:
+        raise UserError("scr: are those of a scenario's grid; say which scenario")
 
     paper = PAPER_START.get(law.name, {}) if among is None else dict[str, float]()
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
     gains = free_gains(law.file, at, only)
     try:
-        problem = PaperProblem(file, gains, weights=_weights(weights), among=among, decay=decay)
+        problem = PaperProblem(
+            file, gains, weights=_weights(weights), among=among, decay=decay, others=tuple(others)
+        )
     except NoEquilibrium as none:
         raise UserError(str(none)) from None
     starts = starts or starts_for(len(problem.gains))
@@ -253,9 +264,20 @@ def tune(
         raise UserError(str(missing)) from None
     named = problem.law.named(found.values)
     tuned = law.with_gains(name or f"{law.name}-tuned", **named)
-    loop = problem.closed_loop(found.values)
-    channels = Gamma(tuned.name, loop.channels(problem.weights))
+    each = (loop.channels(problem.weights) for loop in problem.all_loops(found.values))
+    channels = Gamma(tuned.name, worst_channels(each))
     return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
+
+
+def _at(scenario: Scenario, scr: Sequence[float]) -> list[Scenario]:
+    """A scenario at several short-circuit ratios; as it is without them. Raises UserError: one
+    cannot be."""
+    if not scr:
+        return [scenario]
+    content = scenario.model_dump(mode="json", exclude_unset=True)
+    plant = content.get("plant", {})
+    grids = [{**plant.get("grid", {}), "scr": ratio} for ratio in scr]
+    return [check_scenario({**content, "plant": {**plant, "grid": g}}, "scr") for g in grids]
 
 
 def margins(

@@ -13,7 +13,15 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
-from gfm_runtime import DiscreteLaw, discretise, law_file, law_names, load_law, tuned_names
+from gfm_runtime import (
+    DiscreteLaw,
+    discretise,
+    grid_names,
+    law_file,
+    law_names,
+    load_law,
+    tuned_names,
+)
 from gfm_runtime.inner_file import acting, inner_names, named_inner
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile
@@ -27,6 +35,9 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--tuned", action="store_true", help="those with the gains of the law comparison"
     )
+    command.add_argument(
+        "--grid", action="store_true", help="those for grid codes, with a droop of 5 %%"
+    )
     show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
@@ -36,7 +47,9 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     rows = []
-    for name in tuned_names() if options.tuned else law_names():
+    groups = [(options.tuned, tuned_names), (options.grid, grid_names)]
+    chosen = [names for asked, names in groups if asked] or [law_names]
+    for name in (name for names in chosen for name in names()):
         laws, file = load_law(name), law_file(name)
         first = laws.laws[0]
         rows.append(

@@ -16,7 +16,7 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table, shown
 from gfm_hil.scenario import find_scenario, shipped_scenarios
 from gfm_hil.studies.scan import AMPLITUDE, POINTS, WINDOW_S, FrequencyScan
-from gfm_runtime import law_names, tuned_names
+from gfm_runtime import grid_names, law_names, tuned_names
 from gfm_runtime.errors import meant
 from gfm_runtime.toml_file import read_toml
 
@@ -111,7 +111,7 @@ def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
     except UserError:
         if what.endswith(".toml"):
             raise UserError(f"{what}: there is no such file") from None
-        close = meant(what, [*law_names(), *tuned_names(), *shipped_scenarios()])
+        close = meant(what, [*law_names(), *tuned_names(), *grid_names(), *shipped_scenarios()])
         raise UserError(
             f"{what!r}: is neither a law (gfmhil laws) nor a scenario (gfmhil scenarios){close}"
         ) from None

@@ -26,7 +26,7 @@ from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.base import judge
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
-from gfm_hil.studies.conformity.execute import PartResult
+from gfm_hil.studies.conformity.execute import PartResult, declared_for
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import (
     Case,
@@ -63,7 +63,8 @@ PEAK = {10.0: 0.3, 25.0: 0.6}  # p.u.
 F_SWING, RATIO = 2.0, 0.3
 
 OMEGA_B = 100 * math.pi  # rad/s
-UNDER = load_under_test(None)
+UNDER = declared_for(load_under_test(None), "vsg-2")
+SHIPPED = load_under_test(None)
 CRITERIA: TypeAdapter[Criterion] = TypeAdapter(Criterion)
 
 
@@ -530,6 +531,17 @@ def test_another_frequency_and_rating_keep_the_elements_per_unit():
     assert twin.C_dc * twin.V_dcref**2 / twin.S_n == pytest.approx(
         paper.C_dc * paper.V_dcref**2 / paper.S_n
     )
+
+
+@pytest.mark.parametrize(
+    ("law", "droop"),
+    [("vsg-2", 0.01), ("droop-5", 0.01), ("vsg-10", 0.01), ("dvoc", 0.01), ("droop-2", math.inf),
+     ("matching-1", math.inf), ("hybrid-angle", math.inf), ("vsg-10-grid", 0.05)],
+)  # fmt: skip
+def test_the_droop_is_that_of_the_law_unless_its_owner_declares_another(law, droop):
+    assert declared_for(SHIPPED, law).droop == pytest.approx(droop)
+    owner = UNDER.model_copy(update={"droop": 0.03})
+    assert declared_for(owner, law).droop == 0.03
 
 
 def test_a_converter_of_ones_own_lies_beside_its_file(tmp_path, monkeypatch):

@@ -103,6 +103,14 @@ def read_gains(text: str | None, option: str = "--gains") -> dict[str, float]:
     return found
 
 
+def read_numbers(text: str | None, option: str) -> list[float]:
+    """``1.5,20`` as numbers. Raises UserError: an entry that is none."""
+    try:
+        return [float(entry) for entry in text.split(",")] if text is not None else []
+    except ValueError:
+        raise UserError(f"{option} {text!r}: must be numbers separated by commas") from None
+
+
 def singular_is_users(
     call: Callable[[argparse.Namespace], int],
 ) -> Callable[[argparse.Namespace], int]:
@@ -198,6 +206,10 @@ def _add_tune(kinds: Any) -> None:
         "--decay", type=float, default=0.0, metavar="A",
         help="every mode of the loop must decay at least this fast, 1/s",
     )  # fmt: skip
+    command.add_argument(
+        "--scr", metavar="A,B,…",
+        help="short-circuit ratios of the scenario's grid, in all of which the law is judged",
+    )  # fmt: skip
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
     command.add_argument("-o", "--out", help="write the tuned law to this file")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -263,6 +275,7 @@ def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tun
             on=on,
             converter=options.converter,
             decay=options.decay,
+            scr=read_numbers(options.scr, "--scr"),
             seed=options.seed,
             evaluations=options.evaluations,
             starts=options.starts,

@@ -24,14 +24,14 @@ from gfm_hil.run.runner import (
 )
 from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
-from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge
+from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge, own_droop
 from gfm_hil.studies.conformity.criteria.nfp import Nfp
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
 from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
-from gfm_runtime import law_file
+from gfm_runtime import get_law, law_file
 from gfm_runtime.inner_file import named_inner
 
 
@@ -175,12 +175,21 @@ def make_jobs(
         stage = law_file(start).inner if inner is None else named_inner(inner)
         check_currents(external.name, stage is not None)
         each.append((external.name, start, external))
+    declared = {file: declared_for(under, file) for _, file, _ in each}
     return [
-        Job(law, file, case, part, inner, under, converters, folder, figures, model)
+        Job(law, file, case, part, inner, declared[file], converters, folder, figures, model)
         for law, file, model in each
         for case in cases
         for part in case.test.runs()
     ]
+
+
+def declared_for(under: UnderTest, law: str) -> UnderTest:
+    """What the owner declares, with the droop of a law if none is; of a model that of the law at
+    whose operating point it begins."""
+    if under.droop is not None:
+        return under
+    return under.model_copy(update={"droop": own_droop(get_law(law))})
 
 
 def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]:

@@ -172,7 +172,9 @@ class Conformity:
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             (
                 "declared",
-                f"droop {100 * under.droop:g} %, power {under.P_min:g} to {under.P_max:g} p.u.",
+                "droop "
+                + (f"{100 * under.droop:g} %" if under.droop is not None else "of the law itself")
+                + f", power {under.P_min:g} to {under.P_max:g} p.u.",
             ),
             ("gfmhil", version("gfmhil")),
             ("machine", self.machine),

@@ -28,8 +28,12 @@ from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
 from gfm_hil.studies.envelopes import Unit
 from gfm_plant import Plant
+from gfm_runtime import BuiltLaw
 
 Vector = NDArray[np.float64]
+
+_NEARLY_DC = 1e-9j  # rad/s
+_ERRORS_OF_P = ("linear", "dvoc")  # error maps whose second error has the slope 1 to p at V = 1
 _ROUNDING = 1e-9  # p.u., s or Hz; the plant is solved to it
 
 
@@ -60,10 +64,12 @@ class UnderTest(StrictSchema):
     """The converter under test: its plant, and what its owner declares."""
 
     plant: Plant = Field(description="converter and instruments, without a grid")
-    droop: float = Field(
+    droop: float | None = Field(
+        None,
         gt=0,
         allow_inf_nan=True,
-        description="declared: frequency over power in the steady state, p.u./p.u.; inf: none",
+        description="declared: frequency over power in the steady state, p.u./p.u.; inf: none; "
+        "that of the law itself, the gain from p to ω_u at rest, if not given",
     )
     P_max: float = Field(description="declared: most power in the steady state, p.u.")
     P_min: float = Field(description="declared: least power in the steady state, p.u.")
@@ -88,6 +94,14 @@ class UnderTest(StrictSchema):
         """What its file says of the plant besides the converter, in words."""
         words = ", ".join(sorted(self.plant.model_fields_set - {"converter"}))
         return words or "an ideal plant: its file gives no delay, modulation, limit or protection"
+
+
+def own_droop(law: BuiltLaw) -> float:
+    """The frequency over the power at rest, p.u./p.u.: a law's gain from p to omega_u; inf: it has
+    none, or its errors are others than those of p."""
+    gains = (law.element(matrix, (1, 1))(_NEARLY_DC).real for matrix in ("phi", "psi"))
+    found = sum(gains) if law.error_map in _ERRORS_OF_P else 0.0
+    return found if 0 < found < 1 else math.inf
 
 
 class Clause(StrictSchema):
@@ -180,6 +194,7 @@ class Moment:
         self.T_s = run.scenario.T_s
         self.f_n = nominal_frequency(run.scenario)
         self.width = cycle_ticks(self.T_s, self.f_n)
+        self.droop = math.inf if under.droop is None else under.droop
         self.at, self.tick = at, round(at / self.T_s)
         whole = run.scenario.ticks
         later = [e.at(self.T_s) for e in run.scenario.events if e.at(self.T_s) > self.tick]

@@ -29,7 +29,7 @@ class Energy(Windowed):
         p = m.raw("p")[m.first : m.last]
         dE = float(np.sum(p - m.before("p"))) * m.T_s
         fell = m.before("omega_u") - m.raw("omega_u")[m.first : m.last]
-        by_droop = float(np.sum(fell)) * m.T_s / m.under.droop if self.net_of_droop else 0.0
+        by_droop = float(np.sum(fell)) * m.T_s / m.droop if self.net_of_droop else 0.0
         dE -= by_droop
         H = -math.copysign(1.0, self.df_hz) * m.f_n * dE / (2 * abs(self.df_hz))
         text = (

@@ -58,7 +58,7 @@ class InEnvelope(Windowed):
         if (droops := _by_droop(m, P_0)) > 0.5 * float(np.min(found.upper - found.lower)):
             return m.cannot(
                 "the envelope of a ramp knows no droop, and the declared one of "
-                f"{100 * m.under.droop:g} % alone moves p by {droops:.3g} p.u."
+                f"{100 * m.droop:g} % alone moves p by {droops:.3g} p.u."
             )
         # As DyCoV measures: the mean of the last cycle, and the limits are late by a cycle. In the
         # first one the mean is of before and after, and is not judged.
@@ -92,7 +92,7 @@ def _by_droop(m: Moment, P_0: float) -> float:
     if not any(e.at(m.T_s) == m.tick for e in ramps):
         return 0.0
     omega_g, under = m.raw("omega_g"), m.under
-    moved = (omega_g[m.tick - 1] - omega_g[m.last - 1]) / under.droop
+    moved = (omega_g[m.tick - 1] - omega_g[m.last - 1]) / m.droop
     return float(abs(np.clip(P_0 + moved, under.P_min, under.P_max) - P_0))
 
 

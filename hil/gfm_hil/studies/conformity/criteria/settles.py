@@ -62,12 +62,9 @@ class Settles(Windowed):
         if self.to != "droop":
             return self.to, "the value asked for", False
         omega_u, under = m.ending("omega_u"), m.under
-        asked = m.ending("ref_P_ref") + (1.0 - omega_u) / under.droop
+        asked = m.ending("ref_P_ref") + (1.0 - omega_u) / m.droop
         to = float(np.clip(asked, under.P_min, under.P_max))
-        why = (
-            f"the droop of {100 * under.droop:g} %, which the converter's file declares, at "
-            f"{omega_u * m.f_n:.4g} Hz"
-        )
+        why = f"the declared droop of {100 * m.droop:g} % at {omega_u * m.f_n:.4g} Hz"
         if to != asked:
             why += f", which asks for {asked:.3g} p.u., limited to the declared power"
         return to, why, to != asked
