@@ -1,6 +1,6 @@
 """The table docs/tables/grid_dips.md: laws in 200 random dips of the grid's voltage.
 
-Each dip has a retained voltage of 0 to 0.8 p.u., 0.1 to 0.25 s, at SCR 1.5 to 20 and P_ref of 0.2 to
+Each dip has a retained voltage of 0 to 0.8 p.u. for 0.1 to 0.25 s, SCR 1.5 to 20 and P_ref 0.2 to
 0.9 p.u., on the converter of the published tests behind ``virtual-stator``. All laws get the same.
 
 Usage: python docs/make_dips.py    (about 2 minutes on one processor)
