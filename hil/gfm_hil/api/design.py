@@ -331,11 +331,20 @@ def channels_as_json(channels: Sequence[WeightedChannel]) -> dict[str, Any]:
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 
-def problem_name(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
-    """The problem whose gamma a synthesis gives: the paper's, or that of a scenario."""
+def problem_name(
+    file: LawFile,
+    on: Scenario | None = None,
+    converter: str | None = None,
+    weights: str | None = None,
+    scr: Sequence[float] = (),
+) -> str:
+    """The problem whose gamma a synthesis gives: the paper's, or that of a scenario; arguments as
+    for ``tune``."""
     if on is not None:
         who = "" if converter is None else f"converter {converter} of "
-        return f"the paper's weights on {who}{on.title!r}, sampled"
+        whose = "the paper's weights" if weights is None else f"the weights of {weights}"
+        ratios = f" at SCR {', '.join(f'{x:g}' for x in scr)}" if scr else ""
+        return f"{whose} on {who}{on.title!r}{ratios}, sampled"
     if file.inner is None:
         return "the paper's problem (Section III-B)"
     return f"the paper's weights, behind {file.inner.type}, sampled at 10 kHz, u one sample late"

@@ -247,7 +247,8 @@ def _tune(options: argparse.Namespace) -> int:
     }
     said = _bound(found, result) if options.full_order else ""
     if options.out:
-        problem = None if on is None else problem_name(law.file, on, options.converter)
+        more = options.converter, options.weights, read_numbers(options.scr, "--scr")
+        problem = None if on is None else problem_name(law.file, on, *more)
         write_law(Path(options.out), law.file, named, result, problem=problem)
     if options.json:
         print(json.dumps(result, indent=2))
