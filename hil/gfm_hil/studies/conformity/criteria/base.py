@@ -33,7 +33,7 @@ from gfm_runtime import BuiltLaw
 Vector = NDArray[np.float64]
 
 _NEARLY_DC = 1e-9j  # rad/s
-_ERRORS_OF_P = ("linear", "dvoc")  # error maps whose second error has the slope 1 to p at V = 1
+_OTHER_ERRORS = ("hybrid-angle",)  # error maps whose second error is an angle, not that of p
 _ROUNDING = 1e-9  # p.u., s or Hz; the plant is solved to it
 
 
@@ -100,7 +100,7 @@ def own_droop(law: BuiltLaw) -> float:
     """The frequency over the power at rest, p.u./p.u.: a law's gain from p to omega_u; inf: it has
     none, or its errors are others than those of p."""
     gains = (law.element(matrix, (1, 1))(_NEARLY_DC).real for matrix in ("phi", "psi"))
-    found = sum(gains) if law.error_map in _ERRORS_OF_P else 0.0
+    found = 0.0 if law.error_map in _OTHER_ERRORS else sum(gains)
     return found if 0 < found < 1 else math.inf
 
 

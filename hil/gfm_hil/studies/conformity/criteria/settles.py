@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -64,7 +65,8 @@ class Settles(Windowed):
         omega_u, under = m.ending("omega_u"), m.under
         asked = m.ending("ref_P_ref") + (1.0 - omega_u) / m.droop
         to = float(np.clip(asked, under.P_min, under.P_max))
-        why = f"the declared droop of {100 * m.droop:g} % at {omega_u * m.f_n:.4g} Hz"
+        droop = "no droop" if math.isinf(m.droop) else f"the declared droop of {100 * m.droop:g} %"
+        why = f"{droop} at {omega_u * m.f_n:.4g} Hz"
         if to != asked:
             why += f", which asks for {asked:.3g} p.u., limited to the declared power"
         return to, why, to != asked
