@@ -230,6 +230,10 @@ def test_a_law_makes_a_unit_of_its_converter():
     assert unit.X_eff == pytest.approx(load_converter("paper").pu()["L_f"], abs=0.005)
     more = measure_unit("vsg-2", inner="virtual-stator", plant__grid={"scr": 3.0, "x_over_r": 10.0})
     assert more.X_eff == pytest.approx(0.3, rel=0.1)  # X_v of the stage
+    behind = measure_unit(
+        "vsg-2", plant__grid={"scr": 3.0, "x_over_r": 10.0}, plant__lcl={"L": 0.15}
+    )
+    assert behind.X_eff == pytest.approx(unit.X_eff + 0.15, abs=0.01)  # its transformer
 
 
 def test_a_law_without_inertia_makes_a_unit_of_almost_none():
