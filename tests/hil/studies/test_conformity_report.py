@@ -146,7 +146,7 @@ def test_the_page_shows_what_was_recorded_within_a_level_and_is_small(report):
     # wherever a point is drawn, the signal has that value within the column that it stands for
     at = np.searchsorted(run.signals["t"], power["x"]).clip(0, len(p) - 1)
     around = np.array(
-        [[p[max(0, k - 60) : k + 60].min(), p[max(0, k - 60) : k + 60].max()] for k in at]
+        [[p[max(0, k - 80) : k + 80].min(), p[max(0, k - 80) : k + 80].max()] for k in at]
     )
     assert np.all(drawn >= around[:, 0] - level) and np.all(drawn <= around[:, 1] + level)
     assert [number for *_, number in power["limits"]] == [1]

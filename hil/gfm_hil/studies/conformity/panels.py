@@ -41,7 +41,7 @@ _ALWAYS = ("p", "V", "i", "f_hz")
 _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "frequency f"}
 # Columns of a curve, each with its least and its largest value: over the whole run, and from
 # before to after each event, where what is judged goes on.
-_COLUMNS, _NEAR, _AROUND_S = 300, 90, (-0.02, 0.4)
+_COLUMNS, _NEAR, _AROUND_S = 240, 60, (-0.02, 0.3)
 _LEVELS = 4094  # of a curve in a page: steps of a quarter of a thousandth of its height
 _NO_VALUE = 0xFFFF
 
@@ -173,7 +173,9 @@ class Curves:
     def add(self, panel: Panel) -> int:
         """Take a panel; returns its number in the page."""
         limits = [
-            [x.tolist(), y.tolist(), m.colour, m.number] for m in panel.marks for x, y in m.lines
+            [*(np.char.mod("%.5g", z).astype(float).tolist() for z in line), m.colour, m.number]
+            for m in panel.marks
+            for line in m.lines
         ]
         bars = [
             [*m.window, m.colour, m.number]
