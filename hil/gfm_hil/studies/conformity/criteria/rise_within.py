@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from gfm_hil.run.cycles import whole_ticks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 
@@ -21,20 +22,30 @@ class Rise(Windowed):
     """A signal has done a part of its way to the peak of its one-cycle means within a time, has not
     gone half as far the wrong way first, and does not fall below half of the part again for 0.1 s
     or until it has left its peak. It is low-passed at the nominal frequency: a mean over a cycle
-    would hide the rise, and in the bare signal a spike of the circuit would pass for one."""
+    would hide the rise, and in the bare signal a spike of the circuit would pass for one. With
+    ``mean`` it is the mean over the last cycle: the size of a current whose phases have an offset,
+    as after a fault, swings at the nominal frequency."""
 
     kind: Literal["rise_within"] = Field(description="kind of criterion")
     signal: str = Field("p", description="as for stays_within")
     part: float = Field(0.9, gt=0, lt=1, description="of the way to the peak")
     within: float = Field(gt=0, description="s after at")
     direction: Literal["up", "down"] = Field(description="in which direction it must move")
+    mean: bool = Field(
+        False, description="true: by its mean over the last cycle, as of a fault's current"
+    )
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the time that it takes, ms."""
         w, sign, way = m.way(self.signal, self.direction)
         if way < _NO_RISE:
             return m.cannot(f"{w.symbol} goes {self.direction} by {max(way, 0.0):.2g} only")
-        done = sign * (m.low_passed(self.signal, m.tick, m.last) - w.before) / way
+        x = (
+            m.means(self.signal, m.tick + 1 - whole_ticks(m.width), m.last)
+            if self.mean
+            else m.low_passed(self.signal, m.tick, m.last)
+        )
+        done = sign * (x - w.before) / way
         there = done >= self.part
         k = int(np.argmax(there)) if there.any() else len(done)
         took = k * m.T_s if there.any() else math.inf
