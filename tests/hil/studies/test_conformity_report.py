@@ -89,7 +89,7 @@ def test_the_first_page_says_what_was_judged_and_has_room_to_sign(report):
     for words in (
         "droop-3",
         "gfmhil 0.1.0",
-        "droop 1 %",
+        "droop of the law itself",
         "ours; no source gives it 1 0",
         "all 1 0",
     ):
@@ -138,7 +138,7 @@ def test_the_page_shows_what_was_recorded_within_a_level_and_is_small(report):
     power, *_ = unpacked(page)
     (scenario,) = (report / "runs").rglob("scenario.toml")
     run = gfmhil.run(scenario)
-    p = run.signals["p"]
+    p = run.signals["p_c"]  # at the connection point
     drawn = power["curves"]["every tick"]
     level = np.ptp(p) / 4094
     assert drawn.min() == pytest.approx(p.min(), abs=level)

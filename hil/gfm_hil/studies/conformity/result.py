@@ -166,16 +166,12 @@ class Conformity:
         """What a first page says of a law, or of all, and of the tests, line by line."""
         under = self.under
         own = [] if law is None else [("law", law), ("digest", self.digests.get(law, "–"))]
+        droop = "of the law itself" if under.droop is None else f"{100 * under.droop:g} %"
         return [
             *own,
             ("inner stage", "the law's own" if self.inner is None else self.inner),
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
-            (
-                "declared",
-                "droop "
-                + (f"{100 * under.droop:g} %" if under.droop is not None else "of the law itself")
-                + f", power {under.P_min:g} to {under.P_max:g} p.u.",
-            ),
+            ("declared", f"droop {droop}, power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),
             ("machine", self.machine),
             ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
