@@ -31,7 +31,7 @@ FOLDER = DOCS.parent / "runs" / "conformity"
 FIGURES = DOCS / "_static" / "figures"
 STAGE, LAW = "virtual-stator", "vsg-2"
 STAGED = (LAW, "mimo-gfm-practical")
-STAGES = (STAGE, "cascaded", "threshold-impedance")
+STAGES = (STAGE, "cascaded", "threshold-impedance", "dual-sequence")
 VERDICTS = tuple(SIGNS)
 
 

@@ -184,7 +184,7 @@ def test_a_trip_and_the_reset(device, run):
     operator.command({"type": "grid-voltage", "V_g": 0.0})
     wait_for(lambda: read(device, 701, "InvSt") == 6)
     assert read(device, 701, "Alrm") != 0 and read(device, 701, "St") == 0
-    assert read(device, VENDOR, "Why") and read(device, 715, "OpCtl") == 0
+    assert read(device, VENDOR, "SafeRsn") and read(device, 715, "OpCtl") == 0
     write(device, 715, AlarmReset=1)
     wait_for(lambda: read(device, 701, "InvSt") == 3)
     assert read(device, 701, "Alrm") == 0 and last(run)["ref_P_ref"] == 0.5
