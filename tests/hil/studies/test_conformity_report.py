@@ -20,7 +20,7 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import Run
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario
-from gfm_hil.studies.conformity.panels import Curves, Panel, panels_of_run
+from gfm_hil.studies.conformity.panels import PackedCurves, Panel, panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.verdict import FAIL, PASS, Verdict
 from gfm_runtime.lawfile import shipped_law
@@ -182,7 +182,7 @@ def test_a_spike_of_one_tick_stays_in_the_figure():
     (power, *_) = panels_of_run(run_of(200_000, true_p=p), [])
     assert power.curves["every tick"].max() == 3.0
     assert len(power.x) < 700
-    curves = Curves()
+    curves = PackedCurves()
     assert curves.add(power) == 0 and curves.add(Panel("x", p[:0], {}, [], [], (0.0, 1.0))) == 1
 
 

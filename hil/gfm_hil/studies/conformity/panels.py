@@ -162,7 +162,7 @@ def _thin(x: Vector, edges: NDArray[np.intp]) -> Vector:
     return np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
 
 
-class Curves:
+class PackedCurves:
     """The curves of all panels of a page: in ``levels`` of their own height, each as what it
     changes from point to point, compressed together."""
 

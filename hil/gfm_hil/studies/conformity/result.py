@@ -24,7 +24,7 @@ from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.criteria.base import KNOWN, UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
-from gfm_hil.studies.conformity.panels import Curves
+from gfm_hil.studies.conformity.panels import PackedCurves
 from gfm_hil.studies.conformity.sets import Case
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
@@ -241,7 +241,7 @@ class Conformity:
         """A page about a law, or about all of them."""
         template = "conformity_matrix.html" if law is None else "conformity.html"
         title = "Conformity of laws" if law is None else f"{law}: conformity"
-        curves = Curves()
+        curves = PackedCurves()
         return render(
             template, title=title, found=self, law=law, slug=slug, known=KNOWN, signs=SIGNS,
             row=row, heads=HEADS, saturation=saturation, curves=curves, script=plot_script(),
