@@ -45,7 +45,7 @@ class PlotScript(NamedTuple):
 
 
 def plot_script() -> PlotScript:
-    """uPlot, of which the scope serves the same files, and what draws our plots with it."""
+    """The plotting library uPlot, which the scope serves too, and our script that draws with it."""
     from markupsafe import Markup
 
     vendor = files("gfm_hil").joinpath("ports/scope/static/vendor")

@@ -64,7 +64,7 @@ class Switch(PlantEvent):
         return "" if self.check is None else " when synchronous"
 
     def switch(self, plant: gfm_plant.Network) -> None:
-        """Open or close at once."""
+        """Begin to open, as ``clearing`` says, or close."""
         raise NotImplementedError
 
     def apply(self, plant: gfm_plant.Network) -> None:
