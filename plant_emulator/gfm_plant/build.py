@@ -188,9 +188,7 @@ def _network(
             if name in lags:
                 record["lag"] = len(par) + lags.index(name)
             if isinstance(one, Fed):
-                record["source"] = place = places[emf(name) if one.is_voltage else name]
-                if one.is_voltage:
-                    net["emf"][0, place] = record["E"]
+                record["source"] = places[emf(name) if one.is_voltage else name]
     return Network(par, st, net, now, tuple(parts), wiring)
 
 

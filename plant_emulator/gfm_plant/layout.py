@@ -31,7 +31,6 @@ _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
 
 _NET: _Arrays = {
     "to_grid": (float, ("n_w",)),  # what each state of w brings to the grid, as a current
-    "emf": (float, ("n_s",)),  # p.u.; the constant voltage of a component, at its source's place
     # one sampling period in stretches, between the instants at which a command begins to act; each
     # is cut into pieces for Simpson's rule, and each piece in halves. Another cut of each, n_parts
     # places further on, lets a peak-current limit look at the current; the last one is for what
@@ -75,6 +74,7 @@ _NOW: _Arrays = {
     "gain_omega": (float, ("n_cuts", "n_phasors")),
     "turn": (complex, ("n_cuts", "n_phasors")),
     "w": (complex, ("n_w",)),
+    "emf": (complex, ("n_s",)),  # p.u.; of a component with a voltage, over its unit phasor
     "unit": (complex, ("n_phasors",)),  # the sources' unit phasors, then those of their mirrors
     "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
     "w_before": (complex, ("n_w",)),  # at the last tick

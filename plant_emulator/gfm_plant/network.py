@@ -111,7 +111,9 @@ class Network:
             turns[source], volts[source] = omega, 0j
             if one.is_voltage:
                 volts[source] = voltage = one.start(record, 0j, omega, omega_b, z)
-                now["unit"][place_of[source]] = voltage / abs(voltage)
+                place = place_of[source]
+                now["emf"][place] = E = complex(record["E"])
+                now["unit"][place] = voltage / E
         if (leader := self._leader()) is not None:
             now["omega_g"] = leader["omega"]
 

@@ -212,7 +212,7 @@ def node_voltage(n: Any, now: Any, place: int, tick: float) -> complex:
 def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
     """Return the sum of w and the sources, with the factors of a node for them or for their mirror
     images."""
-    w, unit, emf = field(now, "w"), field(now, "unit"), field(n, "emf")
+    w, unit, emf = field(now, "w"), field(now, "unit"), field(now, "emf")
     by_w, by_source, v = field(n, "node_w"), field(n, "node_s"), 0j
     for i in range(n.n_states):
         by = by_w[c, place, image, i]
@@ -223,8 +223,7 @@ def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
         for k in range(2):  # its two sequences
             v += complex(by * now.sequence[k].real, by * now.sequence[k].imag) * unit[g + k]
     for k in range(g + 2, now.n_s):
-        by = by_source[c, place, image, k] * emf[k]
-        v += complex(by * unit[k].real, by * unit[k].imag)
+        v += by_source[c, place, image, k] * emf[k] * unit[k]
     return v
 
 

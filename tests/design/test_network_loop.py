@@ -110,6 +110,11 @@ def with_machine(place: Path | None = None) -> Scenario:
     return island(**MACHINE)
 
 
+def with_synchronous_machine(place: Path | None = None) -> Scenario:
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, "avr": {"K": 50.0}}
+    return island(**{**MACHINE, "machines": {}, "synchronous_machines": {"M": machine}})
+
+
 def with_finite_grid(place: Path) -> Scenario:
     return scenario({**THREE, "grid": "far"}, plant={"grid": {**FINITE, "V_g": 1.02}})
 
@@ -146,7 +151,9 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
 
 
 @pytest.mark.full  # compiles the loop of several converters
-@pytest.mark.parametrize("of", [island, two_islands, with_machine, with_finite_grid, with_pll])
+@pytest.mark.parametrize(
+    "of", [island, two_islands, with_machine, with_synchronous_machine, with_finite_grid, with_pll]
+)
 @pytest.mark.parametrize("reference", ["P_ref", "V_ref"])
 def test_a_step_is_that_of_the_nonlinear_bench(of, reference, tmp_path):
     # 1e-4 p.u.: nonlinear terms are of the order of 1e-8. The tolerance is that of one converter.

@@ -464,7 +464,7 @@ class _Writing:
         """A component with a source around its rest."""
         slip = self.omega_b * (self.speed[self._island(one.node)] - 1.0)
         source = complex(self.plant.now[0]["unit"][record["source"]])
-        source *= float(record["E"]) if one.is_voltage else 0.0
+        source *= complex(record["E"]) if one.is_voltage else 0.0
         seen = complex(self.w[record["sees"]])
         return one.linear(record, seen, source, slip, self.omega_b)
 
@@ -502,6 +502,7 @@ class _Writing:
             drive = self.modes.drive[:, [self.sources.index(source)]]
             self.A[at, at], self.A[at, self.z] = part.A, part.by_seen @ seen
             self.A[self.z, at] = _real(drive) @ part.source
+            self.A[self.z, self.z] += _real(drive) @ part.direct @ seen
         return self._against_references()
 
     def _source(self, source: str, part: str, e: complex, unit: complex) -> Complex:

@@ -17,6 +17,7 @@ from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
 from gfm_plant.components.part import Component, Dynamic, Fed
+from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
 from gfm_plant.parameters import Options
 from gfm_runtime.compiled import inlined_as
@@ -34,6 +35,7 @@ class NetworkParts(Options):
     constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
     machines: dict[str, Machine] = Field({}, description="by name")
+    synchronous_machines: dict[str, SynchronousMachine] = Field({}, description="by name")
 
     def components(self) -> Iterator[tuple[str, str, Component]]:
         """Table, name and options of each, in the order of the fields above."""

@@ -14,6 +14,7 @@ from gfm_plant.components.part import Fed, LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
     KEPT,
     SWING,
+    lead,
     pack_swing,
     slopes,
     swing,
@@ -57,9 +58,7 @@ def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.omega = 1.0 + w
     power = -_power(one, field(now, "unit")[one.source], field(now, "w")[one.sees]) / one.S
     one.slope, _ = slopes(one, w, one.P_turbine, power)
-    if one.leads:
-        now.omega_g = now.omega_g_to = one.omega
-        now.omega_g_slope = one.slope
+    lead(now, one)
 
 
 @compiled

@@ -4,7 +4,7 @@ the documentation read it."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -53,12 +53,14 @@ class LinearPart:
         by_seen: the states by the current or voltage that it sees, (m, 2), 1/s.
         source: its source by the states, (2, m).
         turn: what a turn of all space vectors by 1 rad does to the states, (m,).
+        direct: its source by what it sees, (2, 2).
     """
 
     A: Matrix
     by_seen: Matrix
     source: Matrix
     turn: Matrix
+    direct: Matrix = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 class Dynamic(Component):
@@ -96,8 +98,8 @@ class Fed(Dynamic):
     """A component with a source of its own: a voltage or a current.
 
     Its record has ``source``, the place of that among the sources, and ``sees``, the place in w of
-    the state that it sees; that of a voltage has ``E``, its constant size, p.u. A record with
-    ``omega`` and ``leads`` may set the frequency of a network without a grid.
+    the state that it sees; that of a voltage has ``E``, its value, p.u., over its unit phasor. A
+    record with ``omega`` and ``leads`` may set the frequency of a network without a grid.
     """
 
     #: a voltage behind a branch, whose node is ``emf(name)``, or a current from its node to ground

@@ -72,6 +72,14 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.energy = one.energy_kept
 
 
+@compiled
+def lead(now: Any, one: Any) -> None:
+    """Set the frequency of a network without a grid by the machine that leads there."""
+    if one.leads:
+        now.omega_g = now.omega_g_to = one.omega
+        now.omega_g_slope = one.slope
+
+
 KEPT = {"keep": _keep, "go_back": _go_back}
 """Hooks of a record that swings."""
 

@@ -315,10 +315,11 @@ def test_a_role_whose_log_cannot_be_written_ends_both(small_disk, start, tmp_pat
     assert process.returncode == 3
     assert err.splitlines()[-1].startswith(f"gfmhil: {folder}: No space left on device; all that")
     ballast.unlink()
-    found = recover(folder).summary
-    assert found["status"] in ("safe", "completed", "interrupted")
-    if found["status"] == "safe":
-        assert found["reason"].endswith("cannot be written: No space left on device")
+    ended = recover(folder).summary
+    # a plant whose controller stands still holds the last u, and its protection may act on that
+    assert ended["status"] in ("safe", "completed", "interrupted", "tripped")
+    if ended["status"] == "safe":
+        assert ended["reason"].endswith("cannot be written: No space left on device")
 
 
 def test_a_disk_without_room_is_said_before_the_run(small_disk, make):

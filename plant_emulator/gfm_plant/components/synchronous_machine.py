@@ -1,0 +1,368 @@
+"""A synchronous machine of order 6 with a voltage regulator: the equations of GENROU, without
+saturation, and the regulator SEXS.
+
+All of it is in p.u. of the machine's rating and in the frame of its rotor, whose q axis is 90
+degrees ahead of its d axis; i flows out of the machine. X'' is that of both axes, so that the
+stator is a voltage behind one branch, R and X'', of the circuit that is solved exactly:
+
+    e'' = j omega psi'' + (d psi''/dt) / omega_b,
+    psi_d'' =  a_d E_q' + (1 - a_d) psi_kd,    a_d = (X'' - X_l) / (X_d' - X_l),
+    psi_q'' = -a_q E_d' + (1 - a_q) psi_kq,    a_q = (X'' - X_l) / (X_q' - X_l),
+    T_d0''  d psi_kd/dt = -g_d,    g_d = psi_kd + (X_d' - X_l) i_d - E_q',
+    T_q0''  d psi_kq/dt = -g_q,    g_q = psi_kq + (X_q' - X_l) i_q + E_d',
+    T_d0'   d E_q'/dt = E_fd - E_q' - (X_d - X_d') (i_d - g_d (X_d' - X'') / (X_d' - X_l)^2),
+    T_q0'   d E_d'/dt =      - E_d' + (X_q - X_q') (i_q - g_q (X_q' - X'') / (X_q' - X_l)^2).
+
+Its torque, psi_d'' i_q - psi_q'' i_d, drives the swing equation. The regulator measures the size V
+of its terminals' voltage:
+
+    T_R dV_m/dt = V - V_m,    T_B dx/dt = V_set - V_m - x,
+    T_E dE_fd/dt = K (x + (V_set - V_m - x) T_A / T_B) - E_fd,    E_min <= E_fd <= E_max.
+
+Within a tick e'' is held, in the rotor's frame, at its value in the middle of the tick,
+extrapolated, and rotor and regulator go on by Heun's rule under the currents at both ends: the
+error falls with the square of T_s. V is the mean over a tick, which e'', R and X'' give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from gfm_plant.circuit import Branch
+from gfm_plant.components.part import Fed, LinearPart, Matrix, emf
+from gfm_plant.components.swing import (
+    KEPT,
+    SWING,
+    lead,
+    pack_swing,
+    slopes,
+    swing,
+    swing_at_rest,
+    swing_matrix,
+)
+from gfm_plant.layout import field
+from gfm_plant.parameters import NonNegative, Options, Positive
+from gfm_plant.solution import drive, state
+from gfm_plant.steady_state import NoEquilibrium
+from gfm_runtime.compiled import compiled
+
+E_Q, E_D, PSI_KD, PSI_KQ, V_M, LEAD, E_FD = range(7)
+"""The states of rotor and regulator."""
+N_STATES = 7
+_LAG = 10.0  # shortest time constant, in sampling periods
+_NUDGE = 1e-6  # of a derivative by differences
+
+
+@compiled
+def _rates(one: Any, x: Any, V: float, i: complex, out: Any) -> None:
+    """Write d/dt of the states x, (7,), 1/s, at a terminal voltage of size V and a current i."""
+    g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
+    g_q = x[PSI_KQ] + one.X_ql * i.imag + x[E_D]
+    out[E_Q] = (x[E_FD] - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d)) / one.T_d10
+    out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q)) / one.T_q10
+    out[PSI_KD], out[PSI_KQ] = -g_d / one.T_d20, -g_q / one.T_q20
+    out[V_M] = out[LEAD] = out[E_FD] = 0.0
+    if one.K > 0.0:
+        off = one.V_set - x[V_M]
+        out[V_M], out[LEAD] = (V - x[V_M]) / one.T_R, (off - x[LEAD]) / one.T_B
+        ahead = x[LEAD] + one.T_A / one.T_B * (off - x[LEAD])
+        out[E_FD] = (one.K * ahead - x[E_FD]) / one.T_E
+
+
+@compiled
+def _flux(one: Any, x: Any) -> complex:
+    """Return psi'' by the states x, or its d/dt by theirs."""
+    return complex(
+        one.a_d * x[E_Q] + (1.0 - one.a_d) * x[PSI_KD],
+        -one.a_q * x[E_D] + (1.0 - one.a_q) * x[PSI_KQ],
+    )
+
+
+@compiled
+def _torque(psi: complex, unit: complex, i: complex) -> float:
+    """Return the torque of a current i in the common frame, in which the d axis is at ``unit``."""
+    own = i * unit.conjugate()
+    return psi.real * own.imag - psi.imag * own.real
+
+
+@compiled
+def _drive(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    drive(n, now, c, part, one.source, one.E_middle, one.omega_middle)
+
+
+@compiled
+def _begin(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Take from its energy, by Simpson's rule, as at the end of a piece; keep the current at the
+    beginning of a tick, which may be another one than at the end of the last if a breaker moved."""
+    if one.begins != 0:
+        one.i_begin = field(now, "w")[one.sees] * field(now, "unit")[one.source].conjugate()
+        one.begins = 0
+    _end(n, now, one, c, part)
+
+
+@compiled
+def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    torque = _torque(one.psi_middle, field(now, "halfway")[one.source], state(n, now, c, one.sees))
+    one.energy -= 4.0 * field(n, "half_h")[part] / 3.0 * torque
+
+
+@compiled
+def _end(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    torque = _torque(one.psi_middle, field(now, "unit")[one.source], field(now, "w")[one.sees])
+    one.energy -= field(n, "half_h")[part] / 3.0 * torque
+
+
+@compiled
+def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    unit, i = field(now, "unit")[one.source], field(now, "w")[one.sees]
+    first = one.i_begin * (1.0 / one.S)
+    last = i * unit.conjugate() * (1.0 / one.S)
+    v = one.E_middle - complex(one.R, one.omega_middle * one.X_2) * (0.5 * (first + last))
+    v -= (last - first) * (one.X_2 / (n.omega_b * n.T_s))
+    V = math.sqrt(v.real * v.real + v.imag * v.imag)
+    _rates(one, one.x, V, first, one.rate)
+    for k in range(N_STATES):
+        one.guess[k] = one.x[k] + n.T_s * one.rate[k]
+    _rates(one, one.guess, V, last, one.guess_rate)
+    for k in range(N_STATES):
+        one.x[k] += 0.5 * n.T_s * (one.rate[k] + one.guess_rate[k])
+    one.x[E_FD] = min(max(one.x[E_FD], one.E_min), one.E_max)
+    w = swing(one, n.T_s, one.omega - 1.0)
+    one.omega = 1.0 + w
+    psi = _flux(one, one.x)
+    one.slope, _ = slopes(one, w, one.P_turbine, -_torque(psi, unit, i) / one.S)
+    _rates(one, one.x, V, last, one.rate)
+    psi_slope = _flux(one, one.rate)
+    bend = (psi_slope - one.psi_slope) * (1.0 / n.T_s)
+    one.psi_slope = psi_slope
+    one.E = 1j * one.omega * psi + psi_slope * (1.0 / n.omega_b)
+    E_slope = 1j * (one.omega * psi_slope + one.slope * psi) + bend * (1.0 / n.omega_b)
+    one.E_middle = one.E + 0.5 * n.T_s * E_slope
+    one.psi_middle = psi + 0.5 * n.T_s * psi_slope
+    one.omega_middle = one.omega + 0.5 * n.T_s * one.slope
+    one.begins = 1
+    field(now, "emf")[one.source] = one.E
+    lead(now, one)
+
+
+@compiled
+def _at_rest(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    torque = _torque(one.psi_middle, field(now, "unit")[one.source], field(now, "w")[one.sees])
+    swing_at_rest(one, one.omega - 1.0, -torque)
+    one.slope = 0.0
+
+
+class Regulator(Options):
+    """A voltage regulator with its exciter, SEXS. Its set-point is what the voltage at the start
+    needs."""
+
+    K: Positive = Field(200.0, description="gain, p.u. of excitation by p.u. of voltage")
+    T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
+    T_A: NonNegative = Field(1.0, description="lead, s")
+    T_B: Positive = Field(10.0, description="lag, s")
+    T_E: Positive = Field(0.05, description="lag of the exciter, s")
+    E_min: float = Field(0.0, ge=-100.0, le=100.0, description="least excitation E_fd, p.u.")
+    E_max: float = Field(5.0, ge=-100.0, le=100.0, description="largest excitation E_fd, p.u.")
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        if not self.E_min < self.E_max:
+            raise ValueError(f"E_min = {self.E_min:g}: must be less than E_max, {self.E_max:g}")
+        return self
+
+
+class SynchronousMachine(Fed):
+    """A synchronous machine with transient and subtransient reactances, a voltage regulator and a
+    governor: field and damper windings of order 6, the subtransient reactance the same in both
+    axes. It has no saturation and no stabiliser. The defaults are those of the machines of
+    Kundur's two areas (Power System Stability and Control, example 12.6)."""
+
+    title: ClassVar = "Synchronous machine of order 6"
+    symbol: ClassVar = "SM"
+    example: ClassVar = {
+        "synchronous_machines": {"x": {"node": "bus", "S": 1.0, "H": 3.0, "P": 0.2, "avr": {}}}
+    }
+    more_states: ClassVar = (
+        ("omega", "p.u.", "its speed, by the swing equation"),
+        ("angle", "rad", "of its rotor's d axis"),
+        ("P_turbine", "p.u. of its rating", "power of its turbine, behind the governor"),
+        ("E_q', E_d', ψ_kd, ψ_kq", "p.u. of its rating", "of field and damper windings"),
+        ("V_m, x, E_fd", "p.u. of its rating", "of the voltage regulator"),
+    )
+    columns: ClassVar = ("true_omega_g",)
+    is_voltage: ClassVar = True
+    unknowns: ClassVar = 4  # its current, p.u. of its rating, and the voltage at its terminals
+    record: ClassVar = np.dtype(
+        [
+            ("source", "i8"), ("sees", "i8"),
+            ("leads", "i8"),  # without a grid, its speed is omega_g
+            *SWING, ("omega", "f8"), ("slope", "f8"),  # its d/dt, 1/s
+            # X_dd is X_d - X_d', X_dl is X_d' - X_l, and so for q; k and a as in the equations
+            *((name, "f8") for name in ("X_dd", "X_qq", "X_dl", "X_ql", "k_d", "k_q", "a_d")),
+            *((name, "f8") for name in ("a_q", "X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20")),
+            # of the regulator; K is 0 without one
+            *((name, "f8") for name in ("K", "T_R", "T_A", "T_B", "T_E", "E_min", "E_max")),
+            ("V_set", "f8"),
+            ("x", "f8", (N_STATES,)), ("rate", "f8", (N_STATES,)),
+            ("guess", "f8", (N_STATES,)), ("guess_rate", "f8", (N_STATES,)),
+            # e'' and psi'' in the rotor's frame, at the tick and in the middle of the one to come
+            ("E", "c16"), ("E_middle", "c16"), ("psi_middle", "c16"), ("psi_slope", "c16"),
+            ("omega_middle", "f8"),
+            ("i_begin", "c16"),  # p.u. of the network, at the beginning of the tick
+            ("begins", "i8"),
+        ],
+        align=True,
+    )  # fmt: skip
+    hooks: ClassVar = {
+        "at_rest": _at_rest, "begin": _begin, "drive": _drive, "middle": _middle, "end": _end,
+        "tick": _tick, **KEPT,
+    }  # fmt: skip
+
+    node: str = Field(min_length=1, description="where it is")
+    S: Positive = Field(description="rating over that of the first converter")
+    H: Positive = Field(description="inertia constant, s")
+    P: float = Field(description="power at nominal frequency, p.u. of its rating")
+    V: Positive = Field(1.0, description="voltage of its node at the start, p.u.")
+    X_d: Positive = Field(1.8, description="synchronous reactance X_d, p.u. of its rating")
+    X_q: Positive = Field(1.7, description="synchronous reactance X_q, p.u.")
+    X_d1: Positive = Field(0.3, description="transient reactance X_d', p.u.")
+    X_q1: Positive = Field(0.55, description="transient reactance X_q', p.u.")
+    X_2: Positive = Field(0.25, description="subtransient reactance X'' of both axes, p.u.")
+    X_l: Positive = Field(0.2, description="leakage reactance, p.u.")
+    R: NonNegative = Field(0.0025, description="resistance of the stator, p.u.")
+    T_d10: Positive = Field(8.0, description="open-circuit transient time constant T_d0', s")
+    T_q10: Positive = Field(0.4, description="open-circuit transient time constant T_q0', s")
+    T_d20: Positive = Field(0.03, description="open-circuit subtransient time constant T_d0'', s")
+    T_q20: Positive = Field(0.05, description="open-circuit subtransient time constant T_q0'', s")
+    D: NonNegative = Field(0.0, description="damping by frequency, p.u./p.u.")
+    droop: Positive = Field(0.05, description="frequency by power of the governor, p.u./p.u.")
+    T_gov: Positive = Field(0.5, description="lag of governor and turbine, s")
+    avr: Regulator | None = Field(None, description="voltage regulator; E_fd is constant if none")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        for axis in "dq":
+            names = "X_l", "X_2", f"X_{axis}1", f"X_{axis}"
+            least = 0.0
+            for name in names:
+                value = getattr(self, name)
+                if value < least or (name == f"X_{axis}1" and value <= self.X_l):
+                    raise ValueError(
+                        f"{name} = {value:g}: must be above that before it in {' <= '.join(names)}"
+                    )
+                least = value
+        return self
+
+    def elements(self, name: str) -> tuple[Branch]:
+        return (Branch(name, emf(name), self.node, self.X_2 / self.S, self.R / self.S),)
+
+    def label(self) -> str:
+        regulator = "" if self.avr is None else ", AVR"
+        return f"S {self.S:g}, H {self.H:g} s, X'' {self.X_2:g}{regulator}"
+
+    def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
+        pack_swing(self, record, self.X_2 / self.S, where, T_s, omega_b)
+        avr = self.avr or Regulator()
+        for name in ("X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20"):
+            record[name] = getattr(self, name)
+        for name in ("K", "T_R", "T_A", "T_B", "T_E", "E_min", "E_max"):
+            record[name] = getattr(avr, name)
+        lags = [(name, getattr(self, name)) for name in ("T_d10", "T_q10", "T_d20", "T_q20")]
+        if self.avr is None:
+            record["K"], record["E_min"], record["E_max"] = 0.0, -np.inf, np.inf
+        else:
+            lags += [(f"avr.{name}", getattr(avr, name)) for name in ("T_R", "T_B", "T_E")]
+        for name, lag in lags:
+            if lag < _LAG * T_s:
+                raise ValueError(
+                    f"{where}: {name} = {lag:g}: must be >= {_LAG * T_s:g} s at this T_s"
+                )
+        for axis in "dq":
+            X, X_1 = getattr(self, f"X_{axis}"), getattr(self, f"X_{axis}1")
+            record[f"X_{axis}{axis}"], record[f"X_{axis}l"] = X - X_1, X_1 - self.X_l
+            record[f"a_{axis}"] = (self.X_2 - self.X_l) / (X_1 - self.X_l)
+            record[f"k_{axis}"] = (X_1 - self.X_2) / (X_1 - self.X_l) ** 2
+        record["P_set"], record["begins"] = self.P, 1
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+        return name
+
+    def steady(
+        self, v: complex, omega: float, omega_b: float, z: Matrix
+    ) -> tuple[complex, list[float]]:
+        i, terminal = complex(*z[:2]), v - complex(*z[2:])
+        torque = ((v + self.R * i) * i.conjugate()).real / omega
+        asked = self.P - (omega - 1.0) * (1.0 / self.droop + self.D)
+        return self.S * i, [abs(v) - self.V, torque - asked, terminal.real, terminal.imag]
+
+    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+        i, v = complex(*z[:2]), complex(*z[2:])
+        q_axis = v + complex(self.R, omega * self.X_q) * i
+        unit = -1j * q_axis / abs(q_axis)
+        i_d, i_q = (own := i * unit.conjugate()).real, own.imag
+        E_fd = (v * unit.conjugate() + self.R * own).imag / omega + self.X_d * i_d
+        if self.avr is not None and not self.avr.E_min < E_fd < self.avr.E_max:
+            raise NoEquilibrium(
+                f"the machine at {self.node}: V = {self.V:g} p.u. needs an excitation of"
+                f" {E_fd:.4g} p.u.; its regulator gives {self.avr.E_min:g} to {self.avr.E_max:g}"
+            )
+        ahead = 0.0 if self.avr is None else E_fd / self.avr.K
+        E_q, E_d = E_fd - (self.X_d - self.X_d1) * i_d, (self.X_q - self.X_q1) * i_q
+        psi_kd = E_q - (self.X_d1 - self.X_l) * i_d
+        psi_kq = -E_d - (self.X_q1 - self.X_l) * i_q
+        record["V_set"] = abs(v) + ahead
+        record["x"] = E_q, E_d, psi_kd, psi_kq, abs(v), ahead, E_fd
+        psi = complex(E_q - (self.X_d1 - self.X_2) * i_d, -E_d - (self.X_q1 - self.X_2) * i_q)
+        record["psi_middle"], record["psi_slope"] = psi, 0j
+        record["omega"] = record["omega_middle"] = omega
+        record["E"] = record["E_middle"] = 1j * omega * psi
+        return complex(record["E"]) * unit
+
+    def linear(
+        self, record: Any, seen: complex, source: complex, slip: float, omega_b: float
+    ) -> LinearPart:
+        """By differences of the equations above.
+
+        What the regulator measures has the d/dt of the current in it. The state that stands for it
+        here is V_m and what that current brings, so that none is left.
+        """
+        one = SimpleNamespace(**{name: record[name] for name in record.dtype.names})
+        unit, (own, per_power) = (
+            source / complex(one.E),
+            swing_matrix(self.H, self.D, self.droop, self.T_gov, 1.0),
+        )
+        resting = seen * unit.conjugate() / self.S
+        ahead = complex(one.E) - complex(self.R, one.omega * self.X_2) * resting
+        ahead *= self.X_2 / (omega_b * one.T_R * abs(ahead))
+
+        def moved(nudge: Matrix) -> Matrix:
+            """d/dt of the states (10,), and the source (2,), after a nudge of the states and of
+            what it sees, (12,)."""
+            rotor = unit * np.exp(1j * nudge[0])
+            i = (seen + complex(*nudge[10:])) * rotor.conjugate() / self.S
+            omega, x, rate = one.omega + nudge[1], one.x + nudge[3:10], np.empty(N_STATES)
+            x[V_M] -= (ahead.conjugate() * (i - resting)).real
+            _rates.py_func(one, x, 0.0, i, rate)
+            psi = _flux.py_func(one, x)
+            E = 1j * omega * psi + _flux.py_func(one, rate) / omega_b
+            V = abs(E - complex(self.R, omega * self.X_2) * i)
+            _rates.py_func(one, x, V, i, rate)
+            torque = _torque.py_func(psi, 1.0, i)
+            swung = own @ nudge[1:3] - np.array([per_power * torque, 0.0])
+            at = E * rotor
+            return np.array([omega_b * nudge[1], *swung, *rate, at.real, at.imag])
+
+        slopes_of = np.stack(
+            [(moved(n) - moved(-n)) / (2 * _NUDGE) for n in _NUDGE * np.eye(12)], axis=1
+        )
+        kept = [k for k in range(10) if self.avr is not None or k < 3 + V_M]
+        A, by_seen = slopes_of[np.ix_(kept, kept)], slopes_of[kept, 10:]
+        turn = np.zeros(len(kept))
+        turn[0] = 1.0
+        return LinearPart(A, by_seen, slopes_of[10:, kept], turn, slopes_of[10:, 10:])

@@ -1,0 +1,246 @@
+"""The synchronous machine of order 6, against its windings in SciPy and a short circuit."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from gfm_plant import Network, NetworkParts, Plant, make_network, plant_command, plant_step
+from gfm_plant.components import SynchronousMachine
+from gfm_plant.components.synchronous_machine import E_FD, V_M
+from gfm_plant.grid import fault, line_breaker
+from gfm_plant.model import DELTA, V_DC
+from gfm_plant.names import TRIPS
+from gfm_plant.steady_state import NoEquilibrium
+
+OFF = {name: {"enabled": False} for name, *_ in TRIPS}
+DATA = {"node": "m", "S": 2.0, "H": 0.8, "P": 0.4, "V": 1.01, "D": 0.5, "T_gov": 0.2, "R": 0.004}
+AVR = {"K": 20.0, "T_A": 0.4, "T_B": 1.5}
+
+
+def make(T_s: float = 1e-4, **more: Any) -> Network:
+    parts = {
+        "loads": {"z": {"node": "m", "P": 0.9, "Q": 0.3}},
+        "capacitors": {"c": {"node": "m", "Q": 0.06}},
+        "synchronous_machines": {"g": DATA | more},
+    }
+    plant = Plant.model_validate({"protection": OFF, "dc_source": {"mode": "regulated"}})
+    return make_network({"a": (plant, "m")}, T_s, Plant().grid, NetworkParts.model_validate(parts))
+
+
+def rest(plant: Network, i: complex) -> np.ndarray:
+    """Put it where the machine gives i, p.u. of its rating, at nominal speed and 1.01 p.u.; returns
+    the commands."""
+    r, v_m = plant.par[0], 1.01 + 0j
+    z = 0.9**2 + 0.3**2
+    i_o = (0.9 / z + 0.3j / z) ** -1 * v_m + 0.06j * v_m - DATA["S"] * i
+    v = v_m + complex(r["R_g"], r["L_g"]) * i_o
+    i_f = i_o + 1j * r["C_f"] * v
+    e = v + complex(r["R_f"], r["L_f"]) * i_f
+    delta = np.angle(e)
+    own = np.array([i_f, v, i_o]) * np.exp(-1j * delta)
+    x, u = np.zeros((1, 8)), np.array([[0.0, 1.0, abs(e), 0.0]])
+    x[0, 0:6:2], x[0, 1:6:2], x[0, DELTA], x[0, V_DC] = own.real, own.imag, delta, 1.0
+    u[0, 0] = u[0, 2] * own[0].real
+    plant.start(x, u, [(np.array([i.real, i.imag, v_m.real, v_m.imag]), 1.0)])
+    return u
+
+
+class Windings:
+    """The machine by the flux linkages of its stator, field and three dampers: Park's equations,
+    with resistances and inductances from reactances and time constants (Sauer and Pai, chapter 3).
+    """
+
+    def __init__(self, one: SynchronousMachine, omega_b: float) -> None:
+        self.one, self.omega_b = one, omega_b
+
+        def axis(X: float, X_1: float, T_1: float, T_2: float) -> tuple[np.ndarray, list[float]]:
+            m, first = X - one.X_l, X_1 - one.X_l
+            slow = 1 / (1 / first - 1 / m)
+            fast = 1 / (1 / (one.X_2 - one.X_l) - 1 / first)
+            L = np.array([[-X, m, m], [-m, m + slow, m], [-m, m, m + fast]])
+            return L, [(m + slow) / (omega_b * T_1), (fast + first) / (omega_b * T_2)]
+
+        self.L_d, (self.R_fd, self.R_kd) = axis(one.X_d, one.X_d1, one.T_d10, one.T_d20)
+        self.L_q, self.R_kq = axis(one.X_q, one.X_q1, one.T_q10, one.T_q20)
+
+    def start(self, i: complex, v: complex) -> tuple[np.ndarray, float, float]:
+        """Fluxes (psi_d, psi_fd, psi_kd, psi_q, psi_kq1, psi_kq2), angle of the d axis, E_fd."""
+        one, L_ad = self.one, self.one.X_d - self.one.X_l
+        angle = np.angle(v + complex(one.R, one.X_q) * i) - np.pi / 2
+        own = i * np.exp(-1j * angle)
+        v_q = (v * np.exp(-1j * angle)).imag
+        E_fd = v_q + one.R * own.imag + one.X_d * own.real
+        d, q = self.L_d @ [own.real, E_fd / L_ad, 0.0], self.L_q @ [own.imag, 0.0, 0.0]
+        return np.concatenate([d, q]), float(angle), float(E_fd)
+
+    def current(self, psi: np.ndarray) -> complex:
+        return complex(np.linalg.solve(self.L_d, psi[:3])[0], np.linalg.solve(self.L_q, psi[3:])[0])
+
+    def slope(self, psi: np.ndarray, v: complex, omega: float, E_fd: float) -> np.ndarray:
+        """d/dt of the fluxes, at a voltage v in the rotor's frame."""
+        i_d, i_fd, i_kd = np.linalg.solve(self.L_d, psi[:3])
+        i_q, i_1, i_2 = np.linalg.solve(self.L_q, psi[3:])
+        v_fd = self.R_fd * E_fd / (self.one.X_d - self.one.X_l)
+        return self.omega_b * np.array([
+            v.real + self.one.R * i_d + omega * psi[3], v_fd - self.R_fd * i_fd, -self.R_kd * i_kd,
+            v.imag + self.one.R * i_q - omega * psi[0], -self.R_kq[0] * i_1, -self.R_kq[1] * i_2,
+        ])  # fmt: skip
+
+
+def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.ndarray]:
+    """After a step of the converter's voltage and speed: currents and voltages, speed, power of
+    the turbine, measured voltage and excitation, of the plant and of DOP853."""
+    plant, i_0 = make(T_s, **more), 0.4 - 0.15j
+    u = rest(plant, i_0)
+    assert plant.wiring.order == ("a.i_f", "a.v", "a.i_o", "z", "g", "c")
+    (one,) = plant.of(SynchronousMachine)
+    now, r, w_b, z = plant.now[0], plant.par[0], plant.wiring.omega_b, 0.9**2 + 0.3**2
+    s_0, delta, machine = (
+        now["w"][:6].copy(),
+        float(plant.st["x"][0, DELTA]),
+        plant.wiring.fed[0][1],
+    )
+    assert abs(s_0[4] - 2.0 * i_0) < 1e-12
+    windings = Windings(machine, w_b)
+    psi_0, angle_0, E_fd_0 = windings.start(i_0, 1.01)
+    avr = machine.avr
+    ahead = E_fd_0 / avr.K if avr else 0.0
+    P_0 = float((np.conj(i_0) * (1.01 + 0.004 * i_0)).real)
+    u[0, 2] += 0.05
+    u[0, 1] += 1e-3
+
+    def slope(t: float, s: np.ndarray) -> np.ndarray:
+        i_f, v, i_o, i_z, v_m = s[:5]
+        psi = s[5:11].real
+        angle, omega, P, V_m, x, E_fd = s[11:].real
+        turn = np.exp(1j * angle)
+        e = u[0, 2] * np.exp(1j * (delta + w_b * (u[0, 1] - 1) * t))
+        i = windings.current(psi)
+        out = np.zeros_like(s)
+        out[0] = w_b / r["L_f"] * (e - v - r["R_f"] * i_f)
+        out[1] = w_b / r["C_f"] * (i_f - i_o)
+        out[2] = w_b / r["L_g"] * (v - v_m - r["R_g"] * i_o)
+        out[3] = w_b / (0.3 / z) * (v_m - 0.9 / z * i_z)
+        out[4] = w_b / 0.06 * (i_o + 2.0 * i * turn - i_z)
+        out[:5] -= 1j * w_b * s[:5]
+        out[5:11] = windings.slope(psi, v_m / turn, omega, E_fd)
+        torque = psi[0] * i.imag - psi[3] * i.real
+        out[11] = w_b * (omega - 1)
+        out[12] = (P - torque - 0.5 * (omega - 1)) / (2 * 0.8)
+        out[13] = (P_0 - (omega - 1) / 0.05 - P) / 0.2
+        if avr:
+            off = 1.01 + ahead - V_m
+            out[14], out[15] = (abs(v_m) - V_m) / avr.T_R, (off - x) / avr.T_B
+            out[16] = (avr.K * (x + avr.T_A / avr.T_B * (off - x)) - E_fd) / avr.T_E
+        return out
+
+    start = np.concatenate([s_0[[0, 1, 2, 3, 5]], psi_0, [angle_0, 1.0, P_0, 1.01, ahead, E_fd_0]])
+    end = solve_ivp(slope, (0, duration), start, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    for _ in range(round(duration / T_s)):
+        plant_command(plant.records, 0, u[0])
+        plant_step(plant.records)
+    i = 2.0 * windings.current(end[5:11].real) * np.exp(1j * end[11])
+    exact = [*end[:4], i, end[4], end[12], end[13], end[14], end[16]]
+    assert abs(end[12] - 1) > 1e-5  # it swings
+    assert avr is None or abs(end[16] - E_fd_0) > 1e-3  # and the regulator acts
+    assert now["omega_g"] == one["omega"]  # there is no other grid
+    mine = [*now["w"][:6], one["omega"], one["P_turbine"], one["x"][V_M], one["x"][E_FD]]
+    return np.array(mine), np.array(exact)
+
+
+@pytest.mark.full  # compiles the plant for several converters
+@pytest.mark.parametrize("regulated", [True, False])
+def test_a_step_against_the_windings(regulated):
+    mine, exact = stepped(1e-4, 0.3, avr=AVR if regulated else None)
+    error = np.abs(mine - exact)
+    assert error[:6].max() < 2e-5  # currents and voltages
+    assert error[6:9].max() < 5e-8 and error[9] < 1e-6
+
+
+@pytest.mark.full
+def test_its_error_falls_with_the_square_of_the_step():
+    errors = [np.abs(np.subtract(*stepped(T_s, 0.1, avr=AVR))).max() for T_s in (2e-4, 1e-4)]
+    assert 3.0 < errors[0] / errors[1] < 6.0
+
+
+@pytest.mark.full
+def test_a_bolted_short_circuit():
+    """The current of an unloaded machine without its DC offset, whose rotor's fluxes decay while
+    that of the stator is zero; and the formula of the books, 1/X_d + (1/X_d' - 1/X_d) e^(-t/T_d')
+    + (1/X'' - 1/X_d') e^(-t/T_d'') with T_d' = T_d0' X_d'/X_d and T_d'' = T_d0'' X''/X_d', which
+    holds for T_d'' << T_d'."""
+    plant = make(H=1e4, P=0.0, R=0.0)
+    u = rest(plant, 0j)
+    fault(plant, None, 1e-4, node="m")
+    now, (one,) = plant.now[0], plant.of(SynchronousMachine)
+    g, source = plant.wiring.order.index("g"), int(one["source"])
+    own = []
+    for _ in range(10_000):
+        plant_command(plant.records, 0, u[0])
+        plant_step(plant.records)
+        own.append(now["w"][g] / now["unit"][source] / DATA["S"])
+    means = np.abs(np.mean(np.reshape(own, (-1, 200)), axis=1))  # of a cycle each
+    t = (np.arange(len(means)) + 0.5) * 0.02
+    m: Any = plant.wiring.fed[0][1]
+    windings = Windings(m, plant.wiring.omega_b)
+    psi, _, E_fd = windings.start(0j, 1.01)
+    by_psi, R = np.linalg.inv(windings.L_d), np.diag([windings.R_fd, windings.R_kd])
+    A = -windings.omega_b * R @ by_psi[1:, 1:]
+    end = -np.linalg.solve(A, [windings.omega_b * windings.R_fd * E_fd / (m.X_d - m.X_l), 0.0])
+    left = np.array([end + expm(A * at) @ (psi[1:3] - end) for at in t])
+    assert np.abs(means / (left @ by_psi[0, 1:]) - 1)[1:].max() < 2e-3
+    T_1, T_2 = m.T_d10 * m.X_d1 / m.X_d, m.T_d20 * m.X_2 / m.X_d1
+    steps = 1 / m.X_d, 1 / m.X_d1 - 1 / m.X_d, 1 / m.X_2 - 1 / m.X_d1
+    book = 1.01 * (steps[0] + steps[1] * np.exp(-t / T_1) + steps[2] * np.exp(-t / T_2))
+    assert np.abs(means / book - 1).max() < 0.02
+
+
+@pytest.mark.full
+def test_a_machine_that_is_lost_runs_up_by_itself():
+    plant = make(avr=AVR)
+    u = rest(plant, 0.4 + 0j)
+    line_breaker(plant, "g", closed=False, clearing="instant")
+    (one,) = plant.of(SynchronousMachine)
+    P, E_fd = float(one["P_turbine"]), float(one["x"][E_FD])
+    for _ in range(200):
+        plant_command(plant.records, 0, u[0])
+        plant_step(plant.records)
+    assert plant.now[0]["w"][plant.wiring.order.index("g")] == 0.0
+    assert one["omega"] - 1 == pytest.approx(P * 0.02 / (2 * 0.8), rel=0.1)
+    assert one["x"][E_FD] < E_fd  # without load its voltage rises, and the regulator takes it back
+
+
+def test_a_rest_that_the_regulator_cannot_hold():
+    plant = make(avr=AVR | {"E_max": 1.2})
+    with pytest.raises(NoEquilibrium, match=r"needs an excitation of .*; its regulator gives 0 to"):
+        rest(plant, 0.4 - 0.15j)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"X_2": 0.4}, r"X_d1 = 0.3: must be above that before it in X_l <= X_2 <= X_d1 <= X_d"),
+        ({"X_l": 0.26}, r"X_2 = 0.25: must be above"),
+        ({"avr": {"E_min": 6.0}}, r"E_min = 6: must be less than E_max, 5"),
+    ],
+)
+def test_data_of_no_machine(more, message):
+    with pytest.raises(ValidationError, match=message):
+        SynchronousMachine.model_validate(DATA | more)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"T_d20": 5e-4}, r"network.synchronous_machines.g: T_d20 = 0.0005: must be >= 0.001 s"),
+        ({"avr": {"T_R": 5e-4}}, r"synchronous_machines.g: avr.T_R = 0.0005: must be >="),
+        ({"H": 1e-4}, r"synchronous_machines.g: it swings at .* rad/s; allowed are"),
+    ],
+)
+def test_too_fast_for_the_step(more, message):
+    with pytest.raises(ValueError, match=message):
+        make(**more)
