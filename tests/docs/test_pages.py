@@ -95,8 +95,8 @@ def documented(head: str) -> list[set[str]]:
 
 def test_summary_keys_are_documented(example_run):
     whole, event = documented("summary.json")
-    # of a processor in the loop, and of a run that did not last
-    assert whole == {*example_run.summary, "instructions", "unstable_mode"}
+    # of a processor in the loop, of a run that did not last, and of one in real time
+    assert whole == {*example_run.summary, "instructions", "unstable_mode", "latency"}
     there = {key for e in example_run.summary["events"] for key in e}
     assert event == there | {"cut_short"}  # which only a run that trips has
 

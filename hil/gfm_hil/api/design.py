@@ -13,6 +13,8 @@ import numpy as np
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
+from gfm_design.misses.tolerance import LatencyTolerance
+from gfm_design.misses.tolerance import latency_tolerance as _latency_tolerance
 from gfm_design.model.closed_loop import ClosedLoop, least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
@@ -30,6 +32,7 @@ from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
+from gfm_hil.scenario.schema import LatePolicy
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant
@@ -304,6 +307,40 @@ def margins(
             " line; loop_margins(Law.closed_loop(...)) has the other margins"
         )
     return _margins(loop)
+
+
+def latency_tolerance(
+    law: str | Path | Law,
+    on: str | Path | Scenario | Plant | None = None,
+    *,
+    hold: int | None = None,
+    extrapolate: int | None = None,
+    **more: Any,
+) -> LatencyTolerance:
+    """What a law bears of late and of lost commands: its delay margin; how many ticks in a row
+    without a new u, by words, if the controller stands still and if it steps; for how many in a
+    row, and in any ten ticks, every sequence is stable. ``LatencyTolerance.used`` says how much of
+    that a measurement used.
+
+    Takes some seconds; the page on benchmarks says how each is obtained.
+
+    Args:
+        law: name, law file or ``Law``.
+        on, more: as for ``Law.closed_loop``.
+        hold, extrapolate: of the plant's late policy, ticks; by default those of the scenario.
+
+    Raises:
+        UnstableLoop: the loop is unstable without any miss.
+        UserError: no such scenario, or there is no operating point.
+    """
+    if isinstance(on, str | Path):
+        on = load_scenario(on)
+    policy = on.late_policy if isinstance(on, Scenario) else LatePolicy()
+    return _latency_tolerance(
+        as_law(law).closed_loop(on, **more),
+        policy.hold if hold is None else hold,
+        policy.extrapolate if extrapolate is None else extrapolate,
+    )
 
 
 def _weights(given: Weights) -> tuple[Weight, ...]:

@@ -32,6 +32,7 @@ from gfm_runtime.lawfile import ElementSpec, LawFile, tied
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
+    from gfm_design.misses.tolerance import LatencyTolerance
     from gfm_design.model.closed_loop import ClosedLoop
 
 
@@ -238,6 +239,15 @@ class Law:
             return loop_under(law, on, converter)
         except NoEquilibrium as problem:
             raise UserError(str(problem)) from None
+
+    def latency_tolerance(
+        self, on: str | Path | Scenario | Plant | None = None, **more: Any
+    ) -> LatencyTolerance:
+        """What this law bears of late and of lost commands: ``gfmhil.design.latency_tolerance``
+        with the same arguments."""
+        from gfm_hil.api.design import latency_tolerance
+
+        return latency_tolerance(self, on, **more)
 
     def staged(self, scenario: Scenario, converter: str | None = None) -> LawFile:
         """Its law file with the inner stage that a scenario gives its laws, if it gives one.

@@ -62,6 +62,11 @@ def _explained(run: Run | NetworkRun) -> None:
 
         if why := why_it_ended(run):
             run.summary["unstable_mode"] = why
+    if isinstance(run, Run) and run.summary["mode"] == "realtime":
+        from gfm_hil.studies.latency import in_a_row_words
+
+        if words := in_a_row_words(run):
+            run.summary["latency"] = words
     write_report(run)
 
 

@@ -137,6 +137,8 @@ def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     yield "simulated", f"{summary['duration_s']:g} s, {summary['ticks']} ticks of {T_us:g} µs"
     yield "wall clock", f"{summary['wall_s']:.2f} s"
     yield "misses", summary["misses"]
+    if "latency" in summary:
+        yield "latency", summary["latency"]
     yield "bump at a law change [p.u.]", summary["bump_pu"]
     if summary["round_trip_us"]:
         yield (

@@ -1,0 +1,1 @@
+"""What a loop bears of ticks without a new u: words, bounds for all of them, statistics."""

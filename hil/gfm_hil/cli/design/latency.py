@@ -1,0 +1,96 @@
+"""gfmhil design latency: how late, and how often missing, a law's u may be."""
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from gfm_design.margins.all_margins import UnstableLoop
+from gfm_design.misses.tolerance import LatencyTolerance
+from gfm_hil.api.design import latency_tolerance
+from gfm_hil.api.latency import measured_misses
+from gfm_hil.api.law import laws
+from gfm_hil.cli.common import EXIT_OTHERWISE, watching
+from gfm_hil.cli.design.common import add_converter_option, add_inner_option
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.report import finite
+from gfm_hil.scenario import load_scenario
+from gfm_hil.studies.latency import as_json, tolerance_table, used_table
+
+_ALL = "all"
+
+
+def add(kinds: Any) -> None:
+    command = kinds.add_parser(
+        "latency", help="how many ticks a law bears without a new u, and what a run used of that"
+    )
+    command.add_argument(
+        "--law", nargs="+", metavar="LAW",
+        help=f"catalogue names or law files, or {_ALL}; the scenario's by default",
+    )  # fmt: skip
+    add_inner_option(command)
+    add_converter_option(command)
+    command.add_argument(
+        "--scenario",
+        help="scenario file or shipped name: plant, references, T_s, late policy; by default that "
+        "of the first run of --from, else pref_step",
+    )
+    command.add_argument(
+        "--from", nargs="+", type=Path, default=[], metavar="RUN|RESULT", dest="measured",
+        help="run folders in real time, or results of gfmhil bench loop: which share they used",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="as JSON")
+    command.set_defaults(call=call)
+
+
+def call(options: argparse.Namespace) -> int:
+    """Print the tolerances; exit code 3 if no law has a stable loop, or a verdict is red."""
+    each = [one for path in options.measured for one in measured_misses(path)]
+    named = options.scenario
+    if named is None:
+        runs = (path for path in options.measured if (path / "scenario.toml").exists())
+        named = str(next((path / "scenario.toml" for path in runs), "pref_step"))
+    scenario = load_scenario(named, inner=options.inner)
+    for one in each:
+        if abs(one.T_s - scenario.T_s) > 1e-12:
+            raise UserError(
+                f"--from {one.name}: has T_s = {one.T_s:g} s, and the scenario {scenario.T_s:g} s"
+            )
+    chosen = options.law or [scenario.law]
+    names = [*laws()] if chosen == [_ALL] else chosen
+    found: dict[str, LatencyTolerance | UnstableLoop] = {}
+    with watching("latency tolerance") as watch:
+        for k, name in enumerate(names):
+            watch.progress(k, len(names), name)
+            try:
+                found[name] = latency_tolerance(name, scenario, converter=options.converter)
+            except UnstableLoop as unstable:
+                found[name] = unstable
+    stable = {name: of for name, of in found.items() if isinstance(of, LatencyTolerance)}
+    used = [{name: of.used(one.misses) for name, of in stable.items()} for one in each]
+    if options.json:
+        content: dict[str, Any] = {
+            "scenario": scenario.title,
+            "laws": {name: as_json(of) for name, of in found.items()},
+            "measured": [
+                {
+                    "name": one.name,
+                    "ticks": one.misses.ticks,
+                    "misses": one.misses.misses,
+                    "in_a_row": one.misses.longest,
+                    "used": {n: {**asdict(u), "verdict": u.light} for n, u in of.items()},
+                }
+                for one, of in zip(each, used, strict=True)
+            ],
+        }
+        print(json.dumps(finite(content), indent=2))
+    else:
+        console = terminal(highlight=False)
+        console.print(f"[bold]{scenario.title}[/]", soft_wrap=True)
+        console.print(tolerance_table(found))
+        for one, of in zip(each, used, strict=True):
+            console.print(used_table(one.name, one.misses, of))
+    red = any(u.light == "red" for of in used for u in of.values())
+    return EXIT_OTHERWISE if red or not stable else 0
