@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from _figures.common import FIGURES, GREY, arrow, box, number, run, scenario, signed, write_table
 from matplotlib.figure import Figure
@@ -149,6 +151,21 @@ def unbalance() -> None:
     write_table("inner_unbalance", [*head, "largest current of a phase", "run"], rows)
 
 
+def sequence() -> None:
+    """How far the reactance of the negative sequence may be from the stator's."""
+    rows, scrs = [], (1.0, 1.5, 3.0, 10.0, 20.0)
+    law = load_law("vsg-2", "dual-sequence").laws[0]
+    for X_n in (0.2, 0.3, 0.45, 0.6, 0.9):
+        cells = []
+        for scr in scrs:
+            plant = {**_PLANT, "grid": {"scr": scr, "x_over_r": 6.0}, "lcl": {"L": 0.15}}
+            stage = law.inner.model_copy(update={"X_n": X_n, "R_n": 0.1 * X_n})
+            loop = ClosedLoop.of(replace(law, inner=stage), Plant.model_validate(plant))
+            cells.append(_least_damped(loop.modes(), _SPLIT, np.inf, 0))
+        rows.append([f"{X_n:g}", *cells])
+    write_table("inner_sequence", ["$X_n$", *(f"SCR {scr:g}" for scr in scrs)], rows)
+
+
 def _least_damped(modes: list[Mode], low: float, high: float, digits: int) -> str:
     """The oscillation between two frequencies [Hz] that lasts longest, if there is one."""
     for mode in modes:  # in this order
@@ -163,3 +180,4 @@ def inner_stage() -> None:
     loops()
     faults()
     unbalance()
+    sequence()

@@ -68,7 +68,7 @@ class Kernel:
 
     def places(self) -> list[tuple[str, int]]:
         """Where the states of ``LinearStage.states`` are kept; an angle has no place of its own."""
-        short = {name: name for name in ("v_f", "x_v", "x_c", "v_p", "v_n", "i_p", "i_n", "x_n")}
+        short = {name: name for name in ("v_f", "x_v", "x_c", "i_p", "i_n", "E_p", "E_n")}
         short["i*"] = "x_v"
         assert self.loop.stage is not None
         names = [name.split()[0] for name in self.loop.stage.states]

@@ -119,7 +119,7 @@ def linearise_stage(
     _check_limits(inner, op, abs(i_0))
     acts = {"v_f": True, "i*": stator, "x_v": not stator and c["T_k_vi"] > 0.0}
     acts["x_c"] = c["T_k_ci"] > 0.0
-    acts |= dict.fromkeys(("v_p", "v_n", "i_p", "i_n", "x_n"), dual)
+    acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), dual)
     both = [name for name, there in acts.items() if there]
     states = [f"{name} of the inner stage, {axis}" for name in both for axis in "dq"]
     states += ["angle of the PLL", "frequency of the PLL"] if inner.f_pll > 0.0 else []
@@ -130,26 +130,25 @@ def linearise_stage(
     i, v, i_o = (y[k] + 1j * y[k + 1] for k in (NY, NY + 2, NY + 4))
     x = {name: w[2 * k] + 1j * w[2 * k + 1] for k, name in enumerate(both)}
     then = {"v_f": x["v_f"] + c["follow_v"] * (v - x["v_f"])}
-    i_n_ref = v_n = np.zeros(len(w), complex)
     if dual:  # at rest there is no negative sequence, so that the turning of its frame is constant
         h = 2.0 * omega_0 * c["half_turn"]
         h += h**3 * c["third"]
         back = (1.0 - 1j * h) / (1.0 + 1j * h)
-        for z, name in ((v, "v"), (i, "i")):
+
+        def tell_apart(name: str, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
             ahead = back * x[f"{name}_n"]
-            error = c["follow_s"] * (z - x[f"{name}_p"] - ahead)
-            then |= {f"{name}_p": x[f"{name}_p"] + error, f"{name}_n": ahead + error}
-        v_n = then["v_n"]
-        i_n_ref = -v_n / (c["R_n"] - 1j * omega_0 * c["X_n"])
-        then["x_n"] = back * x["x_n"] + c["T_k_n"] * (i_n_ref - then["i_n"])
+            lack = c["follow_s"] * (z - x[f"{name}_p"] - ahead)
+            then.update({f"{name}_p": x[f"{name}_p"] + lack, f"{name}_n": ahead + lack})
+            return ahead + lack
+
+        E = E - tell_apart("E", E) - (c["R_more"] + 1j * c["X_more"]) * x["i_n"]
     if stator:
         lacks = op.e - v_0 - 1j * omega_0 * c["L_f"] * i_0
         i_ref_0 = i_0 if inner.k_ci > 0.0 else i_0 + lacks / c["k_c"]
         turn = 1j * omega_0 * c["half_turn"]
-        drive = c["stator_b"] * (E + v_n - v) - 2j * c["half_turn"] * i_ref_0 * omega
+        drive = c["stator_b"] * (E - v) - 2j * c["half_turn"] * i_ref_0 * omega
         i_ref = ((1.0 - c["stator_a"] - turn) * x["i*"] + drive) / (1.0 + c["stator_a"] + turn)
         then["i*"] = i_ref
-        i_ref = i_ref + i_n_ref
     else:
         Z_v = c["R_v"] + 1j * omega_0 * c["X_v"]
         error = E - Z_v * i_o - 1j * c["X_v"] * i_o_0 * omega - v
@@ -159,7 +158,9 @@ def linearise_stage(
             then["x_v"] = x["x_v"] + c["T_k_vi"] * error
     e = then["v_f"] + c["k_c"] * (i_ref - i) + x.get("x_c", 0.0)
     e = e + 1j * c["L_f"] * (omega_0 * i + i_0 * omega)
-    e = e + then.get("x_n", 0.0)
+    if dual:
+        lead = c["lead_d"] + 1j * c["lead_q"] - 2j * omega_0 * c["L_f"]
+        e = e + lead * tell_apart("i", i_ref)
     if "x_c" in x:
         then["x_c"] = x["x_c"] + c["T_k_ci"] * (i_ref - i)
     rows = [part for name in both for part in (then[name].real, then[name].imag)]

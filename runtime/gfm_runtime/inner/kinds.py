@@ -109,10 +109,8 @@ def shape(law, state):
             dual_sequence(law, state, E_d, E_q)
         else:
             voltage_loop(law, state, E_d, E_q)
-        current_loop(law, state)
-        if law.inner == DUAL:
-            state.e_now[0] += state.x_n[0]
-            state.e_now[1] += state.x_n[1]
+        if law.inner != DUAL:
+            current_loop(law, state)
         most = law.m * state.m[V_DC]
         size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
         if size > most * most:  # the limit of the modulation
@@ -141,8 +139,7 @@ def settle_inner(law, state, e_d, e_q):
     state.x_high, state.x_low, state.limited = 0, 0, 0
     for k in range(2):
         state.v_f[k], state.i_f[k], state.i_ref[k] = m[V_D + k], m[I_D + k], m[I_D + k]
-        state.v_p[k], state.i_p[k] = m[V_D + k], m[I_D + k]
-        state.x_c[k] = state.x_v[k] = state.v_n[k] = state.i_n[k] = state.x_n[k] = 0
+        state.x_c[k] = state.x_v[k] = state.i_n[k] = state.E_n[k] = 0
     state.e[0], state.e[1] = e_d, e_q
     need_d, need_q = state.e[0], state.e[1]  # in the law's own precision
     if law.inner != NONE:
@@ -155,6 +152,7 @@ def settle_inner(law, state, e_d, e_q):
             state.i_ref[1] += lack_q / law.k_c
         through_d, through_q = state.i_ref[0], state.i_ref[1]
         state.x_v[0], state.x_v[1] = through_d, through_q
+        state.i_p[0], state.i_p[1] = through_d, through_q
         state.drop[0] = state.drop[1] = 0
         if law.inner != STATOR and law.inner != DUAL:
             through_d, through_q = settle_voltage_loop(law, state)
@@ -162,6 +160,7 @@ def settle_inner(law, state, e_d, e_q):
         need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
         need_q = m[V_Q] + law.R_v * through_q + X * through_d + state.drop[1]
     state.away[0], state.away[1] = need_d - state.now[2], need_q
+    state.E_p[0], state.E_p[1] = need_d, need_q
 
 
 @compiled

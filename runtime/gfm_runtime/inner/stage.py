@@ -49,11 +49,10 @@ INNER_STATE = (
     ("omega_pll", 1, "frequency of the PLL"),
     ("x_high", 1, "integrals of the power limiter"),
     ("x_low", 1, ""),
-    ("v_p", 2, "positive sequence of v"),
-    ("v_n", 2, "negative sequence of v"),
-    ("i_p", 2, "positive sequence of i"),
-    ("i_n", 2, "negative sequence of i"),
-    ("x_n", 2, "resonant term of the current loop"),
+    ("i_p", 2, "positive sequence of the virtual stator's current"),
+    ("i_n", 2, "negative sequence of the virtual stator's current"),
+    ("E_p", 2, "positive sequence of E"),
+    ("E_n", 2, "negative sequence of E"),
 )
 
 
