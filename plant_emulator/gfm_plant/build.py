@@ -13,6 +13,7 @@ from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.part import Component, Dynamic, Fed, emf
+from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.swing import pack_swing
 from gfm_plant.layout import Record, make_net_and_now
 from gfm_plant.model import V_DC
@@ -51,7 +52,8 @@ def make_plant(options: Plant, T_s: float) -> Network:
         bases = converter.bases
         L, R = bases.to_pu(options.grid.load_L, "L"), bases.to_pu(options.grid.load_R, "R")
         branches.append(Branch(LOAD, FAR, GROUND, L, R))
-    plant = _make({CONVERTER: (options, node)}, T_s, options.grid, FAR, branches=branches)
+    cores = _cores({CONVERTER: (options, node)})
+    plant = _make({CONVERTER: (options, node)}, T_s, options.grid, FAR, cores, branches=branches)
     if options.lcl is not None:  # all that lies between capacitor and grid
         plant.par["L_g"] += line["L_g"]
         plant.par["R_g"] += line["R_g"]
@@ -73,7 +75,7 @@ def make_network(
         ValueError: If there are too many parts, two of one name, converters of different voltages
             or frequencies, a node without a path, or a rate that is too fast for T_s.
     """
-    each = [*parts.components()]
+    each = [*parts.components(), *_cores(converters)]
     elements = [element for _, name, one in each for element in one.elements(name)]
     names = [*converters, *(element.name for element in elements)]
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
@@ -82,6 +84,18 @@ def make_network(
     network = _make(converters, T_s, grid, parts.grid, each, opened)
     network.net["joins"] = 1
     return network
+
+
+def _cores(converters: Mapping[str, tuple[Plant, str]]) -> list[tuple[str, str, Saturation]]:
+    """Table, name and options of the cores of the converters' own transformers."""
+    found, first = [], load_converter(next(iter(converters.values()))[0].converter).S_n
+    for name, (options, _) in converters.items():
+        if options.lcl is not None and (core := options.lcl.saturation) is not None:
+            S = load_converter(options.converter).S_n / first
+            terminal = ConverterCircuit.terminal_of(name)
+            own = Saturation(node=terminal, S=S, knee=core.knee, X_air=core.X_air)
+            found.append(("saturations", f"{name}.core", own))
+    return found
 
 
 def _make(
@@ -194,6 +208,7 @@ def _network(
 
 def _check_paths(wiring: Wiring) -> None:
     """Raise ValueError if a part has no path to a converter."""
+    terminals = {unit.terminal for unit in wiring.units}
     reached = {unit.node for unit in wiring.units}
     while True:
         more = {
@@ -212,7 +227,7 @@ def _check_paths(wiring: Wiring) -> None:
     ends += [(name, one.node) for name, one in wiring.fed]
     ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
     for name, node in ends:
-        if node not in reached | {GROUND}:
+        if node not in reached | terminals | {GROUND}:
             raise ValueError(
                 f"network: {name} is at node {node!r}, which has no path to a converter; nodes with"
                 f" one are {sorted(reached)}"

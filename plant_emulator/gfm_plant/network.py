@@ -93,7 +93,7 @@ class Network:
             u: its commands, (N, 4); for one also (4,), or (3,) without the q component of the
                 bridge's voltage. What closed lines connect turns at one speed.
             rests: unknowns of each component with a source, see ``Fed.steady``, and the speed of
-                its island, p.u.
+                its island, p.u.; none if they have no unknowns and turn with the first converter.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
@@ -105,7 +105,8 @@ class Network:
         volts = {unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(wiring.units)}
         turns = {unit.bridge: float(u[k, 1]) for k, unit in enumerate(wiring.units)}
         volts[GRID_SOURCE], turns[GRID_SOURCE] = complex(now["V_g"]), float(now["omega_g"])
-        fed = [(*item, *rest) for item, rest in zip(self.fed(), rests, strict=True)]
+        resting_at = rests or [(np.empty(0), float(u[0, 1]))] * len(wiring.fed)
+        fed = [(*item, *rest) for item, rest in zip(self.fed(), resting_at, strict=True)]
         for name, one, record, z, omega in fed:
             source = emf(name) if one.is_voltage else name
             turns[source], volts[source] = omega, 0j
@@ -188,7 +189,8 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][order.index(name)] = factor
-    banks = {bank.node: bank.name for bank in reversed(wiring.capacitors)}
+    banks = {unit.terminal: unit.states[1] for unit in wiring.units}
+    banks |= {bank.node: bank.name for bank in reversed(wiring.capacitors)}
     may_lead = wiring.grid is None
     for name, one, record in plant.fed():
         record["sees"] = order.index(one.sees(name, banks))

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, cast
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.saturation import Core
 from gfm_plant.names import SENSED
 from gfm_plant.parameters import (
     Element,
@@ -237,6 +238,9 @@ class SecondInductor(Options):
 
     L: Positive = Field(description="p.u. of the converter")
     R: NonNegative = Field(0.0, description="p.u. of the converter")
+    saturation: Core | None = Field(
+        None, description="the core of the transformer that it is; it does not saturate if none"
+    )
     earthed: bool = Field(
         False,
         description="it is a transformer with a delta on the converter's side and an earthed star "

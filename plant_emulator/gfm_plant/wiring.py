@@ -59,7 +59,12 @@ class ConverterCircuit:
     @property
     def terminal(self) -> str:
         """The node of the filter capacitor."""
-        return f"{self.name}.terminal"
+        return self.terminal_of(self.name)
+
+    @staticmethod
+    def terminal_of(name: str) -> str:
+        """That of the converter of this name."""
+        return f"{name}.terminal"
 
     @property
     def connection(self) -> str:
@@ -255,7 +260,8 @@ class Wiring:
         ends += [one.node for _, one in self.fed if one.is_voltage]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
         ends += [sink.node for sink in self.sinks]
-        return tuple(dict.fromkeys(node for node in ends if node != GROUND))
+        within = {GROUND, *(unit.terminal for unit in self.units)}  # which a core may be at
+        return tuple(dict.fromkeys(node for node in ends if node not in within))
 
     @property
     def split(self) -> str | None:

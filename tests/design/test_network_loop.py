@@ -112,7 +112,9 @@ def with_machine(place: Path | None = None) -> Scenario:
 
 def with_synchronous_machine(place: Path | None = None) -> Scenario:
     machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, "avr": {"K": 50.0}}
-    return island(**{**MACHINE, "machines": {}, "synchronous_machines": {"M": machine}})
+    core = {"core": {"node": "far", "S": 1.0}}
+    parts = {"machines": {}, "synchronous_machines": {"M": machine}, "saturations": core}
+    return island(**{**MACHINE, **parts})
 
 
 def with_finite_grid(place: Path) -> Scenario:

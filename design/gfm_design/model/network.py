@@ -458,7 +458,8 @@ class _Writing:
         self.C, self.C_true = np.zeros((members[-1].y.stop, self.n)), np.zeros((NY * N, self.n))
 
     def _island(self, node: str) -> int:
-        return next(k for k, nodes in enumerate(self.islands) if node in nodes)
+        there = {unit.terminal: unit.node for unit in self.plant.wiring.units}.get(node, node)
+        return next(k for k, nodes in enumerate(self.islands) if there in nodes)
 
     def _linear(self, one: Fed, record: Any) -> LinearPart:
         """A component with a source around its rest."""

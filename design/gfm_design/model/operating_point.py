@@ -140,6 +140,7 @@ class _NetworkRest:
             volts[self.fixed] = self.V_g
         at = self.island_of
         speeds = {n: float(omegas[at[n]]) if n in at else self.omega_g for n in self.wiring.nodes}
+        speeds |= {unit.terminal: speeds[unit.node] for unit in self.wiring.units}
         return own, volts, speeds
 
     def residual(self, z: Vector) -> Vector:
@@ -153,6 +154,8 @@ class _NetworkRest:
             rows.append(side.residual(mine, abs(v), omega, cmath.phase(v)))
             i_o = complex(mine[4], mine[5]) * cmath.exp(1j * mine[DELTA])
             missing[unit.node] += i_o / float(side.par[0]["current"])
+            volts[unit.terminal] = complex(mine[2], mine[3]) * cmath.exp(1j * mine[DELTA])
+            missing[unit.terminal] = 0j  # of a core, which draws nothing at rest
         for branch in wiring.branches:
             if branch.name not in wiring.opened:
                 ends_of = volts.get(branch.start, 0j) - volts.get(branch.end, 0j)

@@ -135,11 +135,11 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
             rests = list[tuple[NDArray[np.float64], float]]()
         else:
             starts, rests = operating_points(plant, laws, refs)
+        x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
+        plant.start(x, u, rests)
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
-    plant.start(x, u, rests)
     inner = scenario.has_inner
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):

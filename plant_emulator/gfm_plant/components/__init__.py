@@ -17,6 +17,7 @@ from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
 from gfm_plant.components.part import Component, Dynamic, Fed
+from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
 from gfm_plant.parameters import Options
@@ -31,6 +32,7 @@ class NetworkParts(Options):
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
     transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
+    saturations: dict[str, Saturation] = Field({}, description="of transformers, by name")
     loads: dict[str, Load] = Field({}, description="by name")
     constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
