@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_plant.bridge import LEVELS, bands
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
@@ -128,6 +129,7 @@ def _make(
         one["T_s"], one["delay"] = T_s, options.delay.samples
         one["fraction"] = options.delay.fraction
         _pack_protection(one, options.protection, T_s)
+        _pack_bridge(one, "plant" if each == () else f"network.converters.{name}", options, T_s)
     passive = [p for _, n, x in each if not isinstance(x, Fed) for p in x.elements(n)]
     fed = sorted(
         ((name, one) for _, name, one in each if isinstance(one, Fed)),
@@ -147,7 +149,13 @@ def _make(
     dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
     if grid.finite is not None and grid_node is not None:
         dynamic.append(("plant.grid.finite", "", grid.finite))
-    network = _network(par, st, wiring, T_s, dynamic, measured)
+    carriers, updates = _carrier(converters, T_s)
+    if carriers and dynamic:
+        raise ValueError(
+            f"{dynamic[0][0]}: cannot be beside a switched bridge yet; set bridge.kind = 'average'"
+        )
+    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates)
+    network.net["updates"] = updates
     network.net["batteries"] = par["energy"].any()
     now = network.now
     st["x"][:, V_DC] = 1.0
@@ -168,12 +176,14 @@ def _network(
     T_s: float,
     dynamic: Sequence[tuple[str, str, Dynamic]],
     measured: bool,
+    units_of_carrier: int,
 ) -> Network:
     """Return a plant whose circuits are still to be made.
 
     Args:
         dynamic: table, name and options of each component with a record.
         measured: whether p, q and V of the connection points are looked at.
+        units_of_carrier: see ``net_dtype``.
     """
     cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
@@ -185,9 +195,12 @@ def _network(
         len(cuts) - 1,
         len(par) + len(lags),
         measured,
+        units_of_carrier,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)
+    if units_of_carrier:
+        _pack_units(net, cuts)
     parts = []
     for kind in DYNAMIC:
         those = [item for item in dynamic if isinstance(item[2], kind)]
@@ -290,6 +303,88 @@ def _pack_timing(par: Record, net: Record, cuts: Sequence[float]) -> None:
     newest = par["delay"] - (1 if min(par["delay"]) > 0 else 0)
     for part, begin in enumerate(cuts[:-1]):
         net["age"][0, part] = newest + (begin < par["fraction"])
+
+
+_LEAST_COUNTS = 50
+"""Of a timer in half a period of the carrier: a count is then 2 % of v_dc."""
+
+
+def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
+    """Pack a switched bridge, if it is one.
+
+    Raises:
+        ValueError: its times or its timer do not fit.
+    """
+    bridge, where = options.bridge, f"{where}.bridge"
+    if bridge.kind == "average":
+        return
+    carriers = 1.0 if bridge.carrier_hz is None else bridge.carrier_hz * T_s
+    if min(abs(carriers - 1), abs(carriers - 2)) > 1e-9:
+        raise ValueError(
+            f"{where}.carrier_hz = {bridge.carrier_hz:g}: must be {1 / T_s:g} or {2 / T_s:g} Hz, so"
+            " that a tick samples where the ripple passes zero"
+        )
+    period = T_s / round(carriers)
+    counts = bridge.timer_hz * period / 2
+    if abs(counts - round(counts)) > 1e-6 * counts:
+        raise ValueError(
+            f"{where}.timer_hz = {bridge.timer_hz:g}: must be a multiple of {2 / period:g} Hz, so"
+            " that half a period of the carrier is a whole number of counts"
+        )
+    if counts < _LEAST_COUNTS:
+        raise ValueError(
+            f"{where}.timer_hz = {bridge.timer_hz:g}: too coarse, {counts:g} counts in half a"
+            f" period of the carrier; must be at least {_LEAST_COUNTS * 2 / period:g} Hz"
+        )
+    for name, most in (("dead_time_s", period / 2), ("min_pulse_s", period)):
+        if not (value := getattr(bridge, name)) < most:
+            raise ValueError(
+                f"{where}.{name} = {value:g}: must be less than {most:g} s,"
+                f" {'half a' if name == 'dead_time_s' else 'a'} period of the carrier"
+            )
+    units = round(carriers) * bridge.updates
+    if abs(options.delay.fraction * units - round(options.delay.fraction * units)) > 1e-9:
+        raise ValueError(
+            f"plant.delay.fraction = {options.delay.fraction:g}: compare values are loaded"
+            f" {units} times a period, so it must be a multiple of {1 / units:g}"
+        )
+    bases = load_converter(options.converter).bases
+    par["levels"], par["off"] = LEVELS[bridge.kind]
+    par["counts"], par["count_s"] = round(counts), 1 / bridge.timer_hz
+    par["dead"] = bridge.dead_time_s
+    par["least"] = round(bridge.min_pulse_s / 2 * bridge.timer_hz)
+    par["leg"] = math.sqrt(2 / 3) * bases.V_dcref / bases.V_n
+    V, R = bases.V_dcref, bases.base_of("R")
+    drops = bridge.V_switch / V, bridge.V_diode / V, bridge.R_switch / R, bridge.R_diode / R
+    par["band"] = found = bands(bridge.kind, drops)
+    par["wide"] = [bool((one[0] * [1, 1, 1, 1] != one[1]).any()) for one in found]
+
+
+def _carrier(converters: Mapping[str, tuple[Plant, str]], T_s: float) -> tuple[int, int]:
+    """Return the periods of the carrier in T_s, 0 if no bridge is switched, and how often compare
+    values are loaded in one.
+
+    Raises:
+        ValueError: the bridges differ.
+    """
+    found = {
+        (0, 1) if b.kind == "average" else (round((b.carrier_hz or 1 / T_s) * T_s), b.updates)
+        for b in (options.bridge for options, _ in converters.values())
+    }
+    if len(found) > 1:
+        raise ValueError(
+            "bridge: where one bridge of a network is switched all must be, with one carrier_hz and"
+            " one updates"
+        )
+    return found.pop()
+
+
+def _pack_units(net: Record, cuts: Sequence[float]) -> None:
+    """Say which command acts in each unit of the carrier."""
+    units = int(net["n_units"][0])
+    net["unit_s"] = net["T_s"] / units
+    begins = np.arange(units) / units
+    net["unit_part"] = np.searchsorted(cuts, begins + 1e-9, "right") - 1
 
 
 def _pack_measurement(par: Record, options: Plant) -> None:

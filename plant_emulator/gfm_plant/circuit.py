@@ -107,6 +107,38 @@ class Modes:
     mirror: NDArray[np.complex128]
 
 
+@dataclass(frozen=True)
+class Rates:
+    """What ``find_rates`` returns: w' = by_w w + by_s s in the frame that stands still.
+
+    Attributes:
+        by_w, by_s: (n_w, n_w) and (n_w, n_s), 1/s; rows of states that the circuit does not have
+            are zero.
+        fastest: the norm of ``by_w`` in energy coordinates, 1/s.
+    """
+
+    by_w: NDArray[np.float64]
+    by_s: NDArray[np.float64]
+    fastest: float
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """The circuit in energy coordinates q = K' (root w): q' = omega_b K' (M / root / root) K q +
+    omega_b K' (B / root) s.
+
+    Attributes:
+        names: of the states, branches before capacitors; M, B: of the stored quantities; root: of
+            their L and C; K: columns that are an orthonormal basis of what the nodes allow.
+    """
+
+    names: list[str]
+    M: NDArray[np.float64]
+    B: NDArray[np.float64]
+    root: NDArray[np.float64]
+    K: NDArray[np.float64]
+
+
 def find_modes(
     branches: Sequence[Branch],
     capacitors: Sequence[Capacitor],
@@ -144,6 +176,59 @@ def _find_modes(
     shunts: tuple[Shunt, ...],
     sinks: tuple[CurrentSource, ...],
 ) -> Modes:
+    one = _reduce(branches, capacitors, sources, shunts, sinks)
+    M, B, root, K = one.M, one.B, one.root, one.K
+    A = omega_b * K.T @ (M / root[:, None] / root) @ K - 1j * omega_b * np.eye(K.shape[1])
+    rates, X = np.linalg.eig(A)
+    if not np.linalg.cond(X) < WORST_CONDITION:
+        raise ValueError("the circuit's modes cannot be told apart: change one element a little")
+    at = [order.index(name) for name in one.names]
+    states = np.zeros((len(order), len(rates)), complex)
+    modes = np.zeros((len(rates), len(order)), complex)
+    states[at] = (K @ X) / root[:, None]
+    modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
+    drive = np.zeros((len(rates), B.shape[1]), complex)
+    drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
+    mirror = np.zeros(len(rates), complex)
+    for array in (rates, states, modes, drive, mirror):
+        array.flags.writeable = False
+    return Modes(rates, states, modes, drive, mirror)
+
+
+def find_rates(
+    branches: Sequence[Branch],
+    capacitors: Sequence[Capacitor],
+    sources: Sequence[VoltageSource],
+    omega_b: float,
+    order: Sequence[str],
+    shunts: Sequence[Shunt] = (),
+    sinks: Sequence[CurrentSource] = (),
+) -> Rates:
+    """Return the equations of a circuit as they are, for whom solves them by a series; arguments
+    and errors as for ``find_modes``."""
+    parts = tuple(branches), tuple(capacitors), tuple(sources)
+    one = _reduce(*parts, tuple(shunts), tuple(sinks))
+    P = one.K @ one.K.T
+    A = omega_b * P @ (one.M / one.root[:, None] / one.root) @ P
+    fastest = float(np.linalg.norm(A, 2))
+    A[np.abs(A) < 1e-13 * fastest] = 0.0  # rounding of P
+    drive = P @ (one.B / one.root[:, None])
+    drive[np.abs(drive) < 1e-13 * np.abs(drive).max(initial=0.0)] = 0.0
+    at = [order.index(name) for name in one.names]
+    by_w = np.zeros((len(order), len(order)))
+    by_w[np.ix_(at, at)] = A / one.root[:, None] * one.root
+    by_s = np.zeros((len(order), drive.shape[1]))
+    by_s[at] = omega_b * drive / one.root[:, None]
+    return Rates(by_w, by_s, fastest)
+
+
+def _reduce(
+    branches: tuple[Branch, ...],
+    capacitors: tuple[Capacitor, ...],
+    sources: tuple[VoltageSource, ...],
+    shunts: tuple[Shunt, ...],
+    sinks: tuple[CurrentSource, ...],
+) -> _Reduced:
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
     for name, value in stored.items():
         if not value > 0:
@@ -191,21 +276,7 @@ def _find_modes(
 
     root = np.sqrt(list(stored.values()))
     K = null_space(np.array(list(meets.values())) / root) if meets else np.eye(n_b + n_c)
-    A = omega_b * K.T @ (M / root[:, None] / root) @ K - 1j * omega_b * np.eye(K.shape[1])
-    rates, X = np.linalg.eig(A)
-    if not np.linalg.cond(X) < WORST_CONDITION:
-        raise ValueError("the circuit's modes cannot be told apart: change one element a little")
-    at = [order.index(name) for name in stored]
-    states = np.zeros((len(order), len(rates)), complex)
-    modes = np.zeros((len(rates), len(order)), complex)
-    states[at] = (K @ X) / root[:, None]
-    modes[:, at] = np.linalg.solve(X, K.T.astype(complex)) * root
-    drive = np.zeros((len(rates), n_s), complex)
-    drive[:] = omega_b * np.linalg.solve(X, K.T @ (B / root[:, None]))
-    mirror = np.zeros(len(rates), complex)
-    for array in (rates, states, modes, drive, mirror):
-        array.flags.writeable = False
-    return Modes(rates, states, modes, drive, mirror)
+    return _Reduced(list(stored), M, B, root, K)
 
 
 def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:

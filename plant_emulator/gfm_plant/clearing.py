@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gfm_plant.bridge import advance_bridges
 from gfm_plant.layout import field
-from gfm_plant.period import advance, go_back, keep
+from gfm_plant.period import advance as advance_averages
+from gfm_plant.period import go_back, keep
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import circuit, enter, mirror_sources
 from gfm_runtime.compiled import compiled
@@ -54,6 +56,15 @@ def advance_clearing(plant: PlantRecords) -> None:
         keep(plant)
         begin = first
     advance(plant, begin, math.inf)
+
+
+@compiled
+def advance(plant: PlantRecords, begin: float, end: float) -> None:
+    """Go on between two instants of the period, s after its beginning; inf: to its end."""
+    if plant.net[0].n_units:
+        advance_bridges(plant, begin, end)
+    else:
+        advance_averages(plant, begin, end)
 
 
 @compiled

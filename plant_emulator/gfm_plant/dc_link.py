@@ -30,7 +30,7 @@ def limit_dc_source(r: Any, s: Any) -> None:
 
 
 @inlined
-def _discharge(r: Any, s: Any, h: float, v_0: float, v_1: float, v_2: float) -> None:
+def discharge(r: Any, s: Any, h: float, v_0: float, v_1: float, v_2: float) -> None:
     """Take from the battery what the source has given in h s, in which v_dc went from v_0 by v_1 to
     v_2: what the bridge and the chopper drew, and what has stayed in C_dc; and what its own
     resistance loses. Its open-circuit voltage is 1 p.u.: R i^2 - i + P = 0."""
@@ -117,7 +117,7 @@ def advance_dc_link(r: Any, s: Any, half_h: float) -> tuple[float, float]:
         steps *= _FINER
     s.x[V_DC], s.i_reg, s.i_source = v, i, j
     if r.energy > 0.0:
-        _discharge(r, s, 2.0 * half_h, v_0, v_middle, v)
+        discharge(r, s, 2.0 * half_h, v_0, v_middle, v)
     return v_middle, v
 
 

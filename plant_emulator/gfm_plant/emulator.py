@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.bridge import advance_bridges
 from gfm_plant.clearing import advance_clearing, begin_clearing
 from gfm_plant.components import every_at_rest, every_tick
 from gfm_plant.dc_link import limit_dc_source
@@ -51,6 +52,9 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
         if r.i_u_gain == 0.0:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
+        s.ahead = complex(1.0, 0.0)
+        for x in range(3):  # a period of the carrier begins at its lower end, all legs above it
+            s.level[x], s.gate[x], s.on_at[x] = r.levels - 1, 2 * (r.levels - 1), math.inf
         s.soc, s.i_most[0], s.i_most[1] = r.soc[0], r.i_max, -r.i_max
         limit_dc_source(r, s)
     every_at_rest(plant, circuit(n, now), 0)
@@ -107,6 +111,8 @@ def plant_step(plant: PlantRecords) -> None:
         mirror_sources(n, now, plant.st[0].tick)
     if now.clearing:
         advance_clearing(plant)
+    elif n.n_units:
+        advance_bridges(plant, 0.0, n.T_s)
     else:
         for part in range(n.n_parts):
             stretch(plant, part)
@@ -222,7 +228,7 @@ def synchronise(plant: PlantRecords, k: int) -> None:
     for age in range(MAX_DELAY + 2):
         for j in range(N_COMMANDS):
             s.u[age, j] = s.u_now[j]
-    s.E[0], s.E[1] = size, 0.0
+    s.E[0], s.E[1], s.mid = size, 0.0, 0.0
     s.looked = 0
     s.sums[0] = s.sums[1] = s.i_rms = 0.0
     for j in range(len(s.crossed)):

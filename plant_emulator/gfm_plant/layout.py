@@ -29,6 +29,9 @@ CHECK_SIDES = 2
 Record = NDArray[np.void]
 _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
 
+TERMS = 24
+"""Of the series of a switched bridge, at most."""
+
 _NET: _Arrays = {
     "to_grid": (float, ("n_w",)),  # what each state of w brings to the grid, as a current
     # one sampling period in stretches, between the instants at which a command begins to act; each
@@ -63,6 +66,17 @@ _NET: _Arrays = {
     "node_s": (float, ("n_c", "n_nodes", 2, "n_s")),
     "node_turn": (complex, ("n_c",)),
     "node_i": (int, ("n_nodes",)),
+    # with switched bridges, see `series`: which cut of the period each unit of the carrier belongs
+    # to; of each circuit e^(-j angle) of its axis alpha, its fastest rate, 1/s; of each converter
+    # what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both axes, 1/s; the
+    # other entries of w' = A w + B s: how many, row and column, values on both axes
+    "unit_part": (int, ("n_units",)),
+    "axis": (complex, ("n_rates",)),
+    "fastest": (float, ("n_rates",)),
+    "own_rates": (float, ("n_rates", "n_converters", 2, 5)),
+    "n_links": (int, ("n_rates", 2)),
+    "link_place": (int, ("n_rates", 2, "n_entries", 2)),
+    "link": (float, ("n_rates", 2, "n_entries", 2)),
 }
 _NOW: _Arrays = {
     # modes, what drives them in the first and in the second half of the present piece, and states
@@ -79,6 +93,14 @@ _NOW: _Arrays = {
     "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
     "w_before": (complex, ("n_w",)),  # at the last tick
     "unit_before": (complex, ("n_s",)),
+    # with switched bridges: the terms of the series of w and of the DC links (v_dc, i_reg,
+    # i_source, mid), for the length of an interval; the same of the sources, whose next term
+    # follows from the last one, and their speeds, 1/s
+    "terms": (complex, ("n_terms", "n_w")),
+    "dc_terms": (float, ("n_terms", "n_converters", 4)),
+    "source": (complex, ("n_s",)),
+    "source_term": (complex, ("n_s",)),
+    "source_speed": (float, ("n_s",)),
 }
 
 
@@ -96,6 +118,11 @@ net_dtype = _header(
         ("T_s", "f8"),
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
+        # units of a switched bridge's carrier in a period, between two loads of compare values (0:
+        # no bridge is switched); how many go into a period of the carrier; s of one
+        ("n_units", "i8"),
+        ("updates", "i8"),
+        ("unit_s", "f8"),
         # whether p, q and V of the connection points, and the charge of batteries, are recorded
         ("connections", "i8"),
         ("batteries", "i8"),
@@ -152,7 +179,13 @@ now_dtype = _header(
 
 
 def make_net_and_now(
-    converters: int, states: int, sources: int, parts: int, lags: int, connections: bool
+    converters: int,
+    states: int,
+    sources: int,
+    parts: int,
+    lags: int,
+    connections: bool,
+    units: int = 0,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -163,12 +196,15 @@ def make_net_and_now(
         parts: stretches of the sampling period.
         lags: first-order lags, one of each converter's sensors included.
         connections: whether p, q and V of the converters' connection points are looked at.
+        units: of a switched bridge's carrier in a period, 0: none is switched.
     """
     lengths = {
         "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
         "n_phasors": 2 * sources, "n_contacts": MOST_CONTACTS,
         "n_c": MOST_CONTACTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
+        "n_units": units, "n_rates": MOST_CONTACTS * (converters + 1) if units else 0,
+        "n_entries": states * max(states, sources), "n_terms": TERMS if units else 0,
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
     net["connections"] = connections

@@ -215,6 +215,8 @@ def _connect(plant: Network, wiring: Wiring) -> None:
         net["modes"][circuit, :n, : len(order)] = modes.modes
         net["mirror"][circuit, :n] = modes.mirror
         net["unbalanced"][circuit] = modes.mirror.any()
+        if net["n_units"]:
+            _pack_rates(plant, wiring, circuit, *which[circuit])
         net["drive"][circuit] = 0.0
         for j, source in enumerate(sources):
             net["drive"][circuit, :n, places[source]] = modes.drive[:, j]
@@ -228,6 +230,49 @@ def _connect(plant: Network, wiring: Wiring) -> None:
             net["node_w"][circuit, place, :, : len(order)] = by_w
             for factors, source in zip(by_s.T, sources, strict=False):  # sinks follow
                 net["node_s"][circuit, place, :, places[source]] = factors
+
+
+def _pack_rates(
+    plant: Network, wiring: Wiring, circuit: int, blocked: frozenset[int], contact: Any
+) -> None:
+    """Set the equations of a circuit for `series`: what a converter's own states do to each other,
+    and a list of all else."""
+    net, N, places = plant.net[0], len(wiring.units), wiring.sources()
+    axes, angle, names = wiring.rates(blocked, contact)
+    net["axis"][circuit] = np.exp(-1j * angle)
+    net["fastest"][circuit] = max(one.fastest for one in axes) + max(
+        _fastest_with_dc(r) for r in plant.par
+    )
+    by_w = [one.by_w.copy() for one in axes]
+    for k in range(N):
+        i_f, v, i_o = range(N_OWN * k, N_OWN * (k + 1))
+        for axis, A in enumerate(by_w):
+            for j, at in enumerate(((v, i_f), (v, v), (v, i_o), (i_o, v), (i_o, i_o))):
+                net["own_rates"][circuit, k, axis, j], A[at] = A[at], 0.0
+            A[i_f] = 0.0  # is the bridge's
+    by_s = [np.zeros((len(one.by_s), len(places) + 1)) for one in axes]
+    for one, factors in zip(axes, by_s, strict=True):
+        for column, name in zip(one.by_s.T, names, strict=True):
+            if places[name] >= N:
+                factors[:, places[name]] = column
+            if name == GRID_SOURCE:  # its negative sequence
+                factors[:, places[name] + 1] = column
+    for which, (alpha, beta) in enumerate((by_w, by_s)):
+        entries = np.argwhere((alpha != 0) | (beta != 0))
+        net["n_links"][circuit, which] = len(entries)
+        net["link_place"][circuit, which, : len(entries)] = entries
+        for axis, factors in enumerate((alpha, beta)):
+            net["link"][circuit, which, : len(entries), axis] = factors[tuple(entries.T)]
+
+
+def _fastest_with_dc(r: Any) -> float:
+    """A bound of what the DC link of a converter adds to the fastest rate, 1/s."""
+    per_C = r["omega_b"] / r["C_dc"]
+    found = math.sqrt(per_C * r["omega_b"] / r["L_f"]) * 3 * r["leg"] + per_C * r["k_p"]
+    found += math.sqrt(per_C * r["k_i"]) + per_C * r["chopper"][0]
+    R = float(r["band"][:, :, 3].max())
+    found += r["omega_b"] * R / r["L_f"]
+    return float(found + (1 / r["tau_dc"] if r["tau_dc"] > 0.0 else 0.0))
 
 
 def _nodes(net: Any, wiring: Wiring) -> dict[int, str]:

@@ -232,6 +232,33 @@ def _part_is_enough(schema: dict[str, Any]) -> None:
     schema.pop("required")  # ``Protection`` completes it
 
 
+class Bridge(Options):
+    """The bridge: its average over a period, or the switches themselves."""
+
+    kind: Literal["average", "two-level"] = Field(
+        "average",
+        description="average: a voltage that follows the command; two-level: six switches with "
+        "diodes, modulated by space vectors",
+    )
+    carrier_hz: Positive | None = Field(
+        None, description="of the symmetrical carrier, 1/T_s or 2/T_s; 1/T_s if none"
+    )
+    updates: Literal[1, 2] = Field(
+        1, description="how often the compare values are loaded in a period of the carrier"
+    )
+    timer_hz: Positive = Field(200e6, description="clock of the timer that the carrier counts")
+    dead_time_s: NonNegative = Field(
+        0.0, description="from turning one switch of a leg off to turning the other one on, s"
+    )
+    min_pulse_s: NonNegative = Field(
+        0.0, description="shorter pulses are left out or made as long, whichever is nearer, s"
+    )
+    V_switch: NonNegative = Field(0.0, description="threshold of a switch that conducts, V")
+    R_switch: NonNegative = Field(0.0, description="on-state resistance of a switch, ohm")
+    V_diode: NonNegative = Field(0.0, description="threshold of a diode, V")
+    R_diode: NonNegative = Field(0.0, description="on-state resistance of a diode, ohm")
+
+
 class SecondInductor(Options):
     """The second inductor of an LCL filter, or the leakage of the converter's own transformer,
     between filter capacitor and point of connection."""
@@ -328,6 +355,7 @@ class Plant(Options):
         description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
         "the current of L_f stays within; none if not given",
     )
+    bridge: Bridge = Field(Bridge(), description="averaged, or switched and still solved exactly")
     lcl: SecondInductor | None = Field(
         None,
         description="second inductor of the filter, or the converter's own transformer; the line, "
@@ -354,6 +382,10 @@ class Plant(Options):
         if given and self.grid.scr is not None:
             raise ValueError(
                 f"grid.scr = {self.grid.scr:g}: sets the line; leave out {' and '.join(given)}"
+            )
+        if self.bridge.kind != "average" and self.i_peak is not None:
+            raise ValueError(
+                f"i_peak = {self.i_peak:g}: is a limit of bridge.kind = 'average'; leave one out"
             )
         return self
 

@@ -50,6 +50,8 @@ def keep(plant: PlantRecords) -> None:
             s.before[4 + j] = s.sensed[j]
         s.before[8], s.before[9], s.before[10] = s.E_most, s.E_commanded[0], s.E_commanded[1]
         s.before[11] = s.soc
+        if n.n_units:
+            _keep_legs(s)
     unit, unit_before = field(now, "unit"), field(now, "unit_before")
     for k in range(now.n_s):
         unit_before[k] = unit[k]
@@ -72,6 +74,8 @@ def go_back(plant: PlantRecords) -> None:
             s.sensed[j] = s.before[4 + j]
         s.E_most, s.E_commanded[0], s.E_commanded[1] = s.before[8], s.before[9], s.before[10]
         s.soc = s.before[11]
+        if n.n_units:
+            _legs_go_back(s)
     unit, unit_before = field(now, "unit"), field(now, "unit_before")
     for k in range(now.n_s):
         unit[k] = unit_before[k]
@@ -82,13 +86,31 @@ def go_back(plant: PlantRecords) -> None:
 
 
 @inlined
+def _keep_legs(s: Any) -> None:
+    b = s.legs_before
+    for x in range(3):
+        b[0, x], b[1, x], b[2, x], b[3, x] = s.gate[x], s.level[x], s.on_at[x], s.base[x]
+        b[4, x], b[5, x] = s.edges[x, 0], s.edges[x, 1]
+    b[6, 0], b[6, 1], b[6, 2] = s.mid, s.limit, s.winds
+
+
+@inlined
+def _legs_go_back(s: Any) -> None:
+    b = s.legs_before
+    for x in range(3):
+        s.gate[x], s.level[x], s.base[x] = int(b[0, x]), int(b[1, x]), int(b[3, x])
+        s.on_at[x], s.edges[x, 0], s.edges[x, 1] = b[2, x], b[4, x], b[5, x]
+    s.mid, s.limit, s.winds = b[6, 0], b[6, 1], b[6, 2]
+
+
+@inlined
 def stretch(plant: PlantRecords, part: int) -> None:
     """Go on by one stretch of the period, under the commands that act in it."""
     n, now = plant.net[0], plant.now[0]
     for k in range(n.n_converters):
-        _take_command(plant, k, part)
+        take_command(plant, k, part)
         # the modulator divides by the v_dc that it has at the beginning of its period
-        _limit(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
+        limit_voltage(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
     c, cut = circuit(n, now), part
     for k in range(n.n_converters):
         if _may_peak(plant, k, part):
@@ -121,9 +143,9 @@ def _part_of_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> 
     n, now = plant.net[0], plant.now[0]
     peaks = False
     for k in range(n.n_converters):
-        _take_command(plant, k, part)
+        take_command(plant, k, part)
         if begins:
-            _limit(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
+            limit_voltage(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
         peaks = peaks or _may_peak(plant, k, part)
     c = circuit(n, now)
     cut = cut_to(n, now, c, h, 2.0 * field(n, "half_h")[part + (n.n_parts if peaks else 0)])
@@ -137,7 +159,7 @@ def _part_of_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> 
 
 
 @inlined
-def _take_command(plant: PlantRecords, k: int, part: int) -> None:
+def take_command(plant: PlantRecords, k: int, part: int) -> None:
     """Set the command that acts in a stretch; a blocked bridge turns as the grid does."""
     n, now, s = plant.net[0], plant.now[0], plant.st[k]
     if s.trip == 0:
@@ -148,7 +170,7 @@ def _take_command(plant: PlantRecords, k: int, part: int) -> None:
 
 
 @inlined
-def _limit(s: Any, most: float) -> None:
+def limit_voltage(s: Any, most: float) -> None:
     """Set the bridge's voltage by the command that acts, within what the DC link gives."""
     s.E_most = most
     s.E[0], s.E[1] = s.u_now[2], s.u_now[3]

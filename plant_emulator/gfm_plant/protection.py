@@ -64,22 +64,26 @@ def turn(a: complex, b: complex) -> float:
 def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
     """Latch a trip of converter k, if none is latched: its bridge blocks, its DC source turns off.
 
-    The current of L_f is taken as interrupted at once. From here on the plant ignores the
+    The current of L_f is taken as interrupted at once; that of a switched bridge goes on through
+    its diodes. From here on the plant ignores the
     converter's commands; its frame turns with the grid. The circuits are at hand for one converter
     that trips; a second one trips a tick later, when Python has made those for two
     (`gfm_plant.grid.take_out`).
     """
     s, n, now = plant.st[k], plant.net[0], plant.now[0]
-    if s.trip == 0 and now.row == 0:
+    switched = n.n_units > 0
+    if s.trip == 0 and (now.row == 0 or switched):
         s.trip = reason
         s.trip_tick = s.tick
         s.trip_value = value
         s.waits, s.omega_seen = NOT_ASKED, s.u_now[1]
         i = own(k) + I_F
-        s.x[0] = s.x[1] = s.i_source = s.E[0] = s.E[1] = 0.0
-        field(now, "w")[i] = 0j
-        now.row = 1 + k
-        enter(n, now, plant.st[0].tick, circuit(n, now))
+        s.i_source = s.E[0] = s.E[1] = 0.0
+        if not switched:
+            s.x[0] = s.x[1] = 0.0
+            field(now, "w")[i] = 0j
+            now.row = 1 + k
+            enter(n, now, plant.st[0].tick, circuit(n, now))
         s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
 
 

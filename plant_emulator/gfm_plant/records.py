@@ -20,6 +20,7 @@ N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o
 N_MEASURED, N_COMMANDS = 10, 4  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
+N_GATES = 6  # states of the gates of a leg, at most, see `bridge`
 N_RING = 256  # places of a ring that holds one cycle
 
 
@@ -73,6 +74,21 @@ converter_par_dtype = np.dtype(
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
         ("i_peak", "f8"),
+        # a switched one (0 levels: it is averaged), see `bridge`: levels of a leg, gates that block
+        # it; counts of the timer in half a carrier, and s of one; dead time, s; the shortest half
+        # of a pulse, counts; the space vector of a leg's voltage in p.u. of v_dc. For each state of
+        # the gates whether the leg's voltage depends on its current, and its least and its largest
+        # voltage as factors of v_dc and of the midpoint's displacement, p.u. of v_dc, and p.u. of
+        # resistance
+        ("levels", "i8"),
+        ("off", "i8"),
+        ("counts", "i8"),
+        ("count_s", "f8"),
+        ("dead", "f8"),
+        ("least", "i8"),
+        ("leg", "f8"),
+        ("wide", "i8", (N_GATES,)),
+        ("band", "f8", (N_GATES, 2, 4)),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
@@ -125,6 +141,34 @@ converter_state_dtype = np.dtype(
         ("seen", "f8", (3, 3)),
         ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
+        # the legs of a switched bridge: gates, commanded level, sign of the current where it
+        # decides (0: there is none), and when the next gate turns on, s from the beginning of the
+        # unit; of this unit the level below the carrier and the edges down and up, s
+        ("gate", "i8", (3,)),
+        ("level", "i8", (3,)),
+        ("flows", "i8", (3,)),
+        ("on_at", "f8", (3,)),
+        ("base", "i8", (3,)),
+        ("edges", "f8", (3, 2)),
+        # v of the upper less that of the lower half of C_dc, p.u. of v_dc; at which limit the DC
+        # source is, and whether its integral goes on; legs without current: none (-1), one, all (3)
+        ("mid", "f8"),
+        ("limit", "f8"),
+        ("winds", "f8"),
+        ("open", "i8"),
+        # of the interval between two edges: the bridge's voltage by v_dc, by mid and by nothing, as
+        # a space vector, and what they and the voltage at its terminal, and the current, do to the
+        # current, 1/s
+        ("by_dc", "c16"),
+        ("by_mid", "c16"),
+        ("di_dc", "c16"),
+        ("di_mid", "c16"),
+        ("di", "c16"),
+        ("di_v", "f8", (3,)),
+        ("di_i", "f8", (4,)),
+        # the bridge's frame, as a phasor that stands still
+        ("ahead", "c16"),
+        ("legs_before", "f8", (7, 3)),
         # when kept: delta, v_dc, DC source (3), sensors (4), and what the bridge was commanded (3)
         ("before", "f8", (12,)),
         # protection: ticks in a row that each threshold was crossed, and the latched trip

@@ -253,7 +253,7 @@ def cut_to(n: Any, now: Any, c: int, h: float, longest: float) -> int:
     for k in range(now.n_phasors):
         known[cut, k] = math.inf
     for k in range(len(lags)):
-        weights[cut, k, 0], f_1, f_2, f_3 = _integrals(2.0 * half * lags[k])
+        weights[cut, k, 0], f_1, f_2, f_3 = integrals(2.0 * half * lags[k])
         x = 2.0 * half * lags[k]
         weights[cut, k, 1] = x * (f_1 - 3.0 * f_2 + 4.0 * f_3)
         weights[cut, k, 2] = x * (4.0 * f_2 - 8.0 * f_3)
@@ -262,7 +262,7 @@ def cut_to(n: Any, now: Any, c: int, h: float, longest: float) -> int:
 
 
 @compiled
-def _integrals(x: float) -> tuple[float, float, float, float]:
+def integrals(x: float) -> tuple[float, float, float, float]:
     """Return e^-x and the integrals over t from 0 to 1 of e^(-x (1 - t)) t^(k - 1) / (k - 1)! for
     k = 1, 2, 3."""
     if x > 1.0:

@@ -20,9 +20,11 @@ from gfm_plant.circuit import (
     Capacitor,
     CurrentSource,
     Modes,
+    Rates,
     Shunt,
     VoltageSource,
     find_modes,
+    find_rates,
     find_voltage,
     join_axes,
 )
@@ -408,6 +410,20 @@ class Wiring:
             return found[0], names
         alpha, beta = found
         return join_axes(alpha, beta, contact.angle), names
+
+    def rates(
+        self, blocked: frozenset[int], contact: Contact | None
+    ) -> tuple[list[Rates], float, list[str]]:
+        """The equations of a circuit on the axis alpha and on the axis beta, the angle of alpha,
+        rad, and the names of the sources and sinks; arguments and errors as for ``modes``."""
+        sinks = [sink for sink in self.sinks if sink.name not in self.opened]
+        found = []
+        for axis in (ALPHA, BETA):
+            branches, capacitors, sources, shunts, _ = self._circuit(blocked, contact, axis)
+            parts = branches, capacitors, sources
+            found.append(find_rates(*parts, self.omega_b, self.order, shunts, sinks))
+        names = [part.name for part in sources] + [part.name for part in sinks]
+        return found, 0.0 if contact is None or contact.balanced else contact.angle, names
 
     def zero_sequence(self) -> complex | None:
         """The impedance between the place of the fault and ground for a zero sequence at nominal

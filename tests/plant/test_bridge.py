@@ -1,0 +1,255 @@
+"""The switched bridge: against DOP853 with the same edges, against closed forms, against the
+averaged bridge, and what it refuses."""
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from gfm_plant import Plant, fault, make_plant, plant_advance, plant_equilibrium
+from gfm_plant.bridge import advance_bridges
+from gfm_plant.circuit import Branch, Capacitor, Shunt, VoltageSource, find_modes, find_rates
+from gfm_plant.model import V_DC
+from gfm_plant.protection import trip
+
+from ..support.switched import Reference
+
+T_S = 1e-4
+Z_B = 380**2 / 4000
+DROPS = {"V_switch": 1.5, "V_diode": 1.2, "R_switch": 0.03, "R_diode": 0.02}
+CASES = {
+    "ideal": ({}, {}),
+    "twice": ({"updates": 2}, {"updates": 2}),
+    "20 kHz": ({"carrier_hz": 20e3}, {"carriers": 2, "counts": 5000}),
+    "dead time": ({"dead_time_s": 2e-6}, {"dead": 2e-6}),
+    "drops": (
+        {"dead_time_s": 2e-6, "carrier_hz": 20e3, "updates": 2, **DROPS},
+        {"dead": 2e-6, "carriers": 2, "updates": 2, "counts": 5000,
+         "drops": (1.5 / 700, 1.2 / 700, 0.03 / Z_B, 0.02 / Z_B)},
+    ),
+}  # fmt: skip
+
+
+def switched(bridge=None, P=0.5, **options):
+    """A plant with a switched bridge in its equilibrium; its u of four."""
+    options = {"dc_source": {"mode": "regulated"}, **options}
+    options["bridge"] = {"kind": "two-level", **(bridge or {})}
+    plant = make_plant(Plant.model_validate(options), T_S)
+    x, u = plant_equilibrium(plant.par, P, 1.0)
+    plant.start(x, u)
+    return plant, x, np.append(u, 0.0)
+
+
+def error(periods, bridge, changes):
+    """The largest error of all states at ticks against DOP853, and zeros of currents on the way."""
+    plant, x, u = switched(bridge)
+    turn, omega_b = cmath.exp(1j * x[6]), plant.par[0]["omega_b"]
+    space = [complex(*x[j : j + 2]) * turn for j in (0, 2, 4)]
+    reference = Reference(plant.par[0], np.array([*space, x[7], plant.st[0]["i_reg"]]), **changes)
+    worst = 0.0
+    for k in range(periods):
+        plant_advance(plant.records, u)
+        reference.period(u[2] * turn * cmath.exp(1j * omega_b * u[1] * k * T_S), u)
+        w = plant.now["w"][0, :3] * cmath.exp(1j * omega_b * (k + 1) * T_S)
+        got = np.array([*w, plant.st[0]["x"][V_DC], plant.st[0]["i_reg"]])
+        worst = max(worst, np.abs(got - reference.z).max())
+    return worst, reference.zeros
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_period_is_exact(name):
+    worst, zeros = error(12, *CASES[name])
+    assert worst < 1e-12
+    assert (zeros > 0) == ("dead" in CASES[name][1])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", CASES)
+def test_two_cycles_are_exact(name):
+    worst, _ = error(400, *CASES[name])
+    assert worst < 2e-12
+
+
+def test_rates_and_modes_are_of_one_circuit():
+    """A = X diag(lambda + j omega_b) X^-1, with a node where branches alone meet."""
+    omega_b, order = 100 * math.pi, ["i_f", "v", "i_o", "i_l", "i_g"]
+    branches = [
+        Branch("i_f", "bridge", "terminal", 0.02, 0.002),
+        Branch("i_o", "terminal", "bus", 0.1, 0.01),
+        Branch("i_l", "bus", "ground", 0.3, 0.9),
+        Branch("i_g", "bus", "far", 0.2, 0.02),
+    ]
+    parts = branches, [Capacitor("v", "terminal", 0.2)]
+    sources = [VoltageSource("bridge", "bridge"), VoltageSource("grid", "far")]
+    shunts = [Shunt("r", "terminal", 5.0)]
+    modes = find_modes(*parts, sources, omega_b, order, shunts)
+    rates = find_rates(*parts, sources, omega_b, order, shunts)
+    by_modes = modes.states @ np.diag(modes.rates + 1j * omega_b) @ modes.modes
+    assert np.abs(by_modes - rates.by_w).max() < 1e-9 * rates.fastest
+    assert np.abs(modes.states @ modes.drive - rates.by_s).max() < 1e-9 * rates.fastest
+
+
+class Inside:
+    """A plant that is driven through its periods in steps, so that what is between two ticks can be
+    seen; its command acts without delay."""
+
+    def __init__(self, plant, u, steps):
+        self.plant, self.u, self.steps = plant, u, steps
+
+    def period(self, seen):
+        """Go on by a period; ``seen(plant, t)`` is called after each step, t from its beginning."""
+        st, step = self.plant.st, T_S / self.steps
+        st["u"][0, 0] = self.u
+        for k in range(self.steps):
+            advance_bridges(self.plant.records, k * step, (k + 1) * step)
+            seen(self.plant, (k + 1) * step)
+        st["tick"] += 1
+
+
+STIFF = {"L_f": 10.0, "C_f": 0.05, "R_f": 10.0}  # little ripple, and soon at rest
+
+
+def settled(bridge=None, P=0.8, factors=None, periods=4000, **options):
+    """A plant under constant commands after a while."""
+    options["protection"] = {"under_voltage": {"enabled": False}}
+    plant, x, u = switched(bridge, P, factors=factors or {}, **options)
+    for _ in range(periods):
+        plant_advance(plant.records, u)
+    return plant, x, u
+
+
+def test_the_ripple_of_space_vector_modulation():
+    """Where the command lies on a phase's axis in the middle of a period only one active vector is
+    in use, for m T of it, and takes the phase's current up and down by V (1 - m) m T / 2 L, with V
+    = 2/3 V_dc and m V the voltage."""
+    plant, _, u = settled(factors={"L_f": 3.0, "C_f": 5.0}, periods=1000, P=0.0)
+    r, st = plant.par[0], plant.st[0]
+
+    def stands(t=0.0):
+        return cmath.exp(1j * r["omega_b"] * (T_S * st["tick"] + t))
+
+    while abs(cmath.phase(plant.now["unit"][0, 0] * stands(T_S / 2))) > 0.016:
+        plant_advance(plant.records, u)
+    before = (plant.now["w"][0, 0] * stands()).real
+    currents, m = [], u[2] / (r["leg"] * st["x"][V_DC])
+    Inside(plant, u, 400).period(
+        lambda plant, t: currents.append((plant.now["w"][0, 0] * stands(t)).real)
+    )
+    fundamental = before + (currents[-1] - before) * np.arange(1, 401) / 400
+    expected = r["omega_b"] / r["L_f"] * r["leg"] * (1 - m) * m * T_S / 2
+    assert np.ptp(currents - fundamental) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("dead", [1e-6, 2e-6])
+def test_dead_time_takes_a_square_wave_from_the_voltage(dead):
+    """V_dc t_d f_s against the current of each leg, so 4/pi of it in the fundamental."""
+    gives = []
+    for time in (0.0, dead):  # what a tick sees of the capacitor's ripple is in both
+        plant, _, u = settled({"dead_time_s": time}, factors=STIFF, periods=1500)
+        r, rows = plant.par[0], []
+        for _ in range(200):
+            plant_advance(plant.records, u)
+            rows.append(plant.st["x"][0].copy())
+        x = np.mean(rows, axis=0)
+        i, v = complex(x[0], x[1]), complex(x[2], x[3])
+        gives.append(v + complex(r["R_f"], r["L_f"]) * i)
+    lost = (gives[0] - gives[1]) * i.conjugate() / abs(i)  # along the current
+    expected = 4 / math.pi * 1.5 * r["leg"] * x[V_DC] * dead / T_S
+    assert lost.real == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("P", [0.8, -0.5])
+def test_the_current_of_the_dc_capacitor(P):
+    """Kolar and Round 2006, Eq. (1): I sqrt(2M (sqrt(3)/4pi + cos(phi)^2 (sqrt(3)/pi - 9M/16)))."""
+    plant, _, u = settled(P=P, factors={**STIFF, "C_dc": 10.0}, periods=1000)
+    drawn, rows, inside = [], [], Inside(plant, u, 97)
+
+    def see(plant, t):
+        s = plant.st[0]
+        i = plant.now["w"][0, 0] * cmath.exp(1j * plant.par[0]["omega_b"] * (T_S * s["tick"] + t))
+        drawn.append((s["by_dc"].conjugate() * i).real)
+
+    for _ in range(200):
+        inside.period(see)
+        turn = plant.now["unit"][0, 0]
+        rows.append([plant.now["w"][0, 0] / turn, plant.st[0]["x"][V_DC]])
+    i, v_dc = np.mean(rows, axis=0)
+    M = u[2] / (0.75 * plant.par[0]["leg"] * v_dc.real)  # of V_dc / 2
+    cos = i.real / abs(i)
+    # p.u. of a current on the DC side: S_n / V_dcref; on the AC side S_n / (sqrt(3) V_n)
+    current = abs(i) * 700 / (math.sqrt(3) * 380)
+    form = 2 * M * (math.sqrt(3) / (4 * math.pi) + cos**2 * (math.sqrt(3) / math.pi - 9 * M / 16))
+    assert np.std(drawn) == pytest.approx(current * math.sqrt(form), rel=0.02)
+
+
+def test_a_blocked_bridge_is_a_rectifier():
+    """Its diodes charge C_dc to the peak of the line voltage, and then nothing flows."""
+    plant, _, u = switched({"V_diode": 1.0})
+    plant.st["x"][0, V_DC] = 0.6
+    plant.par["trip_ticks"] = -1
+    trip(plant.records, 0, 1, 0.0)
+    currents, v_dc = [], []
+    for _ in range(6000):
+        plant_advance(plant.records, u)
+        currents.append(abs(plant.now["w"][0, 0]))
+        v_dc.append(plant.st[0]["x"][V_DC])
+    peak = math.sqrt(2) * 380 * np.hypot(*plant.st["x"][0, 2:4]) / 700
+    assert max(currents) > 1.0
+    assert np.all(np.diff(v_dc) >= -1e-15)
+    assert v_dc[-1] == pytest.approx(peak - 2 / 700, rel=2e-3) or v_dc[-1] > peak - 2 / 700
+    assert max(currents[-400:]) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["3ph", "LG", "LLG"])
+def test_a_fault_is_another_matrix(kind):
+    """A switched bridge in a fault that is cleared phase by phase, beside an averaged one."""
+    rows = []
+    for bridge in ({}, {"kind": "two-level"}):
+        off = {name: {"enabled": False} for name in ("over_current", "under_voltage")}
+        options = {"dc_source": {"mode": "regulated"}, "grid": {"scr": 3.0, "x_over_r": 6.0}}
+        plant = make_plant(
+            Plant.model_validate({**options, "bridge": bridge, "protection": off}), T_S
+        )
+        x, u = plant_equilibrium(plant.par, 0.5, 1.0)
+        plant.start(x, u)
+        seen = []
+        for k in range(600):
+            if k == 100:
+                fault(plant, 0.3, 0.02, 0.015, kind=kind, Z_0=None if kind == "3ph" else 0.3j)
+            plant_advance(plant.records, u)
+            seen.append(plant.st["x"][0, 2:6].copy())
+        rows.append(seen)
+    difference = np.abs(np.subtract(*rows))
+    assert np.ptp(rows[0], axis=0).max() > 1.0
+    assert difference.max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("bridge", "more", "words"),
+    [
+        ({"carrier_hz": 15e3}, {}, "carrier_hz = 15000: must be 10000 or 20000 Hz"),
+        ({"dead_time_s": 6e-5}, {}, "dead_time_s = 6e-05: must be less than 5e-05 s, half a"),
+        ({"min_pulse_s": 2e-4}, {}, "min_pulse_s = 0.0002: must be less than 0.0001 s, a period"),
+        ({"timer_hz": 4e5}, {}, "too coarse, 20 counts"),
+        ({"timer_hz": 200.01e6}, {}, "must be a multiple of 20000 Hz"),
+        ({}, {"delay": {"fraction": 0.3}}, "fraction = 0.3: compare values are loaded 1 times"),
+    ],
+)  # fmt: skip
+def test_times_that_do_not_fit_are_refused(bridge, more, words):
+    with pytest.raises(ValueError, match=words.replace("(", "\\(")) as caught:
+        switched(bridge, **more)
+    assert str(caught.value).startswith("plant.") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"bridge": {"kind": "two-level", "V_diode": -1.0}}, "greater than or equal to 0"),
+        ({"bridge": {"kind": "two-level"}, "i_peak": 2.0}, "i_peak = 2: is a limit of bridge.kind"),
+    ],
+)
+def test_options_that_make_no_bridge_are_refused(options, words):
+    with pytest.raises(ValidationError, match=words):
+        Plant.model_validate(options)
