@@ -129,7 +129,7 @@ def _make(
         one["T_s"], one["delay"] = T_s, options.delay.samples
         one["fraction"] = options.delay.fraction
         _pack_protection(one, options.protection, T_s)
-        _pack_bridge(one, "plant" if each == () else f"network.converters.{name}", options, T_s)
+        _pack_bridge(one, "plant" if len(converters) == 1 else f"{name}: plant", options, T_s)
     passive = [p for _, n, x in each if not isinstance(x, Fed) for p in x.elements(n)]
     fed = sorted(
         ((name, one) for _, name, one in each if isinstance(one, Fed)),
