@@ -43,7 +43,7 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     cells: list[_RoundTrips] = []
     with ExitStack() as stack:
         place = memory_folder(stack)
-        contenders, remarks = contenders_of(options.links, place)
+        contenders, remarks = contenders_of([*options.links, *options.peers], place)
         two = stack.enter_context(pair(options.policies[0], place))
         load = stack.enter_context(cpu_load())
         for c in contenders:

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any, Literal
 
 from gfm_hil.bench.c_code import FLAGS
-from gfm_hil.bench.contenders import FRAME
+from gfm_hil.bench.contenders import FRAME, PEERS, missing_packages
 from gfm_hil.bench.cpu_load import LOADS, Load
 from gfm_hil.bench.pair import Policy
 from gfm_hil.bench.rounds import ShowProgress
@@ -36,6 +36,7 @@ class BenchOptions:
     """What to measure; a benchmark uses those that concern it."""
 
     links: Sequence[str]  # names
+    peers: Sequence[str]  # names of what one would pick instead of a link
     modes: Sequence[Mode]  # lockstep: one round trip after the other; realtime: one every 100 µs
     loads: Sequence[Load]  # idle, or busy: with a CPU load on each processor
     policies: Sequence[Policy]  # scheduling of the two processes, the best one first
@@ -80,6 +81,7 @@ def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
         raise UserError(f"--links: {problem}") from None
     return BenchOptions(
         links=links,
+        peers=_peers(of("peers", "installed")),
         modes=_split("--mode", of("mode"), MODES) or MODES,
         loads=_split("--load", of("load"), LOADS) or LOADS,
         policies=_policies(of("policy", "auto")),
@@ -90,6 +92,19 @@ def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
         rounds=_within("--rounds", of("rounds"), 1, 1000),
         until=of("until", math.inf),
     )
+
+
+def _peers(text: str) -> list[str]:
+    """Names of peers that are installed: all, none, or those of a list."""
+    if text == "installed":
+        return [name for name in PEERS if not missing_packages(name)]
+    names = [] if text == "none" else _split("--peers", text, tuple(PEERS))
+    for name in names:
+        if missing := missing_packages(name):
+            raise UserError(
+                f"--peers {name}: needs {' and '.join(missing)}: pip install 'gfmhil[bench]'"
+            )
+    return names
 
 
 def _split(option: str, text: str | None, allowed: Sequence[Any] | None = None) -> list[Any]:

@@ -10,6 +10,7 @@ from typing import Any
 from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn
 
+from gfm_hil.bench.contenders import PEERS
 from gfm_hil.cli.common import new_folder, progress
 from gfm_hil.core.terminal import terminal
 from gfm_hil.links import link_names
@@ -20,6 +21,11 @@ _WIDTH = 100  # columns: a table cut short is no use in a file
 #: options of several kinds of benchmark, as argparse takes them
 _OPTIONS: dict[str, dict[str, Any]] = {
     "--links": {"default": ",".join(link_names()), "help": "by commas (default: %(default)s)"},
+    "--peers": {
+        "default": "installed",
+        "help": f"what one would pick instead, by commas: {', '.join(PEERS)}; installed: those that"
+        " are, or none (default: %(default)s)",
+    },
     "--mode": {
         "default": "lockstep,realtime",
         "help": "lockstep: as fast as it goes; realtime: every 100 µs (default: %(default)s)",
@@ -49,8 +55,8 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 #: kinds of benchmark: what they measure, and their options besides those of the output
 _KINDS = {
     "latency": (
-        "round trip of every link, and the limit in C",
-        "--links --mode --load --policy --payload --seconds --rounds",
+        "round trip of every link, of what one would pick instead, and of the limit in C",
+        "--links --peers --mode --load --policy --payload --seconds --rounds",
     ),
     "jitter": (
         "how late a loop that only paces begins its ticks",
@@ -61,7 +67,7 @@ _KINDS = {
         "closed loop: ticks a second in lockstep, misses in real time",
         "--links --mode --load --laws --seconds --rounds",
     ),
-    "all": ("all of it, in three minutes at most", "--links"),
+    "all": ("all of it, in three minutes at most", "--links --peers"),
 }
 _SECONDS = {"latency": 0.2, "jitter": 0.3, "loop": 3.0}
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from gfm_hil.bench.c_code import compile_twin
-from gfm_hil.bench.contenders import FRAME, messages
+from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
 from gfm_hil.bench.kernel import compare
 from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
@@ -22,6 +22,7 @@ from gfm_runtime import law_names
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
+NONE = ("--peers", "none")
 KEYS = {
     "link", "peer", "code", "mode", "load", "policy", "payload", "n", "ratio_to_baseline_p50",
     "p50_us", "p90_us", "p99_us", "p99_9_us", "p99_99_us", "max_us",
@@ -39,9 +40,9 @@ def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, An
 
 @pytest.mark.apt
 def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
-    found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02")
+    found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02", *NONE)
     rows = found["results"]
-    assert {r["link"] for r in rows} - {"iceoryx2"} == {"shm", "zmq"}
+    assert {r["link"] for r in rows} == {"shm", "zmq"}
     assert {(r["mode"], r["load"]) for r in rows} == {
         (m, w) for m in ("lockstep", "realtime") for w in ("idle", "busy")
     }
@@ -55,6 +56,24 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
             assert row["ratio_to_baseline_p50"] == 1
     assert found["seconds"] > 0
     assert found["environment"]["cpus"] == len(os.sched_getaffinity(0))
+
+
+@pytest.mark.apt
+@pytest.mark.parametrize("peer", [name for name in PEERS if not missing_packages(name)])
+def test_a_peer_answers_beside_its_limit(tmp_path, capsys, peer):
+    short = ("--seconds", "0.05", "--load", "idle", "--mode", "lockstep")
+    found = bench(tmp_path, capsys, "latency", "--links", "shm", "--peers", peer, *short)
+    rows = [row for row in found["results"] if row["peer"] not in ("ours", "C")]
+    without_multicast = [text for text in found["remarks"] if "no multicast" in text]
+    assert rows or (peer == "lcm" and without_multicast)
+    for row in rows:
+        assert row["n"] > 0 and row["silent_rounds"] == 0 and row["ratio_to_baseline_p50"] > 0
+
+
+def test_a_peer_that_is_not_installed(capsys, monkeypatch):
+    monkeypatch.setitem(PEERS, "nng", ("no_such_package",))
+    assert main(["bench", "latency", "--peers", "nng"]) == 2
+    assert "--peers nng: needs no_such_package: pip install" in capsys.readouterr().err
 
 
 @pytest.mark.apt

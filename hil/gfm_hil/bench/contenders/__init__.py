@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,19 @@ from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.signals import NY
 
 FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
-#: files of this folder, in the order of the tables. Each has a function ``contenders(links,
-#: place)`` that yields what it adds to these links; place is a folder in memory with a short path.
-FILES = ("udp", "shm", "iceoryx2", "zmq")
+#: files of this folder with links and limits, in the order of the tables. Each has a function
+#: ``contenders(names, place)`` that yields what it adds to the links and peers of these names;
+#: place is a folder in memory with a short path.
+FILES = ("udp", "shm", "zmq")
+#: files of what one would pick instead, and the packages that each needs
+PEERS = {
+    "cyclonedds": ("cyclonedds",),
+    "iceoryx2": ("iceoryx2", "flatbuffers"),
+    "lcm": ("lcm",),
+    "modbus": ("pymodbus",),
+    "nng": ("pynng",),
+    "zenoh": ("zenoh",),
+}
 
 
 @dataclass(frozen=True)
@@ -51,11 +62,18 @@ class Contender:
         return self.end(self, role, messages(role, payload))
 
 
-def contenders_of(links: Sequence[str], place: Path) -> tuple[list[Contender], list[str]]:
-    """The contenders of links, each after its limit, and remarks: without a C compiler there are no
-    limits. ``place`` is an empty folder in memory with a short path."""
-    files = [import_module(f"{__name__}.{name}") for name in FILES]
-    every: list[Contender] = [one for file in files for one in file.contenders(links, place)]
+def missing_packages(peer: str) -> list[str]:
+    """What a peer needs and is not installed."""
+    return [package for package in PEERS[peer] if find_spec(package) is None]
+
+
+def contenders_of(names: Sequence[str], place: Path) -> tuple[list[Contender], list[str]]:
+    """The contenders of links and peers, and their limits; and remarks: without a C compiler
+    there are no limits. ``place`` is an empty folder in memory with a short path."""
+    files = [import_module(f"{__name__}.{name}") for name in (*FILES, *PEERS)]
+    each: list[Contender] = [one for file in files for one in file.contenders(names, place)]
+    wanted = {one.limit for one in each if one.source is None}
+    every = [one for one in each if one.source is None or one.name in wanted]
     try:
         libraries = {
             source: compile_c(source, place, f"{source.stem}_pingpong")

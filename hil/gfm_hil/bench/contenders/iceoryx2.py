@@ -1,11 +1,10 @@
-"""iceoryx2, a package from PyPI for shared memory, beside the link ``shm`` if it is installed."""
+"""iceoryx2, a package from PyPI for shared memory."""
 
 from __future__ import annotations
 
 import ctypes
 import secrets
 from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from gfm_hil.links.port import Port
 _ROOM = 64  # messages, as in the links
 
 
-def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    if "shm" in links and find_spec("iceoryx2") and find_spec("flatbuffers"):  # which it needs
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "iceoryx2" in names:
         name = f"gfmhil-{secrets.token_hex(8)}"
         yield Contender("iceoryx2", "iceoryx2", name, _open, "iceoryx2", limit=shm.LIMIT)
 

@@ -16,9 +16,9 @@ _SLOTS = 2 * 1024  # bytes, two slot_t
 LIMIT = "C shm"
 
 
-def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    if "shm" in links:
-        yield limit(LIMIT, __file__, str(place / "slots"), _open)
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    yield limit(LIMIT, __file__, str(place / "slots"), _open)
+    if "shm" in names:
         yield of_link("shm", "shm", fresh("shm", place), LIMIT)
 
 

@@ -7,18 +7,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gfm_hil.bench.contenders import FILES, Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.contenders import FILES, PEERS, Contender, free_port, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 
 LIMIT = "C udp"
 
 
-def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    others = [link for link in links if link not in FILES or link == "udp"]
-    if others:
-        yield limit(LIMIT, __file__, f"{free_port()},{free_port()}", _open)
-    for link in others:
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    yield limit(LIMIT, __file__, f"{free_port()},{free_port()}", _open)
+    for link in [name for name in names if name not in FILES and name not in PEERS]:
         yield of_link(link, link, fresh(link, place), LIMIT)
 
 

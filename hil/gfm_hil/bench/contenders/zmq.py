@@ -12,16 +12,17 @@ from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 
+IPC, TCP = "C zmq ipc", "C zmq tcp"
 
-def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
-    if "zmq" not in links:
-        return
+
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     ipc, tcp = fresh("zmq", place), "tcp://127.0.0.1"
-    yield limit("C zmq ipc", __file__, f"{ipc}-c", _open)
-    yield of_link("zmq ipc", "zmq", ipc, "C zmq ipc")
-    yield of_link("zmq ipc, portable", "zmq", f"{ipc}-portable", "C zmq ipc", portable=True)
-    yield limit("C zmq tcp", __file__, f"{tcp}:{free_port()}", _open)
-    yield of_link("zmq tcp", "zmq", f"{tcp}:{free_port()}", "C zmq tcp")
+    yield limit(IPC, __file__, f"{ipc}-c", _open)
+    yield limit(TCP, __file__, f"{tcp}:{free_port()}", _open)
+    if "zmq" in names:
+        yield of_link("zmq ipc", "zmq", ipc, IPC)
+        yield of_link("zmq ipc, portable", "zmq", f"{ipc}-portable", IPC, portable=True)
+        yield of_link("zmq tcp", "zmq", f"{tcp}:{free_port()}", TCP)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

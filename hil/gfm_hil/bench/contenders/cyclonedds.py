@@ -1,0 +1,69 @@
+"""Eclipse Cyclone DDS, by the package cyclonedds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.contenders import Contender, udp
+from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.core.roles import Role
+from gfm_hil.links.port import Port
+
+#: on the loopback interface without multicast; its receiving thread hands a sample on by itself
+_SETTINGS = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+_DOMAINS = 230  # numbers that a domain may have
+
+
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "cyclonedds" in names:
+        domain = str(1 + os.getpid() % _DOMAINS)
+        yield Contender("cyclonedds", "dds", domain, _open, "cyclonedds", limit=udp.LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(Dds(role, int(c.endpoint)), own)
+
+
+class Dds:
+    """One end: a writer and a reader, best effort, the last sample alone."""
+
+    port: Port | None = None
+
+    def __init__(self, role: Role, number: int) -> None:
+        from cyclonedds.core import Policy, Qos
+        from cyclonedds.domain import Domain, DomainParticipant
+        from cyclonedds.idl import make_idl_struct, types
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+
+        kinds: Any = types
+        fields = {"content": kinds.sequence[kinds.uint8]}
+        message: Any = make_idl_struct("Message", "gfmhil.Message", fields)
+        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
+        domain = Domain(number, _SETTINGS)
+        participant = DomainParticipant(number)
+        out, into = ("u", "y") if role == "controller" else ("y", "u")
+        self._writer = DataWriter(participant, Topic(participant, out, message), qos)
+        self._reader = DataReader(participant, Topic(participant, into, message), qos)
+        self._message = message
+        self._keep = [domain, participant]
+
+    def send(self, message: bytes) -> bool:
+        self._writer.write(self._message(content=message))
+        return True
+
+    def receive(self) -> bytes | None:
+        samples = self._reader.take(1)
+        return bytes(samples[0].content) if samples else None
+
+    def close(self) -> None:
+        del self._writer, self._reader
+        self._keep.clear()

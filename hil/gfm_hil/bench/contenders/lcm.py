@@ -1,0 +1,52 @@
+"""LCM, by the package lcm."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from gfm_hil.bench.contenders import Contender, udp
+from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.links.port import Port
+
+
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "lcm" in names:
+        port = 10_000 + os.getpid() % 20_000
+        group = f"udpm://239.255.76.67:{port}?ttl=0"  # ttl 0: the packets stay on this machine
+        yield Contender("lcm", "lcm", group, _open, "lcm", limit=udp.LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(Lcm(role, c.endpoint), own)
+
+
+class Lcm:
+    """One end: two channels of UDP multicast; the caller polls."""
+
+    port: Port | None = None
+
+    def __init__(self, role: Role, group: str) -> None:
+        from lcm import LCM
+
+        try:
+            self._lcm = LCM(group)
+        except RuntimeError:
+            raise UserError("LCM has no multicast here: ip link set lo multicast on") from None
+        self._out, into = ("u", "y") if role == "controller" else ("y", "u")
+        self._came: list[bytes] = []
+        self._lcm.subscribe(into, lambda _, message: self._came.append(message))
+
+    def send(self, message: bytes) -> bool:
+        self._lcm.publish(self._out, message)
+        return True
+
+    def receive(self) -> bytes | None:
+        self._lcm.handle_timeout(0)
+        return self._came.pop(0) if self._came else None
+
+    def close(self) -> None:
+        del self._lcm

@@ -1,0 +1,64 @@
+"""Eclipse Zenoh, by the package eclipse-zenoh."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.contenders import Contender, free_port, udp
+from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.core.roles import Role
+from gfm_hil.links.port import Port
+
+_ROOM = 64  # messages, as in the links
+
+
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "zenoh" in names:
+        tcp = f"tcp/127.0.0.1:{free_port()}"
+        yield Contender("zenoh tcp", "zenoh", tcp, _open, "zenoh", limit=udp.LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(Zenoh(role, c.endpoint), own)
+
+
+class Zenoh:
+    """One end of two peers without a router: an express publisher, which does not batch, of the
+    highest priority, and a subscriber whose ring the caller polls."""
+
+    port: Port | None = None
+
+    def __init__(self, role: Role, endpoint: str) -> None:
+        import zenoh
+
+        config = zenoh.Config()
+        config.insert_json5("mode", '"peer"')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        way = "listen" if role == "controller" else "connect"
+        config.insert_json5(f"{way}/endpoints", json.dumps([endpoint]))
+        if way == "connect":
+            config.insert_json5("listen/endpoints", "[]")
+        self._session = zenoh.open(config)
+        out, into = ("u", "y") if role == "controller" else ("y", "u")
+        self._publisher = self._session.declare_publisher(
+            f"gfmhil/{out}",
+            express=True,
+            priority=zenoh.Priority.REAL_TIME,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+        ring: Any = zenoh.handlers.RingChannel(_ROOM)
+        self._subscriber = self._session.declare_subscriber(f"gfmhil/{into}", ring)
+
+    def send(self, message: bytes) -> bool:
+        self._publisher.put(message)
+        return True
+
+    def receive(self) -> bytes | None:
+        sample = self._subscriber.try_recv()
+        return None if sample is None else bytes(sample.payload)
+
+    def close(self) -> None:
+        self._session.close()
