@@ -24,7 +24,7 @@ _DOMAINS = 230  # numbers that a domain may have
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     if "cyclonedds" in names:
         domain = str(1 + os.getpid() % _DOMAINS)
-        yield Contender("cyclonedds", "dds", domain, _open, "cyclonedds", limit=udp.LIMIT)
+        yield Contender("cyclonedds", "cyclonedds", domain, _open, "cyclonedds", limit=udp.LIMIT)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
