@@ -41,7 +41,7 @@ from gfm_plant.series import (
 from gfm_plant.solution import I_F, I_O, V, circuit, grid_source, integrals, own, turned
 from gfm_runtime.compiled import compiled, inlined
 
-_A = (complex(1.0, 0.0), complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75)))
+_A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
 _NONE = 1e-12  # p.u.; a current that is no more is none
 _NOW = 1e-15  # s; an edge that is no further away is now
 _EVENTS = 200  # of one unit of the carrier; then currents may pass zero unseen
@@ -123,6 +123,7 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
         return
     c = circuit(n, now)
     begin_series(plant, c, begin)
+    speed = field(now, "source_speed")[grid_source(n)]
     for unit in range(n.n_units):
         first = unit * n.unit_s
         last = n.T_s if unit == n.n_units - 1 else first + n.unit_s
@@ -130,7 +131,12 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
             if begin <= first:
                 for k in range(n.n_converters):
                     _load(plant, k, unit)
-            _go(plant, c, max(begin, first) - first, min(end, last) - first)
+            a, b = max(begin, first) - first, min(end, last) - first
+            _go(plant, c, a, b)
+            for k in range(n.n_converters):
+                s = plant.st[k]
+                s.ahead = normal(s.ahead * turned(n.omega_b * s.u_now[1] * (b - a)))
+                s.x[DELTA] += (b - a) * (n.omega_b * s.u_now[1] - speed)
             if last <= end:
                 for k in range(n.n_converters):
                     s = plant.st[k]
@@ -186,7 +192,8 @@ def _go(plant: PlantRecords, c: int, begin: float, end: float) -> None:
     longest = LARGEST / field(n, "fastest")[c]
     for k in range(n.n_converters):
         if plant.par[k].filtered:
-            _see(plant, k, 0, 1, 0.0)
+            w = field(plant.now[0], "w")
+            _see(plant.par[k], plant.st[k], 0, w[own(k) + V], w[own(k) + I_O])
     while True:
         until, watched = min(end, t + longest), False
         for k in range(n.n_converters):
@@ -210,11 +217,13 @@ def _go(plant: PlantRecords, c: int, begin: float, end: float) -> None:
             return
         h = until - t
         terms = how_many(h * field(n, "fastest")[c])
-        find_terms(plant, c, h, terms)
+        find_terms(plant, c, h, terms, watched)
         tau, which, what = 1.0, -1, _NOTHING
         if watched and events < _EVENTS:
             tau, which, what = _first_event(plant, c, terms)
-        _take(plant, terms, tau, h)
+        if tau < 1.0:
+            _cut(plant, terms, tau)
+        _take(plant, tau * h)
         t = until if tau == 1.0 else t + tau * h
         if what != _NOTHING:
             events += 1
@@ -272,11 +281,11 @@ def _settle(plant: PlantRecords, k: int, c: int) -> None:
     """Find which devices of bridge k conduct, after its gates have changed or a current has become
     zero."""
     n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
-    i = field(now, "w")[own(k) + I_F] * r.current
     none, which = 0, -1
+    s.flows[0] = s.flows[1] = s.flows[2] = 0
     for x in range(3):
-        s.flows[x] = 0
         if r.wide[s.gate[x]]:
+            i = field(now, "w")[own(k) + I_F] * r.current
             along = _seen_by(n, c, x, i)
             if abs(along) > _NONE:
                 s.flows[x] = 1 if along > 0.0 else -1
@@ -368,13 +377,17 @@ def _prepare(plant: PlantRecords, k: int, c: int) -> None:
     for x in range(3):
         b = r.band[s.gate[x], 1 if s.flows[x] < 0 else 0]
         a = _A[x] * axis
-        by_dc += b[0] * a
-        by_mid += b[1] * a
-        drop += b[2] * a
-        R = 2.0 / 3.0 * b[3]
-        R_aa += R * a.real * a.real
-        R_ab += R * a.real * a.imag
-        R_bb += R * a.imag * a.imag
+        if b[0] != 0.0:
+            by_dc += b[0] * a
+        if b[1] != 0.0:
+            by_mid += b[1] * a
+        if b[2] != 0.0:
+            drop += b[2] * a
+        if b[3] != 0.0:
+            R = 2.0 / 3.0 * b[3]
+            R_aa += R * a.real * a.real
+            R_ab += R * a.real * a.imag
+            R_bb += R * a.imag * a.imag
     s.by_dc, s.by_mid, drop = by_dc * r.leg, by_mid * r.leg, drop * r.leg
     per_L = r.omega_b / (r.L_f * r.current)
     q_aa = q_bb = per_L
@@ -408,6 +421,8 @@ def _first_event(plant: PlantRecords, c: int, terms: int) -> tuple[float, int, i
     converter; and what."""
     first, which, what = 1.0, -1, _NOTHING
     for k in range(plant.net[0].n_converters):
+        if not _may_happen(plant, k, c, terms):
+            continue
         a, f_a = 0.0, _strain(plant, k, c, terms, 0.0)[0]
         for part in range(1, 5):  # a current may leave zero and come back
             b = 0.25 * part * first
@@ -418,6 +433,23 @@ def _first_event(plant: PlantRecords, c: int, terms: int) -> tuple[float, int, i
                 break
             a, f_a = b, f_b
     return first, which, what
+
+
+@compiled
+def _may_happen(plant: PlantRecords, k: int, c: int, terms: int) -> bool:
+    """Return whether anything that is watched of converter k may happen in the interval: not where
+    it is currents alone, and each further from zero than all terms together can take it."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[k]
+    if s.open >= 0 or s.i_most[0] < math.inf:
+        return True
+    x, i = field(now, "terms"), own(k) + I_F
+    reach = _NONE
+    for j in range(1, terms + 1):
+        reach += abs(x[j, i].real) + abs(x[j, i].imag)
+    for leg in range(3):
+        if s.flows[leg] != 0 and s.flows[leg] * _seen_by(n, c, leg, x[0, i]) <= reach:
+            return True
+    return False
 
 
 @compiled
@@ -508,40 +540,47 @@ def _change(plant: PlantRecords, k: int, c: int, what: int) -> None:
 
 
 @inlined
-def _see(plant: PlantRecords, k: int, which: int, terms: int, tau: float) -> None:
-    """Keep what the sensors of converter k see at a part tau of the interval."""
-    now, r, s, at = plant.now[0], plant.par[k], plant.st[k], own(k)
-    if which == 0:
-        w = field(now, "w")
-        v, i_o = w[at + V], w[at + I_O]
-    else:
-        v, i_o = w_at(now, at + V, terms, tau), w_at(now, at + I_O, terms, tau)
+def _see(r: Any, s: Any, which: int, v: complex, i_o: complex) -> None:
+    """Keep what the sensors see at the beginning (0), the middle (1) or the end (2) of an
+    interval."""
     s.seen[which, 0], s.seen[which, 1], s.seen[which, 2] = terminal(
         v.real, v.imag, i_o.real * r.current, i_o.imag * r.current
     )
 
 
 @compiled
-def _take(plant: PlantRecords, terms: int, tau: float, h: float) -> None:
-    """Take the states on by a part tau of the interval of h s."""
-    n, now, step = plant.net[0], plant.now[0], tau * h
+def _cut(plant: PlantRecords, terms: int, tau: float) -> None:
+    """End an interval at a part tau of it."""
+    n, now = plant.net[0], plant.now[0]
+    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
+    for which in range(2):
+        at = tau if which else 0.5 * tau
+        for i in range(n.n_states):
+            w_to[which, i] = w_at(now, i, terms, at)
+        for k in range(n.n_converters):
+            for what in range(4):
+                dc_to[which, k, what] = dc_at(now, k, what, terms, at)
+
+
+@compiled
+def _take(plant: PlantRecords, step: float) -> None:
+    """Take the states on to the end of an interval of ``step`` s."""
+    n, now = plant.net[0], plant.now[0]
     w, source, speed = field(now, "w"), field(now, "source"), field(now, "source_speed")
+    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
     for k in range(n.n_converters):
-        r, s = plant.par[k], plant.st[k]
-        v_0, v_1 = s.x[V_DC], dc_at(now, k, DC, terms, 0.5 * tau)
-        v_2 = dc_at(now, k, DC, terms, tau)
+        r, s, at = plant.par[k], plant.st[k], own(k)
+        v_0, v_1, v_2 = s.x[V_DC], dc_to[0, k, DC], dc_to[1, k, DC]
+        s.x[V_DC], s.i_reg = v_2, dc_to[1, k, REG]
+        s.i_source, s.mid = dc_to[1, k, SOURCE], dc_to[1, k, MID]
         if r.energy > 0.0:
-            i_0, i_1 = w[own(k) + I_F], w_at(now, own(k) + I_F, terms, 0.5 * tau)
-            i_2 = w_at(now, own(k) + I_F, terms, tau)
-            s.drawn[0], s.drawn[1] = _drawn(r, s, i_0, v_0), _drawn(r, s, i_1, v_1)
-            s.drawn[2] = _drawn(r, s, i_2, v_2)
-        s.x[V_DC], s.i_reg = v_2, dc_at(now, k, REG, terms, tau)
-        s.i_source, s.mid = dc_at(now, k, SOURCE, terms, tau), dc_at(now, k, MID, terms, tau)
-        if r.energy > 0.0:
+            s.drawn[0] = _drawn(r, s, w[at + I_F], v_0)
+            s.drawn[1] = _drawn(r, s, w_to[0, at + I_F], v_1)
+            s.drawn[2] = _drawn(r, s, w_to[1, at + I_F], v_2)
             discharge(r, s, step, v_0, v_1, v_2)
         if r.filtered:
-            _see(plant, k, 1, terms, 0.5 * tau)
-            _see(plant, k, 2, terms, tau)
+            _see(r, s, 1, w_to[0, at + V], w_to[0, at + I_O])
+            _see(r, s, 2, w_to[1, at + V], w_to[1, at + I_O])
             b_0, b_1, b_2, b_3 = _weights(step * r.omega_s)
             s.sensed[0] = b_0 * s.sensed[0] + b_1 * v_0 + b_2 * v_1 + b_3 * v_2
             for j in range(3):
@@ -550,11 +589,8 @@ def _take(plant: PlantRecords, terms: int, tau: float, h: float) -> None:
                     + b_1 * s.seen[0, j] + b_2 * s.seen[1, j] + b_3 * s.seen[2, j]
                 )  # fmt: skip
                 s.seen[0, j] = s.seen[2, j]
-        speed_u = n.omega_b * s.u_now[1]
-        s.ahead = normal(s.ahead * turned(speed_u * step))
-        s.x[DELTA] += step * (speed_u - speed[grid_source(n)])
     for i in range(n.n_states):
-        w[i] = w_at(now, i, terms, tau)
+        w[i] = w_to[1, i]
     for k in range(n.n_converters, now.n_s):
         source[k] = source[k] * turned(speed[k] * step)
 

@@ -69,12 +69,14 @@ _NET: _Arrays = {
     # with switched bridges, see `series`: which cut of the period each unit of the carrier belongs
     # to; of each circuit e^(-j angle) of its axis alpha, its fastest rate, 1/s; of each converter
     # what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both axes, 1/s; the
-    # other entries of w' = A w + B s: how many, row and column, values on both axes
+    # other entries of w' = A w + B s: how many, row and column, values on both axes; whether there
+    # are none but what the grid does to the only line
     "unit_part": (int, ("n_units",)),
     "axis": (complex, ("n_rates",)),
     "fastest": (float, ("n_rates",)),
     "own_rates": (float, ("n_rates", "n_converters", 2, 5)),
     "n_links": (int, ("n_rates", 2)),
+    "alone": (int, ("n_rates",)),
     "link_place": (int, ("n_rates", 2, "n_entries", 2)),
     "link": (float, ("n_rates", 2, "n_entries", 2)),
 }
@@ -94,10 +96,12 @@ _NOW: _Arrays = {
     "w_before": (complex, ("n_w",)),  # at the last tick
     "unit_before": (complex, ("n_s",)),
     # with switched bridges: the terms of the series of w and of the DC links (v_dc, i_reg,
-    # i_source, mid), for the length of an interval; the same of the sources, whose next term
-    # follows from the last one, and their speeds, 1/s
+    # i_source, mid), for the length of an interval, and what they add up to in its middle and at
+    # its end; of the sources the values, the last term, and their speeds, 1/s
     "terms": (complex, ("n_terms", "n_w")),
     "dc_terms": (float, ("n_terms", "n_converters", 4)),
+    "w_to": (complex, (2, "n_w")),
+    "dc_to": (float, (2, "n_converters", 4)),
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),

@@ -261,6 +261,12 @@ def _pack_rates(
         entries = np.argwhere((alpha != 0) | (beta != 0))
         net["n_links"][circuit, which] = len(entries)
         net["link_place"][circuit, which, : len(entries)] = entries
+        if which:  # the grid's two sequences act alike on its line
+            only = {(int(row), int(column)) for row, column in entries}
+            i_o, g = 2, places.get(GRID_SOURCE, 0)
+            net["alone"][circuit] = (
+                N == 1 and only == {(i_o, g), (i_o, g + 1)} and not net["n_links"][circuit, 0]
+            )
         for axis, factors in enumerate((alpha, beta)):
             net["link"][circuit, which, : len(entries), axis] = factors[tuple(entries.T)]
 
