@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from gfm_plant import Plant, fault, make_plant, plant_advance, plant_equilibrium
-from gfm_plant.bridge import advance_bridges
+from gfm_plant.bridge import advance_bridges, modulate
 from gfm_plant.circuit import Branch, Capacitor, Shunt, VoltageSource, find_modes, find_rates
 from gfm_plant.model import V_DC
 from gfm_plant.protection import trip
@@ -182,6 +182,28 @@ def test_the_current_of_the_dc_capacitor(P):
     current = abs(i) * 700 / (math.sqrt(3) * 380)
     form = 2 * M * (math.sqrt(3) / (4 * math.pi) + cos**2 * (math.sqrt(3) / math.pi - 9 * M / 16))
     assert np.std(drawn) == pytest.approx(current * math.sqrt(form), rel=0.02)
+
+
+@pytest.mark.parametrize(("E", "gives"), [(1.2, 1.2), (1e3, 2 / math.pi * 1.5 * 1.5040727)])
+def test_what_v_dc_cannot_give_ends_in_six_steps(E, gives):
+    """The fundamental of six steps is 2/pi V_dc; below the linear limit it is the command."""
+    plant, _, _ = switched()
+    turns = np.exp(2j * np.pi * (np.arange(3600) + 0.5) / 3600)
+    counts = np.array([modulate(plant.par[0], plant.st[0], complex(E * t), 1.0) for t in turns])
+    axes = np.exp(2j * np.pi / 3 * np.arange(3))
+    mean = plant.par[0]["leg"] * (counts / plant.par[0]["counts"]) @ axes
+    assert (mean / turns).mean() == pytest.approx(gives, rel=1e-3)
+    assert (E < 2) == (len(np.unique(counts)) > 100)
+
+
+def test_pulses_are_at_least_as_long_as_they_must_be():
+    """2 us are 200 counts in half a carrier; shorter ones become that, or nothing."""
+    plant, _, _ = switched({"min_pulse_s": 2e-6})
+    turns = np.exp(2j * np.pi * (np.arange(3600) + 0.5) / 3600)
+    counts = np.array([modulate(plant.par[0], plant.st[0], 1.29 * t, 1.0) for t in turns])
+    on = np.unique(counts)
+    assert not np.any((on > 0) & (on < 200)) and not np.any((on > 9800) & (on < 10_000))
+    assert {200, 9800} <= set(on)
 
 
 def test_a_blocked_bridge_is_a_rectifier():
