@@ -24,6 +24,7 @@ LEFT_OUT = {
     "mimo-gfm-scheduled": "on the paper's grid its first stage is in force, which is mimo-gfm",
     "mimo-gfm-deployable-rig": "for a regulated source; its row 1 is the paper's",
     "mimo-gfm-practical": "mimo-gfm-deployable for a converter with a current limit",
+    "mimo-gfm-ride-through": "mimo-gfm-practical with gains for large signals",
 }
 
 Row = dict[str, Any]

@@ -47,7 +47,7 @@ from gfm_runtime.inner.stage import current_loop, limit_current
 from gfm_runtime.inner.virtual_stator import VirtualStator, stator
 from gfm_runtime.toml_file import NotNegative, Positive
 
-_SMALL = 0.15  # of I_max; less of the negative sequence leaves the limit to the sum
+_SMALL = 0.2  # of I_max; less of the negative sequence leaves the limit to the sum
 
 
 class DualSequence(VirtualStator):
@@ -60,7 +60,7 @@ class DualSequence(VirtualStator):
     )
     part_n: Positive = Field(0.5, description="of I_max, what the negative sequence gets; below 1")
     f_seq: Positive = Field(
-        12.0, description="bandwidth with which the sequences are told apart, Hz"
+        10.0, description="bandwidth with which the sequences are told apart, Hz"
     )
     delay: NotNegative = Field(
         1.8, description="from v to the middle of the bridge's pulse that it causes, samples"

@@ -11,6 +11,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import check_scenario
+from gfm_hil.studies.conformity.sets import load_under_test
 
 CYCLE = 200  # ticks
 LIMITED = ("virtual-stator", "cascaded", "threshold-impedance")
@@ -73,6 +74,28 @@ def test_no_clearing_on_the_line_stops_the_law():
                 stops.append((after, found.summary["reason"]))
     assert ended["zero"] == []
     assert len(ended["instant"]) > RANDOM_FAULTS / 4
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("law", ["vsg-2", "droop-3"])
+def test_no_clearing_behind_a_transformer_stops_the_law(law):
+    """The converter of the published tests; one fault in three is at its connection point."""
+    chance, stops = random.Random(5), []
+    under = load_under_test(None).plant.model_dump(mode="json", exclude_unset=True)
+    for _ in range(RANDOM_FAULTS):
+        lasts = round(chance.uniform(0.06, 0.25), 5)
+        place = 0.0 if chance.random() < 1 / 3 else round(chance.uniform(0.02, 0.95), 4)
+        event = {
+            "type": "fault", "kind": chance.choice(("3ph", "LG", "LL", "LLG")), "duration": lasts,
+            "position": place, "R": chance.choice((0.001, 0.01, 0.05)),
+        }  # fmt: skip
+        plant = {**under, "grid": {"scr": 1.5 * 13.3 ** chance.random(), "x_over_r": 6.0}}
+        references = {"P_ref": chance.uniform(-0.8, 0.8)}
+        found = run(event, 1.0, law, plant=plant, references=references)
+        since = found.signals["t"][-1] - 0.2 - lasts
+        if found.status == "safe" or (found.status != "completed" and 0.0 <= since < 0.03):
+            stops.append((event, plant["grid"], references, found.summary["reason"]))
+    assert stops == []
 
 
 @pytest.mark.parametrize("law", ["vsg-2", "droop-3"])

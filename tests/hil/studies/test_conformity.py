@@ -809,6 +809,14 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
         ("least = 0.05", "least = 0.05\nwindow = [0.0, 2.0]\nat = [0.5]", "window to 2"),
         ("f_n = 50.0", 'f_n = 50.0\njudged = "twin"', "judged: 'twin'"),
         ("duration = 1.5", 'duration = 1.5\nlaw = "vsg-2"', "scenario.law"),
+        (
+            "x_over_r = 6.0 }", "x_over_r = 6.0 }, lcl = { L = 0.1 }",
+            "jump.toml: scenario.plant.lcl: belongs to the converter under test; a test sets grid",
+        ),
+        (
+            "x_over_r = 6.0 }", "x_over_r = 6.0 }, factors = { L_f = 2.0 }",
+            "scenario.plant.factors.L_f: belongs to the converter under test",
+        ),
         ('known = "ours"', 'known = "rumour"', "rumour"),
         ('kind = "no_trip"', 'kind = "nfp"\nunknown = "why"', "nfp: must be its only criterion"),
         ('kind = "no_trip"', 'kind = "nfp"', "bands, unknown: give one of them"),
@@ -828,6 +836,15 @@ def test_wrong_test_files_are_told_in_one_line(lab, refused, old, new, says):
     (lab / "jump.toml").write_text(LAB.replace(old, new))
     line = refused("conform", "--law", "droop-3", "--against", str(lab))
     assert "jump.toml" in line and says in line
+
+
+def test_a_test_replaces_what_its_clause_demands(lab):
+    text = LAB.replace("x_over_r = 6.0 }", "x_over_r = 6.0 }, lcl = { L = 0.1 }")
+    (lab / "jump.toml").write_text(text.replace("f_n = 50.0", 'f_n = 50.0\nreplaces = ["lcl"]'))
+    (case,) = load_cases([str(lab / "jump.toml")])
+    made = scenario_of(case, case.test.runs()[0], UNDER, "vsg-2", None, lab)
+    assert UNDER.plant.lcl.L == 0.15 and made.plant.lcl.L == 0.1
+    assert made.plant.i_peak == UNDER.plant.i_peak
 
 
 @pytest.mark.compilers

@@ -29,6 +29,8 @@ from gfm_runtime.errors import allowed, printable
 from gfm_runtime.toml_file import read_toml
 
 ALL = "all"
+#: what a test may set of a converter's plant: its grid, and in a network its line to the bus
+_OF_A_TEST = ("grid", "factors.L_g", "factors.R_g")
 _FOLDER, _UNDER_TEST = "conformity", "converter.toml"
 _LIMIT = ("test", "clause", "criterion", "limit", "source", "known")  # of an entry of the list
 
@@ -72,6 +74,11 @@ class Test(StrictSchema):
     )
     scenario: dict[str, Any] = Field(
         description="the run: keys of a scenario file except title, law, inner, link and mode"
+    )
+    replaces: list[str] = Field(
+        [],
+        description="keys of the plant, such as lcl, that the clause of the source demands other "
+        "than the converter under test has them",
     )
     criteria: list[Criterion] = Field([], description="what is asked of every part")
     parts: list[TestPart] = Field([], description="runs of the test; one if none")
@@ -176,6 +183,14 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
             for name in names
             if name and name not in members
         ]
+    for where, plant in _plants(content):
+        found += [
+            f"{where}.{key}: belongs to the converter under test; a test sets "
+            f"{', '.join(_OF_A_TEST)} of a plant, or what it names in replaces"
+            for key in _keys(plant)
+            if key not in (*_OF_A_TEST, *test.replaces)
+            and key.partition(".")[0] not in test.replaces
+        ]
     duration = content["duration"]
     for c in test.asked(part):
         window = getattr(c, "window", None) or (0.0, 0.0)
@@ -186,6 +201,19 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
                     f"run, which ends at {duration:g} s"
                 )
     return found
+
+
+def _plants(content: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Each table of a plant that a part has, and where."""
+    members = (content.get("network") or {}).get("converters", {})
+    each = [(f"scenario.network.converters.{name}.plant", one) for name, one in members.items()]
+    return [("scenario.plant", content["plant"]), *((w, one.get("plant", {})) for w, one in each)]
+
+
+def _keys(plant: Mapping[str, Any]) -> list[str]:
+    """The keys of a plant; those of its factors one by one, and its place in a network aside."""
+    factors = [f"factors.{name}" for name in plant.get("factors", {})]
+    return [*(key for key in plant if key not in ("factors", "node")), *factors]
 
 
 def all_limits(cases: Sequence[Case]) -> list[dict[str, str]]:
