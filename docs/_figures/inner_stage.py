@@ -155,7 +155,7 @@ def sequence() -> None:
     """How far the reactance of the negative sequence may be from the stator's."""
     rows, scrs = [], (1.0, 1.5, 3.0, 10.0, 20.0)
     law = load_law("vsg-2", "dual-sequence").laws[0]
-    for X_n in (0.2, 0.3, 0.45, 0.6, 0.9):
+    for X_n in (0.2, 0.3, 0.45, 0.6, 0.9, 1.2):
         cells = []
         for scr in scrs:
             plant = {**_PLANT, "grid": {"scr": scr, "x_over_r": 6.0}, "lcl": {"L": 0.15}}
