@@ -516,7 +516,7 @@ def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_co
         "dc_source": {"mode": "regulated"},
     }
     content = {
-        "title": "closed form", "f_n": 50.0,
+        "title": "closed form", "f_n": 50.0, "replaces": ["factors", "dc_source"],
         "source": {"document": "here", "clause": "closed form", "revision": "1", "known": "ours"},
         "scenario": {
             "duration": 1.0, "references": {"P_ref": 0.0}, "plant": plant,
