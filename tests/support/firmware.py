@@ -12,7 +12,7 @@ from gfm_runtime import BuiltLaw, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
-from gfm_runtime.inner import DualSequence, PRIORITIES, PowerLimiter, STAGES, settle
+from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
 from gfm_runtime.signals import NU, carried_rows, group
 from gfm_runtime.switchover import settle_into
@@ -44,7 +44,7 @@ def _staged() -> dict[str, BuiltLaw]:
             laws[f"{kind} {priority}"] = replace(LAWS["vsg-2"], inner=stage)
     for name, law in laws.items():
         if isinstance(law.inner, DualSequence):
-            laws[name] = replace(law, inner=law.inner.model_copy(update={"f_seq": 60.0}))
+            laws[name] = replace(law, inner=law.inner.model_copy(update={"f_seq": 20.0}))
     return laws | {"no stage": LAWS["mimo-gfm"]}
 
 
