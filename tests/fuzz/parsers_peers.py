@@ -21,10 +21,11 @@ from gfm_hil.links.can.node import TRANSPORT, Node, process
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import MOST, frame_dtype
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
-from gfm_hil.links.serial.framing import Unstuffer, stuffed
+from gfm_hil.links.serial.framing import stuffed
 from gfm_hil.scenario import check_scenario
 from gfm_runtime.signals import NU, NY
 
+from ..support.links import Unstuffer
 from .conftest import Parser, Take
 from .mutations import blobs, lines, texts
 

@@ -16,7 +16,9 @@ from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, link_kind, open_link
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.impaired.link import ImpairedLink
+from gfm_hil.links.serial.line import COUNT_DAMAGED, feed, make_line, take
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.parts import RolePart
@@ -99,6 +101,36 @@ class Tampering:
 Touch = Callable[[Role, Link], Link]
 
 
+class Unstuffer:
+    """Takes bytes as they come from a serial line, and gives whole messages, as the compiled link
+    does.
+
+    Attributes:
+        damaged: what stood between two zeros and was no message.
+    """
+
+    def __init__(self) -> None:
+        self._line, self._message = make_line(), np.zeros(LONGEST, np.uint8)
+        self._found: list[bytes] = []
+
+    @property
+    def damaged(self) -> int:
+        return int(self._line[COUNT_DAMAGED])
+
+    def feed(self, came: bytes) -> None:
+        for begin in range(0, len(came), 4096):
+            feed(self._line, came[begin : begin + 4096])
+            while size := take(self._line, self._message):
+                self._found.append(self._message[:size].tobytes())
+
+    def next(self) -> bytes | None:
+        return self._found.pop(0) if self._found else None
+
+    def all(self) -> list[bytes]:
+        found, self._found = self._found, []
+        return found
+
+
 @dataclass
 class Pair:
     """The results of a run in two threads.
@@ -134,12 +166,13 @@ def run_pair(
     options: dict[str, Any] | None = None,
     touch: Touch = lambda role, link: link,
     stopped: Callable[[], bool] = lambda: False,
-    endpoint: str | None = None,
+    endpoint: str | dict[Role, str] | None = None,
 ) -> Pair:
-    """Run a scenario over a link, new if there is no ``endpoint``; ``touch`` may wrap an end after
-    the handshake."""
+    """Run a scenario over a link, new if there is no ``endpoint``, one or one a side; ``touch`` may
+    wrap an end after the handshake."""
     folder.mkdir(parents=True, exist_ok=True)
     where = endpoint or link_kind(link).fresh(folder)
+    wheres = where if isinstance(where, dict) else dict.fromkeys(ROLES, where)
     benches = {role: make_bench(scenario) for role in ROLES}
     parts = {
         role: RolePart.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES
@@ -150,7 +183,7 @@ def run_pair(
 
     def call(role: Role) -> None:
         bench, part, impairment = benches[role], parts[role], scenario.link.impairment
-        end = open_link(link, role, where, options, bench.inner)
+        end = open_link(link, role, wheres[role], options, bench.inner)
         timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         used = end
         if impairment is not None and impairment.hits(role):

@@ -72,6 +72,34 @@ def _limit(row: Row) -> str:
     return "limit" if row["peer"] == "C" else times(row["ratio_to_baseline_p50"])
 
 
+_QUICK, _NEAR = 1.3, 2.0  # times the limit
+_TICK_US = 100.0
+
+
+def latency_verdicts(content: Row) -> Iterator[str]:
+    """What the round trips say of each link of ours, a sentence each: its limit, the ratio to it,
+    and which share of the answers came within a tick of 100 µs."""
+    rows = content["results"]
+    limits = {(r["name"], r["mode"], r["load"]): r for r in rows if r["peer"] == "C"}
+    for row in rows:
+        if row["peer"] != "ours" or row["p50_us"] is None:
+            continue
+        text = f"{row['name']}, {row['mode']}, {row['load']}: p50 {micro(row['p50_us'])} µs"
+        ratio = row["ratio_to_baseline_p50"]
+        limit = limits.get((row["baseline"], row["mode"], row["load"]))
+        if ratio is not None and limit is not None:
+            far = f"{times(ratio)} {row['baseline']} ({micro(limit['p50_us'])} µs)"
+            how = "as quick as its limit" if ratio <= _QUICK else "near its limit"
+            text += f", {far}: {how if ratio <= _NEAR else 'slower than its limit'}"
+        within = [share for name, share in SHARES.items() if row[f"{name}_us"] <= _TICK_US]
+        if row["mode"] == "realtime":
+            most = (
+                f"{100 * max(within):g} % of the answers" if within else "not half of the answers"
+            )
+            text += f"; {most} within a tick of {_TICK_US:g} µs"
+        yield text
+
+
 def jitter_tables(content: Row) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
     if "jitter" in content:

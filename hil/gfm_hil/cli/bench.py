@@ -110,6 +110,7 @@ def call(options: argparse.Namespace) -> int:
     from gfm_hil.bench.options import measurements
     from gfm_hil.bench.page import all_tables, write_page
     from gfm_hil.bench.result import new_result, write_result
+    from gfm_hil.bench.tables import latency_verdicts
 
     parts = measurements(options)
     folder = new_folder(options.out, f"bench-{options.kind}")
@@ -122,7 +123,8 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(content, indent=1))
         return 0
-    _print([table for _, table in all_tables(content)], (*content["remarks"], *content["caveats"]))
+    said = *latency_verdicts(content), *content["remarks"], *content["caveats"]
+    _print([table for _, table in all_tables(content)], said)
     print(f"{content['seconds']:g} s · {folder / 'bench.html'}")
     return 0
 

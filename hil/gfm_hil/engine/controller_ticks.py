@@ -10,6 +10,7 @@ first computes the ticks since the last one, with the y of that one, and sends n
 """
 
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
+from gfm_hil.engine.replay import stands_still
 from gfm_hil.engine.tick import answer
 from gfm_hil.links.frame import judge, pack, pack_again, skip, unpack
 from gfm_hil.realtime.clock import AHEAD_NS, now_ns, sleep_until, spin_or_yield, yield_processor
@@ -36,7 +37,7 @@ def controller_ticks(end, records, controller, event):
         records, controller: ``Records`` and ``ControllerRecords`` from there.
         event: tick of the next event.
     """
-    loop, _, y, u, _, times, _ = records
+    loop, y, u, times = records.loop, records.y, records.u, records.times
     ctl, laws, states, est = controller
     r = loop[0]
     sent = 0  # when the last answer left, in this call
@@ -45,7 +46,8 @@ def controller_ticks(end, records, controller, event):
         if why != ReturnReason.GO_ON:
             return why
         changes = ctl[0].changes
-        answer(ctl, laws, states, est, y, u, plant_tripped(end, r))
+        if not stands_still(records.plan, r.tick):
+            answer(ctl, laws, states, est, y, u, plant_tripped(end, r))
         why = reply(end, records, r, controller, event, changes)
         if why != ReturnReason.GO_ON:
             return why
@@ -92,7 +94,7 @@ def plant_tripped(end, r):
 @inlined
 def _between(end, records, r):
     """Take the y received once its tick is there; note the times of a tick before it."""
-    _, _, y, _, _, times, _ = records
+    y, times = records.y, records.times
     got, _ = end.into
     if r.tick == r.received and r.left == 0:
         for j in range(len(y)):
@@ -108,7 +110,7 @@ def reply(end, records, r, controller, event, changes):
 
     ``changes`` is how often the law had changed before this tick.
     """
-    _, _, _, u, rows, times, progress = records
+    u, rows, times, progress = records.u, records.rows, records.times, records.progress
     ctl, _, states, est = controller
     sequence, frame, message = end.out
     k = r.tick
@@ -138,7 +140,7 @@ def _next_frame(end, records, r, ctl, sent):
     The time since the last answer was ``sent`` (0: there was none), which the link's own thread
     took, is a gap between two looks at the clock like any other.
     """
-    _, flags, y, _, _, times, _ = records
+    flags, y, times = records.flags, records.y, records.times
     got, got_bytes = end.into
     reader = end.reader
     judge(reader, False, ctl[0].state == SAFE)

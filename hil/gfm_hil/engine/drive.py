@@ -88,7 +88,14 @@ class _End:
             (w.sequence, w.frame, w.message), (r.frame, r.message), r.record,
         )  # fmt: skip
         records = Records(
-            self.loop, flags, bench.y, bench.u, part.signals, part.times, part.progress
+            self.loop,
+            flags,
+            bench.y,
+            bench.u,
+            part.signals,
+            part.times,
+            part.progress,
+            *bench.trace,
         )
         self.side = Side(end, records)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.engine.loop_records import ControllerRecords, ReturnReason
+from gfm_hil.engine.replay import Trace, no_trace, replay, stands_still
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
@@ -64,10 +65,13 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 
 @compiled
-def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, survives_trip):
+def _run_ticks(
+    plant, stack, plant_rows, controller_rows, start, stop, first, survives_trip, plan, kept
+):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
     ctl, laws, states, est = stack.controllers
     y, u, st = stack.y, stack.u, plant.st
+    told = u if len(plan) == 0 else kept[len(kept) - 1 :]
     delayed = plant_is_delayed(plant)
     for k in range(start, stop):
         changed, trips = False, 0
@@ -76,9 +80,12 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, su
             tripped = sample(plant, i, y[i], row)
             trips += tripped
             mine, estimate = ctl[i : i + 1], est[i : i + 1]
-            answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
+            if not stands_still(plan, k):
+                answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
             record_controller(controller_rows[i, k - first], mine, states[i], estimate)
-            record_command(row, u[i])
+            if len(plan) > 0:
+                replay(plan, kept, k, u[i], told[i])
+            record_command(row, told[i])
             changed = changed or ctl[i].changes != changes or ctl[i].state != before
         if delayed:  # as over a link, where u[k] may come meanwhile
             plant_step(plant)
@@ -86,7 +93,7 @@ def _run_ticks(plant, stack, plant_rows, controller_rows, start, stop, first, su
             state = ctl[i].state
             if apply_peer_state(plant, i, survives_trip, state) != ReturnReason.GO_ON:
                 return k + 1, False
-            if take(plant, i, u[i], st[i].trip, state, True) != ReturnReason.GO_ON:
+            if take(plant, i, told[i], st[i].trip, state, True) != ReturnReason.GO_ON:
                 return k + 1, False
         if not delayed:
             plant_step(plant)
@@ -107,6 +114,7 @@ def run_ticks(
     stop: int,
     first: int = 0,
     survives_trip: bool = False,
+    trace: Trace | None = None,
 ) -> int:
     """Run ticks [start, stop); returns the tick after the last one done.
 
@@ -118,9 +126,10 @@ def run_ticks(
         plant_rows, controller_rows: shape (N, ticks, columns), of every tick from ``first`` on,
             columns as ``signals_of`` says.
         survives_trip: the run does after a trip.
+        trace: what the run replays, if anything.
     """
-    rows = plant_rows, controller_rows
-    return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip)[0])
+    rows, more = (plant_rows, controller_rows), trace or no_trace()
+    return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip, *more)[0])
 
 
 def run_inproc(
@@ -145,7 +154,15 @@ def run_inproc(
         while k < stop and calm:
             end = min(k + piece, stop)
             done, calm = _run_ticks(
-                plant, controllers, plant_rows, controller_rows, k, end, k, survives_trip
+                plant,
+                controllers,
+                plant_rows,
+                controller_rows,
+                k,
+                end,
+                k,
+                survives_trip,
+                *bench.trace,
             )
             for room, parts in sides:
                 for part, recorded in zip(parts, room, strict=True):

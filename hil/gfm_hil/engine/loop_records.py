@@ -106,6 +106,7 @@ class Records(NamedTuple):
         y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
             stage, p.u.
         rows, times, progress: of the recording's part.
+        plan, kept: of the trace that is replayed, see ``gfm_hil.engine.replay``.
     """
 
     loop: NDArray[Any]
@@ -115,6 +116,8 @@ class Records(NamedTuple):
     rows: NDArray[np.float64]
     times: NDArray[np.int64]
     progress: NDArray[np.int64]
+    plan: NDArray[np.int64]
+    kept: NDArray[np.float64]
 
 
 class Side(NamedTuple):

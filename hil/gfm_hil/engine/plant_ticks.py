@@ -12,6 +12,7 @@ tick k + n on (before tick n u[0] acts): a delay of n ticks, in lockstep as in r
 """
 
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
+from gfm_hil.engine.replay import replay
 from gfm_hil.engine.tick import apply_peer_state, asks_to_start, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, skip, unpack
 from gfm_hil.realtime.clock import (
@@ -32,7 +33,8 @@ from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
-AWAITED, FRESH, OVERDUE, LEAVING, CUT_OFF = range(5)  # what came of u[k]
+# what came of u[k]; HELD_BACK: it came, and the trace that is replayed says that it did not
+AWAITED, FRESH, OVERDUE, LEAVING, CUT_OFF, HELD_BACK = range(6)
 _NOTHING, _OTHER, _OVER = range(3)  # what one read of a link gives
 _UNRESTED, _REST_NS = 10, 50_000  # ticks; ns
 
@@ -263,6 +265,8 @@ def _close(side, plant, i, k, gap, hurried):
     came = r.came
     if came == CUT_OFF and r.others == 0:
         return ReturnReason.GONE
+    if came == FRESH and len(records.plan) > 0 and not replay(records.plan, records.kept, k, u, u):
+        came, records.times[k, 3] = HELD_BACK, -1
     if came == FRESH:
         if hurried:
             r.unseen = k
@@ -282,7 +286,7 @@ def _close(side, plant, i, k, gap, hurried):
             r.lost = LEFT
         elif came == CUT_OFF:
             r.lost = GONE
-        elif came != FRESH and not r.realtime:
+        elif came != FRESH and came != HELD_BACK and not r.realtime:
             judge(reader, came == OVERDUE, True)
             if came != OVERDUE:
                 return ReturnReason.STOPPED_HERE

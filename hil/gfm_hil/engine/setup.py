@@ -4,7 +4,7 @@ Both sides build the same bench from the same scenario, possibly on two machines
 frames have to cross the link.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
+from gfm_hil.engine.replay import Trace, no_trace, trace_of
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
@@ -37,6 +38,7 @@ class Bench:
         y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
         u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
         external: what computes u in place of the law; None for the law.
+        trace: what the run replays.
     """
 
     scenario: Scenario
@@ -47,6 +49,7 @@ class Bench:
     y: NDArray[np.float64]
     u: NDArray[np.float64]
     external: SteppedController | None = None
+    trace: Trace = field(default_factory=no_trace)
 
     @property
     def inner(self) -> bool:
@@ -151,7 +154,8 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         else:
             controller.start(start.x_law, start.u)
         told = start.commands[: len(carried("u", inner))].copy()
-        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told)
+        trace = trace_of(one, told)
+        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told, trace=trace)
         bench.keep()
         gains_of(one, controller.omega_b)
         benches.append(bench)

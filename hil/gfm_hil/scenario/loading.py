@@ -172,10 +172,10 @@ def look_beside(content: Any, folder: Path) -> None:
         file = table[key]
         if not isinstance(file, str) or "\0" in file:
             continue
-        if key != "file" and not file.endswith(".toml"):
+        if key not in ("file", "trace") and not file.endswith(".toml"):
             continue
         with contextlib.suppress(OSError):  # a name too long: the check of the file says so
-            if (folder / file).is_file():
+            if (folder / file).is_file() or (key == "trace" and (folder / file).is_dir()):
                 table[key] = str((folder / file).absolute())
 
 
@@ -193,6 +193,7 @@ def _files(content: Any) -> Iterator[tuple[Any, Any]]:
     for one in (content, *_inside(content, "network", "converters").values()):
         yield from within(one, "law", "inner", "ready_laws", "compare")
         yield from within(_inside(one, "plant"), "converter")
+        yield from within(_inside(one, "link", "impairment"), "trace")
     events = content.get("events") if isinstance(content, dict) else None
     for event in events if isinstance(events, list) else ():
         yield from within(event, "file", "law")

@@ -13,6 +13,7 @@ import pytest
 from gfm_hil.bench.histogram import summary
 from gfm_hil.bench.page import all_tables, figures, write_page
 from gfm_hil.bench.rounds import spread
+from gfm_hil.bench.tables import latency_verdicts
 from gfm_hil.realtime.environment import caveats, environment
 
 
@@ -160,3 +161,13 @@ def test_caveats_follow_the_badge():
     ):  # fmt: skip
         (said,) = caveats(ideal | change)
         assert word in said
+
+
+def test_each_link_gets_a_sentence_with_its_limit(content):
+    said = [*latency_verdicts(content)]
+    assert len(said) == 8  # two links, two modes, two loads
+    (shm,) = (text for text in said if text.startswith("shm, realtime, idle"))
+    assert re.search(r"1\.25 × C shm \(0\.\d\d µs\): as quick as its limit", shm)
+    assert shm.endswith("100 % of the answers within a tick of 100 µs")
+    (other,) = (text for text in said if text.startswith("<zmq> & Co, lockstep, idle"))
+    assert " × " not in other and "tick" not in other

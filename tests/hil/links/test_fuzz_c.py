@@ -18,7 +18,7 @@ import gfm_hil.controllers
 from gfm_hil.engine.handshake import _Hello
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameReader, FrameWriter
-from gfm_hil.links.serial.framing import Unstuffer, stuffed
+from gfm_hil.links.serial.framing import stuffed
 from gfm_runtime.firmware import make_modules, sources
 from gfm_runtime.firmware.check import HARNESS
 from gfm_runtime.firmware.folder import selftest
@@ -26,6 +26,7 @@ from gfm_runtime.firmware.loop import _states
 
 from ...support.firmware import STAGED, T_S, cc, exported
 from ...support.laws import LAWS
+from ...support.links import Unstuffer
 
 pytestmark = [
     pytest.mark.compilers,

@@ -27,7 +27,7 @@ FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
 #: files of this folder with links and limits, in the order of the tables. Each has a function
 #: ``contenders(names, place)`` that yields what it adds to the links and peers of these names;
 #: place is a folder in memory with a short path.
-FILES = ("udp", "shm", "zmq")
+FILES = ("udp", "shm", "zmq", "serial")
 #: files of what one would pick instead, and the packages that each needs
 PEERS = {
     "cyclonedds": ("cyclonedds",),
@@ -112,7 +112,7 @@ def limit(
 def fresh(link: str, place: Path) -> str:
     """A new endpoint of a link."""
     folder = place / link
-    folder.mkdir()
+    folder.mkdir(parents=True)
     return link_kind(link).fresh(folder)
 
 

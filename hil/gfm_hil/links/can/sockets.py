@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import carray, types  # type: ignore[attr-defined]
+from numba import types
 
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
+from gfm_hil.links.system import errno_now, poll
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import cached
 
@@ -39,18 +40,10 @@ _NONE_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN)
 _EVENTS = 32  # bit offset of ``events`` in struct pollfd
 
-# send(2), recv(2) and poll(2) of libc; addresses are int64
+# send(2) and recv(2) of libc; addresses are int64
 _transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
 _send: Any = types.ExternalFunction("send", _transfer)
 _recv: Any = types.ExternalFunction("recv", _transfer)
-_poll: Any = types.ExternalFunction("poll", types.int32(types.int64, types.int64, types.int32))
-_errno_place: Any = types.ExternalFunction("__errno_location", types.CPointer(types.int32)())
-
-
-@cached
-def _errno():
-    """errno of the previous call."""
-    return np.int64(carray(_errno_place(), 1)[0])
 
 
 def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = ()) -> None:
@@ -65,7 +58,7 @@ def write_frame(sockets, frame):
     s, address = sockets[0], frame.ctypes.data
     if s.kind == SOCKETCAN:
         size = MTU_FD if frame[0].flags & FD else MTU
-        return 0 if _send(s.fd, address, size, _DONTWAIT) == size else _errno()
+        return 0 if _send(s.fd, address, size, _DONTWAIT) == size else errno_now()
     problem = 0
     size = HEAD + frame[0].length
     for k in range(_OTHERS):
@@ -73,7 +66,7 @@ def write_frame(sockets, frame):
             continue
         s.empty_until[k] = 0
         if _send(s.others[k], address, size, _DONTWAIT) != size:
-            why = _errno()
+            why = errno_now()
             if why == errno.ECONNREFUSED:  # reports the previous datagram, not this one
                 s.empty_until[k] = now_ns() + _RECHECK_NS
             else:
@@ -87,7 +80,7 @@ def read_frame(sockets, frame):
     or the negative errno."""
     got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD, _DONTWAIT)
     if got < 0:
-        why = _errno()
+        why = errno_now()
         return 0 if why in _NONE_NOW else -why
     if got == 0 and sockets[0].kind == SOCKETCAN:  # the bridge has left
         return -errno.ENOTCONN
@@ -99,4 +92,4 @@ def read_frame(sockets, frame):
 @cached
 def sleep_for_frame(sockets, ms):
     """Sleep until the socket is readable, at most ``ms``."""
-    _poll(sockets.ctypes.data + _POLL_AT, 1, ms)
+    poll(sockets.ctypes.data + _POLL_AT, 1, ms)

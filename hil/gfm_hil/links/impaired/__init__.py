@@ -36,10 +36,22 @@ class Impairment(LinkOptions):
         None, ge=0, le=10**12, description="frame at which the process is killed"
     )
 
+    trace: str | None = Field(
+        None,
+        min_length=1,
+        description="run folder or file of a trace: its delays and misses tick by tick, in lockstep"
+        "; with no other fault",
+    )
+
     @model_validator(mode="after")
     def _something(self) -> Impairment:
         faults = self.loss, self.corrupt, self.duplicate, self.reorder, self.delay, self.jitter
-        if not any(faults) and self.pause_at is None and self.kill_at is None:
+        others = any(faults) or self.pause_at is not None or self.kill_at is not None
+        if self.trace is not None:
+            if others:
+                raise ValueError("trace: stands alone, without another fault")
+            return self
+        if not others:
             raise ValueError("nothing: give loss, corrupt, duplicate, reorder, delay, jitter, ...")
         if sum(faults[:4]) > 1:
             raise ValueError(
@@ -49,4 +61,4 @@ class Impairment(LinkOptions):
 
     def hits(self, role: Role) -> bool:
         """Whether the faults apply to this side's incoming frames."""
-        return self.towards in ("both", role)
+        return self.trace is None and self.towards in ("both", role)

@@ -25,6 +25,12 @@ def _open(role: Role, endpoint: str, options: SerialOptions) -> Link:
     return SerialLink(role, endpoint, options)
 
 
+def _warm_up(options: LinkOptions) -> None:
+    from gfm_hil.links.serial.line import warm_up
+
+    warm_up()
+
+
 def _fresh(folder: Path) -> str:
     return f"{PTY}://{folder}/line"
 
@@ -37,4 +43,5 @@ KIND = LinkKind(
     fresh=_fresh,
     open=_open,
     options=SerialOptions,
+    warm_up=_warm_up,
 )

@@ -1,4 +1,4 @@
-"""Messages on a line of bytes: stuffed by COBS, with a zero byte after each.
+"""Messages on a line of bytes: stuffed by COBS, with a zero byte after each; compiled.
 
 Consistent Overhead Byte Stuffing (S. Cheshire and M. Baker, IEEE/ACM Transactions on Networking
 7(2), 1999) takes the zeros out of a message for one byte in 254. A zero therefore ends a message
@@ -8,83 +8,87 @@ greeting, which has none, gets one here.
 
 from __future__ import annotations
 
-import zlib
-from collections import deque
+from typing import Any
+
+import numpy as np
 
 from gfm_hil.links.base import LONGEST
+from gfm_hil.links.crc import crc32
+from gfm_runtime.compiled import cached
 
 _RUN = 254  # bytes without a zero that one code byte covers
 _CRC = 4  # bytes, little-endian
-_GREETING = b"GFMHIL "
+_GREETING = np.frombuffer(b"GFMHIL ", np.uint8)
+_LONG = LONGEST + _CRC  # bytes of the longest message with its CRC
 #: bytes on the line of the longest message, without its zero
-_MOST = LONGEST + _CRC + (LONGEST + _CRC) // _RUN + 1
+MOST = _LONG + _LONG // _RUN + 1
+DAMAGED = -1
+
+
+@cached
+def _is_greeting(message, size):
+    same = size >= len(_GREETING)
+    for k in range(min(size, len(_GREETING))):
+        same = same and message[k] == _GREETING[k]
+    return same
+
+
+@cached
+def stuff(message, out):
+    """Write a message as it goes to the line, with the zero that ends it; returns the bytes.
+
+    Args:
+        message: at most ``LONGEST`` bytes.
+        out: room for ``MOST`` + 1 bytes.
+    """
+    size = len(message)
+    total, crc = size, np.int64(0)
+    if _is_greeting(message, size):
+        total, crc = size + _CRC, np.int64(crc32(message, size))
+    code_at, at, run = 0, 1, 1
+    for k in range(total):
+        byte = message[k] if k < size else np.uint8((crc >> (8 * (k - size))) & 0xFF)
+        if byte == 0:
+            out[code_at] = run
+            code_at, at, run = at, at + 1, 1
+            continue
+        out[at] = byte
+        at, run = at + 1, run + 1
+        if run == _RUN + 1:
+            out[code_at] = run
+            code_at, at, run = at, at + 1, 1
+    out[code_at], out[at] = run, 0
+    return at + 1
+
+
+@cached
+def unstuff(piece, size, message):
+    """Write the message of ``size`` > 0 bytes that stood between two zeros of the line, at most
+    ``MOST``, into ``message``, room for as many; returns its length, or ``DAMAGED``."""
+    at, n = 0, 0
+    while at < size:
+        code: Any = np.int64(piece[at])
+        if code == 0 or at + code > size:
+            return DAMAGED
+        for k in range(at + 1, at + code):
+            message[n] = piece[k]
+            n += 1
+        at += code
+        if code <= _RUN and at < size:
+            message[n] = 0
+            n += 1
+    if _is_greeting(message, n):
+        n -= _CRC
+        if n < len(_GREETING):
+            return DAMAGED
+        crc = np.int64(crc32(message, n))
+        for k in range(_CRC):
+            if message[n + k] != (crc >> (8 * k)) & 0xFF:
+                return DAMAGED
+    return n if 0 < n <= LONGEST else DAMAGED
 
 
 def stuffed(message: bytes) -> bytes:
     """A message as it goes to the line, with the zero that ends it."""
-    if message.startswith(_GREETING):
-        message += zlib.crc32(message).to_bytes(_CRC, "little")
-    out = bytearray()
-    for part in message.split(b"\0"):
-        while len(part) >= _RUN:
-            out += b"\xff" + part[:_RUN]
-            part = part[_RUN:]
-        out.append(len(part) + 1)
-        out += part
-    out.append(0)
-    return bytes(out)
-
-
-def unstuffed(piece: bytes) -> bytes | None:
-    """The message of what stood between two zeros of the line; None if it is damaged."""
-    out, at = bytearray(), 0
-    while at < len(piece):
-        code = piece[at]
-        part = piece[at + 1 : at + code]
-        if code == 0 or len(part) != code - 1:
-            return None
-        out += part
-        at += code
-        if code <= _RUN and at < len(piece):
-            out.append(0)
-    message = bytes(out)
-    if message.startswith(_GREETING):
-        message, crc = message[:-_CRC], message[-_CRC:]
-        if zlib.crc32(message).to_bytes(_CRC, "little") != crc:
-            return None
-    return message
-
-
-class Unstuffer:
-    """Takes bytes as they come from a line, and gives whole messages.
-
-    Attributes:
-        damaged: what stood between two zeros and was no message.
-    """
-
-    def __init__(self) -> None:
-        self.damaged = 0
-        self._piece = bytearray()
-        self._found: deque[bytes] = deque()
-
-    def feed(self, came: bytes) -> None:
-        """Take the next bytes of the line."""
-        *whole, rest = came.split(b"\0")
-        for end in whole:
-            self._piece += end[: _MOST + 1]
-            if self._piece:
-                self._end()
-        self._piece += rest[: _MOST + 1]
-        del self._piece[_MOST + 1 :]  # too long for a message: the rest, up to a zero, is one too
-
-    def _end(self) -> None:
-        message = unstuffed(bytes(self._piece)) if len(self._piece) <= _MOST else None
-        self._piece.clear()
-        if not message or len(message) > LONGEST:
-            self.damaged += 1
-        else:
-            self._found.append(message)
-
-    def next(self) -> bytes | None:
-        """The next message, or None if none is whole yet."""
-        return self._found.popleft() if self._found else None
+    out = np.zeros(MOST + 1, np.uint8)
+    return out[: stuff(np.frombuffer(bytearray(message), np.uint8), out)].tobytes()

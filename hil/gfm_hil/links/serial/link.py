@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import os
 import select
-import struct
-import termios
 import time
 import tty
 from pathlib import Path
 
+import numpy as np
+
 from gfm_hil.core.errors import PeerLost, UserError, need
 from gfm_hil.core.roles import Role
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.port import Port
 from gfm_hil.links.serial import PTY, SerialOptions
-from gfm_hil.links.serial.framing import Unstuffer, stuffed
+from gfm_hil.links.serial.line import (
+    COUNT_DAMAGED,
+    DROPPED,
+    FD,
+    GONE,
+    line_port,
+    make_line,
+    receive,
+    send,
+    set_line,
+)
 
-_ROOM = 256  # bytes that may wait in the kernel when another message is sent
-_AT_ONCE = 4096  # bytes of a read
 _LOOK_S = 0.01  # poll interval while the other side's pseudo terminal is not there
-_NONE_NOW = (errno.EAGAIN, errno.EINTR)
 
 _DEFAULT = SerialOptions()
 
@@ -43,16 +47,14 @@ class SerialLink:
             ``receive`` and ``wait`` may raise it too.
     """
 
-    port: Port | None = None  # a thread pumps the messages
-
     def __init__(self, role: Role, endpoint: str, options: SerialOptions = _DEFAULT) -> None:
         need("serial", "pyserial", f"link.endpoint = {endpoint!r}", "serial")
         self._endpoint, self._options = endpoint, options
         scheme, _, path = endpoint.partition("://")
         self._pty, self._path = scheme == PTY, Path(path)
         self._ends = contextlib.ExitStack()
-        self._fd = -1
-        self._into, self._rest, self._dropped = Unstuffer(), b"", 0
+        self._line, self._message = make_line(), np.zeros(LONGEST, np.uint8)
+        self.port = line_port(self._line)
         if self._pty and role == "controller":
             self._make()
         else:
@@ -62,7 +64,8 @@ class SerialLink:
     def counters(self) -> dict[str, int]:
         """What the frame reader cannot count: damage before a message was whole, and messages of
         ours for which the line had no room."""
-        return {"damaged_messages": self._into.damaged, "dropped": self._dropped}
+        line = self._line
+        return {"damaged_messages": int(line[COUNT_DAMAGED]), "dropped": int(line[DROPPED])}
 
     def _make(self) -> None:
         """Make a pseudo terminal, and the symbolic link to it."""
@@ -79,13 +82,13 @@ class SerialLink:
             self._ends.close()
             raise self._unusable("made", problem.strerror) from None
         self._ends.callback(self._path.unlink, missing_ok=True)
-        self._fd = ours
+        set_line(self._line, ours)
 
     def _there(self) -> bool:
         """Whether the line is open; opens it as soon as possible."""
-        if self._fd < 0 and (not self._pty or self._path.exists()):
+        if self._line[FD] < 0 and (not self._pty or self._path.exists()):
             self._open()
-        return self._fd >= 0
+        return bool(self._line[FD] >= 0)
 
     def _open(self) -> None:
         import serial
@@ -102,7 +105,7 @@ class SerialLink:
             raise self._unusable("opened", why) from None
         self._ends.callback(line.close)
         line.reset_input_buffer()  # what came before we were there
-        self._fd = line.fileno()
+        set_line(self._line, line.fileno())
 
     def _unusable(self, verb: str, why: str | None) -> UserError:
         return UserError(f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {why}")
@@ -113,31 +116,12 @@ class SerialLink:
         Raises:
             PeerLost: the device is gone.
         """
-        if len(message) > LONGEST or not self._there():
+        if not self._there():
             return False
-        if self._write(self._rest) and self._waiting() <= _ROOM:
-            self._write(stuffed(message))
-            return True
-        self._dropped += 1
-        return False
-
-    def _waiting(self) -> int:
-        """Bytes that the kernel has not yet sent."""
-        try:
-            answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, b"\0\0\0\0")
-        except OSError as problem:  # the other side closed its pseudo terminal
-            raise self._gone(problem) from None
-        return int(struct.unpack("i", answer)[0])
-
-    def _write(self, what: bytes) -> bool:
-        """Write as much as there is room for, and keep the rest; whether that was all."""
-        try:
-            self._rest = what[os.write(self._fd, what) :] if what else b""
-        except OSError as problem:
-            if problem.errno not in _NONE_NOW:
-                raise self._gone(problem) from None
-            self._rest = what
-        return not self._rest
+        sent = send(self._line, np.frombuffer(bytearray(message), np.uint8))
+        if self._line[GONE]:
+            raise self._gone()
+        return bool(sent)
 
     def receive(self) -> bytes | None:
         """The next message, or None.
@@ -145,24 +129,17 @@ class SerialLink:
         Raises:
             PeerLost: the device is gone.
         """
-        message = self._into.next()
-        if message is None and self._there():
-            if self._rest:
-                self._write(self._rest)
-            try:
-                came = os.read(self._fd, _AT_ONCE)
-            except OSError as problem:
-                if problem.errno not in _NONE_NOW:
-                    raise self._gone(problem) from None
-                return None
-            if not came:
-                return None
-            self._into.feed(came)
-            message = self._into.next()
-        return message
+        if not self._there():
+            return None
+        size = receive(self._line, self._message)
+        if size < 0:
+            raise self._gone()
+        return self._message[:size].tobytes() if size else None
 
-    def _gone(self, problem: OSError) -> PeerLost:
-        return PeerLost(f"the serial line {self._path} is gone: {problem.strerror}")
+    def _gone(self) -> PeerLost:
+        """The error that says why the line is gone."""
+        why, self._line[GONE] = int(self._line[GONE]), 0
+        return PeerLost(f"the serial line {self._path} is gone: {os.strerror(why)}")
 
     def wait(self, seconds: float) -> bool:
         until = time.monotonic() + seconds
@@ -172,9 +149,13 @@ class SerialLink:
                 return False
             time.sleep(min(_LOOK_S, left))
         left = max(until - time.monotonic(), 0.0)
-        return bool(select.select([self._fd], [], [], left)[0])
+        return bool(select.select([self], [], [], left)[0])
+
+    def fileno(self) -> int:
+        """The file descriptor of the line; -1: it is not open."""
+        return int(self._line[FD])
 
     def close(self) -> None:
         """Close the line; the kernel still sends what it has accepted."""
-        self._fd = -1
+        set_line(self._line, -1)
         self._ends.close()

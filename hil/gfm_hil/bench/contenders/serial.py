@@ -1,0 +1,29 @@
+"""The link over a pseudo terminal, and its limit: the same bytes on one in C."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
+from gfm_hil.bench.pingpong import Messages, PingPong, in_c
+from gfm_hil.core.roles import Role
+from gfm_hil.links import open_link
+from gfm_hil.links.serial.link import SerialLink
+
+LIMIT = "C serial"
+
+
+def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "serial" in links:
+        yield limit(LIMIT, __file__, fresh("serial", place / "c"), _open)
+        yield of_link("serial", "serial", fresh("serial", place), LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    keep = ExitStack()
+    end = open_link("serial", role, c.endpoint)
+    keep.callback(end.close)
+    assert isinstance(end, SerialLink)
+    return in_c(c.library, [end.fileno()], own.shape[1], keep)

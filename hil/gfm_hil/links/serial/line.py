@@ -1,0 +1,180 @@
+"""Messages to and from the file descriptor of a line, compiled: libc's ``read`` and ``write``.
+
+All state is in one int64 array, the ``handle`` of the port: numbers first, then the bytes of what
+came, of the piece of a message up to its zero, of the message, and of what is still to be written.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import termios
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from gfm_hil.links.base import LONGEST
+from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.serial.framing import DAMAGED, MOST, stuff, unstuff
+from gfm_hil.links.system import errno_now, poll
+from gfm_runtime.compiled import cached
+
+#: numbers of the handle: the open line (-1: none), counts, errno of a line that is gone, ends
+(FD, COUNT_DAMAGED, DROPPED, GONE, _CAME_AT, _CAME_END, _PIECE_END, _REST_AT, _REST_END, _POLL,
+ _WAITING) = range(11)  # fmt: skip
+_NUMBERS = 16
+_WORD = 8
+_AT_ONCE = 4096  # bytes of a read
+_ROOM = 256  # bytes that may wait in the kernel when another message is sent
+_WORDS = (MOST + 2 + _WORD) // _WORD
+_CAME = _NUMBERS
+_PIECE = _CAME + _AT_ONCE // _WORD
+_MESSAGE = _PIECE + _WORDS
+_REST = _MESSAGE + _WORDS
+_SIZE = _REST + _WORDS
+
+_NONE_NOW = (errno.EAGAIN, errno.EINTR)
+_TIOCOUTQ = termios.TIOCOUTQ
+_EVENTS = 32  # bit offset of ``events`` in struct pollfd
+_PATIENCE_MS = 1
+_SPINS = 200  # the reader itself moves the bytes of a pseudo terminal, see n_tty_read of Linux
+
+# read(2), write(2) and ioctl(2) of libc; addresses are int64
+_transfer = types.int64(types.int32, types.int64, types.int64)
+_read: Any = types.ExternalFunction("read", _transfer)
+_write: Any = types.ExternalFunction("write", _transfer)
+_ioctl: Any = types.ExternalFunction("ioctl", types.int32(types.int32, types.int64, types.int64))
+
+
+def make_line() -> NDArray[np.int64]:
+    """The handle of a line that is not open yet."""
+    h = np.zeros(_SIZE, np.int64)
+    h[FD] = -1
+    return h
+
+
+def set_line(h: NDArray[np.int64], fd: int) -> None:
+    """The line is open; its owner keeps it so, and it does not block. -1: it is closed."""
+    h[FD], h[_POLL] = fd, max(fd, 0) | select.POLLIN << _EVENTS
+
+
+@cached
+def flush(h):
+    """Write what is left to write as far as there is room; whether that was all. If the line is
+    gone, GONE says why."""
+    left = h[_REST_END] - h[_REST_AT]
+    if left == 0:
+        return True
+    done = _write(h[FD], h.ctypes.data + _WORD * _REST + h[_REST_AT], left)
+    if done < 0:
+        why = errno_now()
+        if why not in _NONE_NOW:
+            h[GONE] = why
+        return False
+    h[_REST_AT] += done
+    return done == left
+
+
+@cached
+def send(h, message):
+    """Send a message; 0 if the line has no room for it, or is gone."""
+    if h[FD] < 0 or len(message) > LONGEST:
+        return 0
+    if flush(h):
+        if _ioctl(h[FD], _TIOCOUTQ, h.ctypes.data + _WORD * _WAITING) < 0:
+            h[GONE] = errno_now()  # the other side closed its pseudo terminal
+            return 0
+        if h[_WAITING] & 0xFFFFFFFF <= _ROOM:
+            h[_REST_AT], h[_REST_END] = 0, stuff(message, h[_REST:].view(np.uint8))
+            flush(h)
+            return 0 if h[GONE] else 1
+    if h[GONE] == 0:
+        h[DROPPED] += 1
+    return 0
+
+
+@cached
+def take(h, message):
+    """The next message of the bytes that came: its length, or 0 if none is whole."""
+    came, piece = h[_CAME:_PIECE].view(np.uint8), h[_PIECE:_MESSAGE].view(np.uint8)
+    while h[_CAME_AT] < h[_CAME_END]:
+        byte = came[h[_CAME_AT]]
+        h[_CAME_AT] += 1
+        n = h[_PIECE_END]
+        if byte != 0:
+            if n <= MOST:  # a longer piece is damaged, up to its zero
+                piece[n] = byte
+                h[_PIECE_END] = n + 1
+            continue
+        if n == 0:
+            continue
+        h[_PIECE_END] = 0
+        whole = h[_MESSAGE:_REST].view(np.uint8)
+        size = unstuff(piece, n, whole) if n <= MOST else DAMAGED
+        if size == DAMAGED:
+            h[COUNT_DAMAGED] += 1
+            continue
+        for k in range(min(size, len(message))):
+            message[k] = whole[k]
+        return size
+    return 0
+
+
+@cached
+def receive(h, message):
+    """The next message: its length, 0 if none is there, -1 if the line is gone."""
+    size = take(h, message)
+    if size != 0 or h[FD] < 0:
+        return size
+    flush(h)
+    if h[GONE] != 0:
+        return -1
+    got = _read(h[FD], h.ctypes.data + _WORD * _CAME, _AT_ONCE)
+    if got < 0:
+        why = errno_now()
+        if why in _NONE_NOW:
+            return 0
+        h[GONE] = why
+        return -1
+    h[_CAME_AT], h[_CAME_END] = 0, got
+    return take(h, message)
+
+
+def feed(h: NDArray[np.int64], some: bytes) -> None:
+    """Take up to 4096 bytes as if the line had brought them, once all before are taken."""
+    h[_CAME:_PIECE].view(np.uint8)[: len(some)] = np.frombuffer(some, np.uint8)
+    h[_CAME_AT], h[_CAME_END] = 0, len(some)
+
+
+@port_function
+def _port_send(handle, message):
+    return send(handle, message)
+
+
+@port_function
+def _port_receive(handle, message):
+    return receive(handle, message)
+
+
+@port_function
+def _port_await(handle, message):
+    size = receive(handle, message)
+    if size == 0:
+        poll(handle.ctypes.data + _WORD * _POLL, 1, _PATIENCE_MS)
+        size = receive(handle, message)
+    return size
+
+
+def line_port(h: NDArray[np.int64]) -> Port:
+    """The port of a line."""
+    return Port(h, _port_send, _port_receive, _SPINS, _port_await)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) what an end calls."""
+    h, message = make_line(), np.zeros(1, np.uint8)
+    line_port(h)
+    send(h, message)
+    receive(h, message)
