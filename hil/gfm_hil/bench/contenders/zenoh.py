@@ -37,6 +37,7 @@ class Zenoh:
         config = zenoh.Config()
         config.insert_json5("mode", '"peer"')
         config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("transport/shared_memory/enabled", "false")  # it outlives a kill
         way = "listen" if role == "controller" else "connect"
         config.insert_json5(f"{way}/endpoints", json.dumps([endpoint]))
         if way == "connect":
