@@ -232,7 +232,7 @@ def _part_is_enough(schema: dict[str, Any]) -> None:
     schema.pop("required")  # ``Protection`` completes it
 
 
-class Bridge(Options):
+class BridgeOptions(Options):
     """The bridge: its average over a period, or the switches themselves."""
 
     kind: Literal["average", "two-level"] = Field(
@@ -355,7 +355,9 @@ class Plant(Options):
         description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
         "the current of L_f stays within; none if not given",
     )
-    bridge: Bridge = Field(Bridge(), description="averaged, or switched and still solved exactly")
+    bridge: BridgeOptions = Field(
+        BridgeOptions(), description="averaged, or switched and still solved exactly"
+    )
     lcl: SecondInductor | None = Field(
         None,
         description="second inductor of the filter, or the converter's own transformer; the line, "

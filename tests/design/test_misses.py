@@ -139,7 +139,7 @@ def test_a_chain_fitted_to_what_it_drew():
     misses = Misses.of(chain.drawn(400_000, 1, np.random.default_rng(3))[0])
     fitted = misses.chain()
     assert fitted.begins == pytest.approx(0.02, rel=0.05)
-    assert fitted.goes_on == pytest.approx(0.6, rel=0.05)
+    assert fitted.continues == pytest.approx(0.6, rel=0.05)
     assert misses.misses / misses.ticks == pytest.approx(chain.share, rel=0.05)
 
 

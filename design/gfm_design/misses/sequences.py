@@ -55,7 +55,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Proved:
+class ProvedSequences:
     """What the bounds say of a constraint "at most n".
 
     Attributes:
@@ -127,12 +127,14 @@ def in_a_row(words: Words, n: int) -> Pieces:
     return Pieces(pieces, np.arange(1, n + 2), words.slowest(n).sigma, words.ticks)
 
 
-def proved_in_a_row(words: Words, refuted: int | None, most: int = MOST_IN_A_ROW) -> Proved:
+def proved_in_a_row(
+    words: Words, refuted: int | None, most: int = MOST_IN_A_ROW
+) -> ProvedSequences:
     """For how many misses in a row every sequence is stable, up to ``most``; a word of ``refuted``
     is unstable."""
     end = min(most, most if refuted is None else refuted - 1)
     n = _largest(0, end, lambda n: in_a_row(words, n).proved())
-    return Proved(n, in_a_row(words, n).bounds(), refuted, end)
+    return ProvedSequences(n, in_a_row(words, n).bounds(), refuted, end)
 
 
 def in_a_window(ticks: Ticks, m: int, K: int) -> Pieces:
@@ -143,7 +145,7 @@ def in_a_window(ticks: Ticks, m: int, K: int) -> Pieces:
     return Pieces(pieces, np.full(len(pieces), K), low, ticks)
 
 
-def proved_in_a_window(words: Words, K: int, known: int) -> Proved:
+def proved_in_a_window(words: Words, K: int, known: int) -> ProvedSequences:
     """For how many misses in any K ticks, fewer than K, every sequence is stable; ``known`` misses
     in a row are proved, and so as many in K ticks."""
     ticks, least = words.ticks, min(known, K - 1)
@@ -152,7 +154,7 @@ def proved_in_a_window(words: Words, K: int, known: int) -> Proved:
     end = K - 1 if refuted is None else refuted - 1
     m = _largest(least, end, lambda m: in_a_window(ticks, m, K).proved())
     pieces = in_a_row(words, m) if m <= least else in_a_window(ticks, m, K)
-    return Proved(m, pieces.bounds(), refuted, end)
+    return ProvedSequences(m, pieces.bounds(), refuted, end)
 
 
 def _largest(low: int, end: int, proved: Callable[[int], bool]) -> int:

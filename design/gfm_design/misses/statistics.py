@@ -1,7 +1,7 @@
 """Misses as they were measured: a Markov chain fitted to them, and the mean square under it.
 
 The chain is that of E. N. Gilbert (Bell System Technical Journal 39, 1960): after a hit a miss
-comes with probability ``begins``, after a miss another one with ``goes_on``. With it the sampled
+comes with probability ``begins``, after a miss another one with ``continues``. With it the sampled
 loop is a Markov jump linear system. Its second moments Q_j = E[x x^T, outcome j] follow
 
     Q_j[k+1] = A_j (sum_i p_ij Q_i[k]) A_j^T + pi_j w w^T,
@@ -84,12 +84,12 @@ class MissChain:
     """Probabilities of a miss after a hit, and after a miss."""
 
     begins: float
-    goes_on: float
+    continues: float
 
     @property
     def share(self) -> float:
         """Of ticks that are missed."""
-        leaves = 1.0 - self.goes_on
+        leaves = 1.0 - self.continues
         return self.begins / (self.begins + leaves) if self.begins else 0.0
 
     def drawn(self, ticks: int, runs: int, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -97,7 +97,7 @@ class MissChain:
         chance, last = rng.random((ticks, runs)), np.zeros(runs, bool)
         out = np.empty((ticks, runs), bool)
         for k in range(ticks):
-            out[k] = last = chance[k] < np.where(last, self.goes_on, self.begins)
+            out[k] = last = chance[k] < np.where(last, self.continues, self.begins)
         return out.T
 
 
@@ -120,7 +120,7 @@ class MeanSquare:
             spread[i * N + j, k] = spread[j * N + i, k] = 1.0
         rows = self._half[0] * N + self._half[1]
         hit, miss = ((np.kron(A, A)[rows]) @ spread for A in (ticks.hit, ticks.misses[0]))
-        b, on = chain.begins, chain.goes_on
+        b, on = chain.begins, chain.continues
         self._map = np.block([[(1 - b) * hit, (1 - on) * hit], [b * miss, on * miss]])
 
     def without(self) -> MeanSquare:
@@ -148,12 +148,12 @@ class MeanSquare:
         return np.asarray(np.einsum("ij,jk,ik->i", C, total, C))
 
 
-def most_misses(ticks: Ticks, goes_on: float) -> float | None:
+def most_misses(ticks: Ticks, continues: float) -> float | None:
     """The largest share of missed ticks, in bursts that go on so, of which the mean square decays;
     None if it does with almost every tick missed."""
 
     def stable(begins: float) -> bool:
-        return MeanSquare(ticks, MissChain(begins, goes_on)).sigma() < 0.0
+        return MeanSquare(ticks, MissChain(begins, continues)).sigma() < 0.0
 
     low, high = 0.0, 1.0
     if stable(high):
@@ -161,4 +161,4 @@ def most_misses(ticks: Ticks, goes_on: float) -> float | None:
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)
-    return MissChain(low, goes_on).share
+    return MissChain(low, continues).share

@@ -14,7 +14,7 @@ import numpy as np
 
 from gfm_design.margins.all_margins import UnstableLoop
 from gfm_design.margins.delays import DelayMargin, longest, overall_delay
-from gfm_design.misses.sequences import Proved, proved_in_a_row, proved_in_a_window
+from gfm_design.misses.sequences import ProvedSequences, proved_in_a_row, proved_in_a_window
 from gfm_design.misses.statistics import MeanSquare, Misses, most_misses
 from gfm_design.misses.ticks import MEANWHILE, Meanwhile, Ticks, ticks
 from gfm_design.misses.words import MOST, Word, Words
@@ -37,8 +37,8 @@ class RowTolerance:
     """
 
     lost: Word | None
-    in_a_row: Proved
-    in_a_window: Proved
+    in_a_row: ProvedSequences
+    in_a_window: ProvedSequences
 
     @property
     def bears(self) -> int:
@@ -173,7 +173,7 @@ def used(tolerance: LatencyTolerance, misses: Misses) -> Used:
         worst = np.max([one.variance() for one in each], axis=0)
         among = [k for k, name in enumerate(Y_CARRIED[: len(plain)]) if name != "omega_u"]
         added = {Y_CARRIED[k]: float(worst[k] / plain[k]) for k in among if plain[k] > 0.0}
-        limits = [s for of in cases if (s := most_misses(of, chain.goes_on)) is not None]
+        limits = [s for of in cases if (s := most_misses(of, chain.continues)) is not None]
         share = _share(chain.share, min(limits)) if limits else None
     delay = misses.mean_age * T_s / tolerance.delay.seconds
     row = _share(misses.longest, tolerance.bears)

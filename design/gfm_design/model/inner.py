@@ -135,13 +135,13 @@ def linearise_stage(
         h += h**3 * c["third"]
         back = (1.0 - 1j * h) / (1.0 + 1j * h)
 
-        def tell_apart(name: str, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        def split_sequences(name: str, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
             ahead = back * x[f"{name}_n"]
             lack = c["follow_s"] * (z - x[f"{name}_p"] - ahead)
             then.update({f"{name}_p": x[f"{name}_p"] + lack, f"{name}_n": ahead + lack})
             return ahead + lack
 
-        E = E - tell_apart("E", E) - (c["R_more"] + 1j * c["X_more"]) * x["i_n"]
+        E = E - split_sequences("E", E) - (c["R_more"] + 1j * c["X_more"]) * x["i_n"]
     if stator:
         lacks = op.e - v_0 - 1j * omega_0 * c["L_f"] * i_0
         i_ref_0 = i_0 if inner.k_ci > 0.0 else i_0 + lacks / c["k_c"]
@@ -160,7 +160,7 @@ def linearise_stage(
     e = e + 1j * c["L_f"] * (omega_0 * i + i_0 * omega)
     if dual:
         lead = c["lead_d"] + 1j * c["lead_q"] - 2j * omega_0 * c["L_f"]
-        e = e + lead * tell_apart("i", i_ref)
+        e = e + lead * split_sequences("i", i_ref)
     if "x_c" in x:
         then["x_c"] = x["x_c"] + c["T_k_ci"] * (i_ref - i)
     rows = [part for name in both for part in (then[name].real, then[name].imag)]

@@ -95,7 +95,7 @@ class DualSequence(VirtualStator):
 
 
 @inlined
-def tell_apart(law, p, n, d, q, cosine, sine):
+def split_sequences(law, p, n, d, q, cosine, sine):
     """One tick of the two filters on d + j q: its positive sequence p (2,) and its negative one
     n (2,), which turns by cosine - j sine from tick to tick."""
     n_d, n_q = cosine * n[0] + sine * n[1], cosine * n[1] - sine * n[0]
@@ -114,12 +114,12 @@ def dual_sequence(law, state, E_d, E_q):
     h += h * h * h * law.third
     size = law.one + h * h
     cosine, sine = (law.one - h * h) / size, (h + h) / size
-    tell_apart(law, state.E_p, state.E_n, E_d, E_q, cosine, sine)
+    split_sequences(law, state.E_p, state.E_n, E_d, E_q, cosine, sine)
     n_d, n_q = state.i_n[0], state.i_n[1]
     E_d -= state.E_n[0] + law.R_more * n_d - law.X_more * n_q
     E_q -= state.E_n[1] + law.R_more * n_q + law.X_more * n_d
     stator(law, state, E_d, E_q)
-    tell_apart(law, state.i_p, state.i_n, state.x_v[0], state.x_v[1], cosine, sine)
+    split_sequences(law, state.i_p, state.i_n, state.x_v[0], state.x_v[1], cosine, sine)
     n_d, n_q = state.i_n[0], state.i_n[1]
     lead_d, lead_q = law.lead_d * n_d - law.lead_q * n_q, law.lead_d * n_q + law.lead_q * n_d
     # i_n* within I_n and within its share of I_max

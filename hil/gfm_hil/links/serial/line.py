@@ -143,7 +143,7 @@ def receive(h, message):
 
 
 def feed(h: NDArray[np.int64], some: bytes) -> None:
-    """Take up to 4096 bytes as if the line had brought them, once all before are taken."""
+    """Take up to 4096 bytes as if they had come over the line, once all before are taken."""
     h[_CAME:_PIECE].view(np.uint8)[: len(some)] = np.frombuffer(some, np.uint8)
     h[_CAME_AT], h[_CAME_END] = 0, len(some)
 
