@@ -149,8 +149,11 @@ class MeanSquare:
 
 
 def most_misses(ticks: Ticks, continues: float) -> float | None:
-    """The largest share of missed ticks, in bursts that go on so, of which the mean square decays;
-    None if it does with almost every tick missed."""
+    """The largest share of missed ticks with which the mean square still decays.
+
+    ``continues`` is the probability that a miss follows a miss. None: it decays even with almost
+    every tick missed.
+    """
 
     def stable(begins: float) -> bool:
         return MeanSquare(ticks, MissChain(begins, continues)).sigma() < 0.0

@@ -54,8 +54,8 @@ def test_a_trace_does_what_it_says_over_a_link_and_in_process(trace, tmp_path):
 
 @pytest.mark.processes
 def test_a_run_in_real_time_is_replayed_tick_by_tick(tmp_path):
-    """In a row of misses the times of both sides leave open at times which of two late u came
-    first; so one of five recordings has to be replayed bit by bit, whatever the machine missed."""
+    """Each replay gives the same bits each time. That of one recording in five has to be the run
+    itself: in a row of misses the times may leave open which of two late u came first."""
     asked = {**CONTENT, "mode": "realtime", "duration": 1.0, "link": {"type": "shm"}}
     asked["late_policy"] = {"hold": 10**6}
     for k in range(5):
