@@ -12,7 +12,7 @@ tick k + n on (before tick n u[0] acts): a delay of n ticks, in lockstep as in r
 """
 
 from gfm_hil.engine.loop_records import STOP, WAKE, ReturnReason
-from gfm_hil.engine.replay import replay
+from gfm_hil.engine.replay import ACTS, replay
 from gfm_hil.engine.tick import apply_peer_state, asks_to_start, sample, take
 from gfm_hil.links.frame import INVALID, judge, pack, pack_again, skip, unpack
 from gfm_hil.realtime.clock import (
@@ -23,6 +23,7 @@ from gfm_hil.realtime.clock import (
     wait_until,
     yield_processor,
 )
+from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.recorder import record_command
 from gfm_plant import plant_is_delayed, plant_step
 from gfm_plant.names import CONTROLLER, GONE, LEFT
@@ -33,6 +34,7 @@ from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
+_ACTS = kept_of("plant").index("acts")
 # what came of u[k]; HELD_BACK: it came, and the trace that is replayed says that it did not
 AWAITED, FRESH, OVERDUE, LEAVING, CUT_OFF, HELD_BACK = range(6)
 _NOTHING, _OTHER, _OVER = range(3)  # what one read of a link gives
@@ -265,8 +267,11 @@ def _close(side, plant, i, k, gap, hurried):
     came = r.came
     if came == CUT_OFF and r.others == 0:
         return ReturnReason.GONE
-    if came == FRESH and len(records.plan) > 0 and not replay(records.plan, records.kept, k, u, u):
-        came, records.times[k, 3] = HELD_BACK, -1
+    records.times[k, _ACTS] = reader[0].tick if r.every == 1 else r.acting
+    if came == FRESH and len(records.plan) > 0:
+        records.times[k, _ACTS] = records.plan[k, ACTS]
+        if not replay(records.plan, records.kept, k, u, u):
+            came, records.times[k, 3] = HELD_BACK, -1
     if came == FRESH:
         if hurried:
             r.unseen = k

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.columns import ACTS as RECORDED_ACTS
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.npz import open_npz
-from gfm_hil.recording.timing import MISS_NEEDS, missed
+from gfm_hil.recording.timing import MISS_NEEDS
 from gfm_hil.scenario import Scenario
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import NU, carried
+from gfm_runtime.signals import NU
 
 ACTS, STEPS = range(2)  # columns of ``Trace.plan``
 
@@ -96,7 +97,7 @@ def _read(file: Path, scenario: Scenario, where: str) -> NDArray[np.int64]:
         if {"acts", "steps"} <= columns.keys():
             plan = np.stack([columns["acts"][:], columns["steps"][:]], axis=1).astype(np.int64)
         else:
-            plan = _of_run(columns, file, scenario, where)
+            plan = _of_run(columns, scenario, where)
     except FileNotFoundError as problem:
         raise UserError(f"{where}: no such file: {problem.filename}") from None
     except (OSError, ValueError, KeyError) as problem:
@@ -114,40 +115,18 @@ def _read(file: Path, scenario: Scenario, where: str) -> NDArray[np.int64]:
     return plan
 
 
-def _of_run(columns: Columns, file: Path, scenario: Scenario, where: str) -> NDArray[np.int64]:
-    """The plan of a run's times, and of the u that its plant recorded.
-
-    A u that was late acts from the next miss on. The newest of those that were sent before the
-    plant began its next tick is the one, if u changed at all.
-    """
-    needs = (*MISS_NEEDS, "plant_woke", "controller_received", "controller_sent")
-    if not columns.keys() >= set(needs) or (columns[MISS_NEEDS[0]][:1] < 0).all():
+def _of_run(columns: Columns, scenario: Scenario, where: str) -> NDArray[np.int64]:
+    """The plan of a run in real time, from what its two sides recorded."""
+    due_in, computed_in = MISS_NEEDS[0], "controller_computed"
+    if due_in not in columns or (columns[due_in][:1] < 0).all():
         raise UserError(f"{where}: has no times of a run in real time")
-    due, received, woke, computed, sent = (np.asarray(columns[name][:]) for name in needs)
+    for name in (RECORDED_ACTS, computed_in):
+        if name not in columns:
+            raise UserError(f"{where}: has no column {name}; record the run anew, with both sides")
+    due, computed = (np.asarray(columns[name][:]) for name in (due_in, computed_in))
     T_ns = float(np.median(np.diff(due[:1000])))
     if abs(T_ns - 1e9 * scenario.T_s) > 1.0:
         raise UserError(
             f"{where}: has T_s = {1e-9 * T_ns:g} s, and the scenario {scenario.T_s:g} s"
         )
-    late = missed({"plant_scheduled": due, "plant_received": received})
-    u = _recorded_u(file.parent)
-    steps = computed >= 0
-    acts = np.arange(len(due))
-    for k in np.flatnonzero(late):
-        before = acts[k - 1] if k else -1
-        acts[k] = before
-        if k == 0 or np.array_equal(u[k], u[k - 1]):
-            continue
-        late_ones = [j for j in range(before + 1, k) if steps[j]]
-        end = woke[k + 1] if k + 1 < len(woke) else due[k] + T_ns  # of the plant's last look
-        came = [j for j in late_ones if sent[j] <= end]
-        if late_ones:  # u has changed, so one has come
-            acts[k] = came[-1] if came else late_ones[0]
-    return np.stack([acts, steps], axis=1).astype(np.int64)
-
-
-def _recorded_u(folder: Path) -> NDArray[np.float64]:
-    """u as the plant of a run recorded it, shape (ticks, 3) or (ticks, 4)."""
-    columns = open_npz(folder / "signals.npz")
-    names = [f"u_{name}" for name in carried("u", True) if f"u_{name}" in columns]
-    return np.stack([columns[name][:] for name in names], axis=1)
+    return np.stack([columns[RECORDED_ACTS][:], computed >= 0], axis=1).astype(np.int64)

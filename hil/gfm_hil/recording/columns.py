@@ -40,9 +40,10 @@ CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 SIGNALS_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
 TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CONTROLLER_TIMES}
-#: kept after the times: of a law that runs on a processor in the loop, -1: not counted
-COUNTS_OF: dict[Role, tuple[str, ...]] = {"plant": (), "controller": ("instructions",)}
-INSTRUCTIONS = "controller_instructions"
+#: kept after the times: the tick whose u acts, -1: that of the start; the instructions of a law
+#: that runs on a processor in the loop, -1: not counted
+COUNTS_OF: dict[Role, tuple[str, ...]] = {"plant": ("acts",), "controller": ("instructions",)}
+ACTS, INSTRUCTIONS = "plant_acts", "controller_instructions"
 _INNER_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_INNER, "controller": CONTROLLER_INNER}
 
 
@@ -224,6 +225,7 @@ def _table() -> dict[str, Described]:
         Described("limited", "", "", "whether the inner stage limits the current", "",
                   ((0, "no"), (1, "yes"))),
         *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
+        Described(ACTS, "", "", "tick whose u the D/A gets, -1: that of the start"),
         Described(INSTRUCTIONS, "", "", "instructions of a step on a processor in the loop"),
     ]  # fmt: skip
     found = {row.name: row for row in rows}

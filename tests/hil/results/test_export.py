@@ -16,6 +16,7 @@ from scipy.io import loadmat
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import (
+    ACTS,
     CONTROLLER_INNER,
     INSTRUCTIONS,
     PLANT_INNER,
@@ -68,7 +69,7 @@ def test_every_column_is_described():
     for name in [*TABLE]:
         column = describe(name, ["a", "b"])
         assert column.comment
-        assert bool(column.unit) != (bool(column.words) or name in ("tick", INSTRUCTIONS))
+        assert bool(column.unit) != (bool(column.words) or name in ("tick", ACTS, INSTRUCTIONS))
     assert describe("y_p", []).unit == "p.u. (S_n)"
     assert describe("law", ["a", "b"]).words == ((0, "a"), (1, "b"))
 
