@@ -87,6 +87,22 @@ Element = Branch | Capacitor | Shunt | CurrentSource
 
 
 @dataclass(frozen=True)
+class Circuit:
+    """The parts of a circuit; at most one shunt a node, none at a source."""
+
+    branches: tuple[Branch, ...]
+    capacitors: tuple[Capacitor, ...]
+    sources: tuple[VoltageSource, ...]
+    shunts: tuple[Shunt, ...] = ()
+    sinks: tuple[CurrentSource, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Those of its sources, and then of its sinks."""
+        return [one.name for one in self.sources] + [one.name for one in self.sinks]
+
+
+@dataclass(frozen=True)
 class Modes:
     """What ``find_modes`` returns, for w of n_w states, n modes and n_s sources.
 
@@ -139,44 +155,22 @@ class _Reduced:
     K: NDArray[np.float64]
 
 
-def find_modes(
-    branches: Sequence[Branch],
-    capacitors: Sequence[Capacitor],
-    sources: Sequence[VoltageSource],
-    omega_b: float,
-    order: Sequence[str],
-    shunts: Sequence[Shunt] = (),
-    sinks: Sequence[CurrentSource] = (),
-) -> Modes:
+@lru_cache(maxsize=256)
+def find_modes(circuit: Circuit, omega_b: float, order: tuple[str, ...]) -> Modes:
     """Return the modes of a circuit; those of the last circuits are kept, so that an event of a
     scenario that has been tried before its run costs no eigenvalues in real time.
 
     Args:
+        circuit: the currents of its sinks follow the sources in ``Modes.drive``.
         omega_b: rad/s, also the speed of the common frame.
         order: the names of the states as w has them; those of other circuits may be among them.
-        shunts: at most one a node, none at a source.
-        sinks: their currents follow the sources in ``Modes.drive``.
 
     Raises:
         ValueError: an L or C is not positive, a node hangs on one branch alone, two sources or
             capacitors share a node, a sink is at a node without a capacitor, or the modes are too
             close to each other to be told apart.
     """
-    parts = tuple(branches), tuple(capacitors), tuple(sources)
-    return _find_modes(*parts, omega_b, tuple(order), tuple(shunts), tuple(sinks))
-
-
-@lru_cache(maxsize=256)
-def _find_modes(
-    branches: tuple[Branch, ...],
-    capacitors: tuple[Capacitor, ...],
-    sources: tuple[VoltageSource, ...],
-    omega_b: float,
-    order: tuple[str, ...],
-    shunts: tuple[Shunt, ...],
-    sinks: tuple[CurrentSource, ...],
-) -> Modes:
-    one = _reduce(branches, capacitors, sources, shunts, sinks)
+    one = _reduce(circuit)
     M, B, root, K = one.M, one.B, one.root, one.K
     A = omega_b * K.T @ (M / root[:, None] / root) @ K - 1j * omega_b * np.eye(K.shape[1])
     rates, X = np.linalg.eig(A)
@@ -195,19 +189,10 @@ def _find_modes(
     return Modes(rates, states, modes, drive, mirror)
 
 
-def find_rates(
-    branches: Sequence[Branch],
-    capacitors: Sequence[Capacitor],
-    sources: Sequence[VoltageSource],
-    omega_b: float,
-    order: Sequence[str],
-    shunts: Sequence[Shunt] = (),
-    sinks: Sequence[CurrentSource] = (),
-) -> Rates:
+def find_rates(circuit: Circuit, omega_b: float, order: Sequence[str]) -> Rates:
     """Return the equations of a circuit as they are, for whom solves them by a series; arguments
     and errors as for ``find_modes``."""
-    parts = tuple(branches), tuple(capacitors), tuple(sources)
-    one = _reduce(*parts, tuple(shunts), tuple(sinks))
+    one = _reduce(circuit)
     P = one.K @ one.K.T
     A = omega_b * P @ (one.M / one.root[:, None] / one.root) @ P
     fastest = float(np.linalg.norm(A, 2))
@@ -222,13 +207,9 @@ def find_rates(
     return Rates(by_w, by_s, fastest)
 
 
-def _reduce(
-    branches: tuple[Branch, ...],
-    capacitors: tuple[Capacitor, ...],
-    sources: tuple[VoltageSource, ...],
-    shunts: tuple[Shunt, ...],
-    sinks: tuple[CurrentSource, ...],
-) -> _Reduced:
+def _reduce(circuit: Circuit) -> _Reduced:
+    branches, capacitors = circuit.branches, circuit.capacitors
+    sources, sinks = circuit.sources, circuit.sinks
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
     for name, value in stored.items():
         if not value > 0:
@@ -238,7 +219,7 @@ def _reduce(
     if both := set(fixed) & set(charged):
         raise ValueError(f"node {min(both)}: a source and a capacitor in parallel")
 
-    through = {shunt.node: shunt.R for shunt in shunts}
+    through = {shunt.node: shunt.R for shunt in circuit.shunts}
     n_b, n_c = len(branches), len(capacitors)
     n_s = len(sources) + len(sinks)
     M = np.zeros((n_b + n_c, n_b + n_c))  # of the stored quantities: L i' = M w + B s, C v' = M w
@@ -306,12 +287,7 @@ def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:
 
 
 def find_voltage(
-    node: str,
-    branches: Sequence[Branch],
-    capacitors: Sequence[Capacitor],
-    sources: Sequence[VoltageSource],
-    order: Sequence[str],
-    shunts: Sequence[Shunt] = (),
+    node: str, circuit: Circuit, order: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the voltage of a node as factors of w, (n_w,), and of the sources, (n_s,).
 
@@ -320,12 +296,13 @@ def find_voltage(
     ends give).
 
     Args:
-        branches, capacitors, sources, order, shunts: as for ``find_modes``.
+        circuit, order: as for ``find_modes``.
     """
-    charged = {part.node: order.index(part.name) for part in capacitors}
-    fixed = _places("source", sources)
-    through = {shunt.node: shunt.R for shunt in shunts}
-    n_w, n_s = len(order), len(sources)
+    branches = circuit.branches
+    charged = {part.node: order.index(part.name) for part in circuit.capacitors}
+    fixed = _places("source", circuit.sources)
+    through = {shunt.node: shunt.R for shunt in circuit.shunts}
+    n_w, n_s = len(order), len(circuit.sources)
     ends = [end for branch in branches for end in (branch.start, branch.end)]
     known = {GROUND, *charged, *fixed, *through}
     free = [one for one in dict.fromkeys(ends) if one not in known]

@@ -18,6 +18,7 @@ from gfm_plant.circuit import (
     GROUND,
     Branch,
     Capacitor,
+    Circuit,
     CurrentSource,
     Modes,
     Rates,
@@ -373,18 +374,20 @@ class Wiring:
             return {contact.name: 1.0}
         if seen.imag > 0:
             return {CONTACT: 1.0}
-        branches, capacitors, _, shunts, _ = self._circuit(frozenset(), contact, axis)
+        circuit, _ = self._circuit(frozenset(), contact, axis)
         place, share = str(self.grid), -1.0  # towards the network
         if isinstance(contact, FaultPlace):
             place = "beyond" if self.split else contact.node
-            bank = next((one.name for one in capacitors if one.node == place), None)
+            bank = next((one.name for one in circuit.capacitors if one.node == place), None)
             if bank is not None:
                 return {bank: 1 / seen.real}
-            R = next(one.R for one in shunts if one.node == place)  # with what else is there
+            R = next(
+                one.R for one in circuit.shunts if one.node == place
+            )  # with what else is there
             share = R / seen.real if seen.real > 0 else 1.0
         return {
             branch.name: share if branch.end == place else -share
-            for branch in branches
+            for branch in circuit.branches
             if place in (branch.start, branch.end)
         }
 
@@ -398,32 +401,21 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
-        sinks = [sink for sink in self.sinks if sink.name not in self.opened]
-        unbalanced = contact is not None and not contact.balanced
-        found = []
-        for axis in (ALPHA, BETA) if unbalanced else (ALPHA,):
-            branches, capacitors, sources, shunts, _ = self._circuit(blocked, contact, axis)
-            parts = branches, capacitors, sources
-            found.append(find_modes(*parts, self.omega_b, self.order, shunts, sinks))
-        names = [part.name for part in sources] + [part.name for part in sinks]
+        circuits = [self._circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
         if contact is None or contact.balanced:
-            return found[0], names
-        alpha, beta = found
-        return join_axes(alpha, beta, contact.angle), names
+            return find_modes(circuits[0], self.omega_b, self.order), circuits[0].names
+        alpha, beta = (find_modes(one, self.omega_b, self.order) for one in circuits)
+        return join_axes(alpha, beta, contact.angle), circuits[0].names
 
     def rates(
         self, blocked: frozenset[int], contact: Contact | None
     ) -> tuple[list[Rates], float, list[str]]:
         """The equations of a circuit on the axis alpha and on the axis beta, the angle of alpha,
         rad, and the names of the sources and sinks; arguments and errors as for ``modes``."""
-        sinks = [sink for sink in self.sinks if sink.name not in self.opened]
-        found = []
-        for axis in (ALPHA, BETA):
-            branches, capacitors, sources, shunts, _ = self._circuit(blocked, contact, axis)
-            parts = branches, capacitors, sources
-            found.append(find_rates(*parts, self.omega_b, self.order, shunts, sinks))
-        names = [part.name for part in sources] + [part.name for part in sinks]
-        return found, 0.0 if contact is None or contact.balanced else contact.angle, names
+        circuits = [self._circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
+        found = [find_rates(one, self.omega_b, self.order) for one in circuits]
+        angle = 0.0 if contact is None or contact.balanced else contact.angle
+        return found, angle, circuits[0].names
 
     def zero_sequence(self) -> complex | None:
         """The impedance between the place of the fault and ground for a zero sequence at nominal
@@ -497,26 +489,25 @@ class Wiring:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The voltage of a node on an axis as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on."""
-        parts = self._circuit(blocked, contact, axis)
-        branches, capacitors, sources, shunts, hanging = parts
-        there = {end for branch in branches for end in (branch.start, branch.end)}
-        there |= {part.node for part in capacitors} | {part.node for part in sources}
+        circuit, hanging = self._circuit(blocked, contact, axis)
+        there = {end for branch in circuit.branches for end in (branch.start, branch.end)}
+        there |= {one.node for one in circuit.capacitors} | {one.node for one in circuit.sources}
         seen, reached = {node}, [node]
         while reached:
             here = reached.pop(0)
             if here in there or here == GROUND:
-                return find_voltage(here, branches, capacitors, sources, self.order, shunts)
+                return find_voltage(here, circuit, self.order)
             for branch in hanging:
                 if here in (branch.start, branch.end):
                     other = branch.end if branch.start == here else branch.start
                     reached += [other] if other not in seen else []
                     seen.add(other)
-        return np.zeros(len(self.order)), np.zeros(len(sources))
+        return np.zeros(len(self.order)), np.zeros(len(circuit.sources))
 
     def _circuit(
         self, blocked: frozenset[int], contact: Contact | None, axis: int
-    ) -> tuple[list[Branch], list[Capacitor], list[VoltageSource], list[Shunt], list[Branch]]:
-        """The parts of a circuit, and the branches that an open breaker has left hanging; of an
+    ) -> tuple[Circuit, list[Branch]]:
+        """A circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
@@ -558,8 +549,9 @@ class Wiring:
         branches = _without_ends(branches, held)
         met = {node for branch in branches for node in (branch.start, branch.end)}
         shunts = [s for s in shunts if s.node in met]
-        hanging = [branch for branch in whole if branch not in branches]
-        return branches, capacitors, sources, shunts, hanging
+        sinks = tuple(sink for sink in self.sinks if sink.name not in self.opened)
+        circuit = Circuit(tuple(branches), tuple(capacitors), tuple(sources), tuple(shunts), sinks)
+        return circuit, [branch for branch in whole if branch not in branches]
 
     def _whole(
         self, branches: Sequence[Branch], poles: Mapping[str, complex] = MappingProxyType({})

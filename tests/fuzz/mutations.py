@@ -1,9 +1,14 @@
-"""Inputs near valid ones: text changed word by word, bytes changed bit by bit."""
+"""Inputs near valid ones: text changed word by word, tables value by value, bytes bit by bit."""
 
+import contextlib
+import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from hypothesis import strategies as st
+
+from gfm_hil.scenario import toml_text
 
 _WORD = re.compile(r'"(?:\\.|[^"\\\n])*"|[A-Za-z_@][\w.-]*@?|[-+]?\d[\w.+-]*|\s+|.', re.DOTALL)
 _DEPTH = 3000
@@ -57,6 +62,48 @@ def texts(draw: st.DrawFn, seeds: Sequence[str], also: Sequence[str] = ()) -> by
                 del words[at:]
     whole = "".join(words).encode("utf-8", "surrogatepass")
     return draw(blobs([whole])) if draw(st.integers(0, 9)) == 0 else whole
+
+
+#: values that some field cannot have; "@date" becomes a date
+WEIRD = st.one_of(
+    st.sampled_from([0, -1, 2**31, 2**63 - 1, 2**63, 10**29, 10**400, -(10**400)]),
+    st.sampled_from([0.0, -0.0, -1.0, 1e300, -1e300, 1e-300, 5e-324, 1e12, 1e-12]),
+    st.sampled_from([float("nan"), float("inf"), -float("inf")]),
+    st.sampled_from(["", " ", "a" * 300, "a\0b", "a\nb", "é", "/dev/zero", "P_ref", "1 / D_p"]),
+    st.sampled_from([True, False, [], {}, [[]], [[1.0]], {"a": 1}, [1] * 100, ["x"], "@date"]),
+    st.floats(),
+    st.integers(-3, 10**6),
+)
+
+
+def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The path of every value in nested tables and arrays."""
+    items: Any = ()
+    if isinstance(content, dict):
+        items = content.items()
+    elif isinstance(content, list):
+        items = enumerate(content)
+    for key, value in items:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+@st.composite
+def tables(draw: st.DrawFn, seeds: Sequence[dict[str, Any]]) -> bytes:
+    """TOML in which one to three values of a valid file were replaced or removed."""
+    content = copy.deepcopy(draw(st.sampled_from(seeds)))
+    paths = st.sampled_from(list(places(content)))
+    for path, value in draw(st.lists(st.tuples(paths, st.none() | WEIRD), min_size=1, max_size=3)):
+        at: Any = content
+        with contextlib.suppress(KeyError, IndexError, TypeError):  # changed before
+            for key in path[:-1]:
+                at = at[key]
+            last = str(path[-1]) if isinstance(at, dict) else path[-1]
+            if value is None:
+                del at[last]
+            else:
+                at[last] = copy.deepcopy(value)  # else a list could contain itself
+    return toml_text(content).replace('"@date"', "1979-05-27").encode()
 
 
 @st.composite

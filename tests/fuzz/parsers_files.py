@@ -5,6 +5,7 @@ import io
 import os
 import shutil
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -13,9 +14,11 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from gfm_design.norms.performance import read_weights
 from gfm_hil.cli import main
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
+from gfm_hil.engine.setup import make_bench, make_benches
 from gfm_hil.links.shm import segment
 from gfm_hil.links.shm.link import ShmLink
 from gfm_hil.ports.scope.recording import open_recording
@@ -33,14 +36,17 @@ from gfm_hil.scenario.events.grid_profile import read_profile
 from gfm_hil.studies.campaign import loading
 from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test
-from gfm_runtime import LawError, discretise, get_law, load_law
+from gfm_plant import NoEquilibrium, load_converter
+from gfm_runtime import LawError, discretise, get_law, load_law, pack_law
 from gfm_runtime.firmware import STYLES, elf_a2l, golden, make_modules
 from gfm_runtime.firmware.report import read_report, reports
 
+from ..support.laws import EVERYTHING
 from .conftest import CORPUS, Parser, Take
-from .mutations import blobs, texts
+from .mutations import blobs, tables, texts
 
 CATALOGUE = Path(load_law.__code__.co_filename).parent / "laws"
+CONVERTERS = Path(load_converter.__code__.co_filename).parent / "converters"
 RESULTS = """
 {"version": "1.0", "inner": null, "under_test": {"droop": 0.01}, "laws": {"vsg-2": {"lab/jump": {
 "verdict": "pass", "parts": [{"part": "a", "verdict": "pass", "reason": "", "clauses": [
@@ -137,14 +143,39 @@ closed = false
 """
 
 
+LINK = """
+title = "x"
+duration = 0.05
+[link]
+type = "%s"
+endpoint = "tcp://127.0.0.1:5555"
+peer_timeout_s = 1.0
+options = { fd = true, every = 1, curve = "keys", plain = true, bitrate = 1000000 }
+impairment = { pause_at = 3, kill_at = 3, seed = 3 }
+"""
+WEIGHTS = "W_11 = { num = [1.0, 4.0], den = [1.0, 4e-4] }"
+
+
 def _shipped(*folders: Path) -> list[str]:
     return [path.read_text("utf-8") for f in folders for path in sorted(f.glob("*.toml"))]
+
+
+def toml(*seeds: str) -> st.SearchStrategy[bytes]:
+    """Changed word by word as text, or value by value as tables."""
+    return texts(seeds) | tables([tomllib.loads(seed) for seed in seeds])
+
+
+def _scenarios() -> st.SearchStrategy[bytes]:
+    """Shipped ones, every event, links with all that they can have, and every key that there is."""
+    whole = load_scenario("switchover").model_copy(deep=True)
+    links = [LINK % kind for kind in ("zmq", "can", "shm")]
+    return toml(*_shipped(*SCENARIO_FOLDERS), EVENTS, *links, scenario_toml(whole))
 
 
 def reading(
     name: str,
     load: Callable[[Path], Any],
-    refusal: type[Exception],
+    refusal: type[Exception] | tuple[type[Exception], ...],
     check: Callable[[Any], None] = lambda found: None,
 ) -> Callable[[Path], AbstractContextManager[Take]]:
     """Opens the parser of one file: an input is its content, which ``load`` reads or refuses;
@@ -171,15 +202,30 @@ def _scenario(file: Path) -> tuple[Path, Scenario]:
 
 
 def _written_again(found: tuple[Path, Scenario]) -> None:
+    """Read what is written of it, and do what a run in process does before it writes anything."""
     again, scenario = found
     again.write_text(scenario_toml(scenario), "utf-8")
-    assert load_scenario(str(again)) == scenario
+    read = load_scenario(str(again))
+    assert read == scenario and read.digest() == scenario.digest()
+    try:
+        make_benches(load_scenario(str(again), mode="lockstep", link__type="inproc"))
+    except (UserError, NoEquilibrium) as problem:
+        short(str(problem))
+
+
+def _converter(file: Path) -> None:
+    scenario = file.with_name("scenario.toml")
+    plant = f'[plant]\nconverter = "{file}"\n'
+    scenario.write_text(f'title = "x"\nduration = 0.05\nlink.type = "inproc"\n{plant}')
+    make_bench(load_scenario(str(scenario)))
 
 
 def _law(file: Path) -> None:
     for law in load_law(str(file)).laws:
+        assert all(element.is_proper for element in law.phi.values())
         found = discretise(law, 1e-4)
         assert all(np.isfinite(matrix).all() for matrix in (found.A, found.C))
+        assert pack_law(found)["n"][0] <= 12
 
 
 def _firmware(file: Path) -> None:
@@ -244,6 +290,8 @@ def _compared(found: Results) -> None:
 def short(text: str) -> None:
     """Check that an error message is readable."""
     assert len(text) < 20_000, f"{len(text)} characters"
+    for line in text.removesuffix("\n").split("\n"):
+        assert line.isprintable(), f"{line!r:.3000}"
 
 
 @contextlib.contextmanager
@@ -406,15 +454,19 @@ def _elf(file: Path) -> None:
 _ELF = (CORPUS / "elf" / "vsg_2_records").read_bytes()
 FILES = (
     Parser("profile", reading("a.csv", _profile, UserError), lambda: texts([PROFILE])),
+    Parser("scenario", reading("scenario.toml", _scenario, UserError, _written_again), _scenarios),
     Parser(
-        "scenario",
-        reading("scenario.toml", _scenario, UserError, _written_again),
-        lambda: texts([*_shipped(*SCENARIO_FOLDERS), EVENTS]),
+        "converter",
+        reading("converter.toml", _converter, (UserError, NoEquilibrium)),
+        lambda: toml(*_shipped(CONVERTERS)),
     ),
-    Parser("law", reading("law.toml", _law, LawError), lambda: texts(_shipped(CATALOGUE))),
+    Parser(
+        "law", reading("law.toml", _law, LawError), lambda: toml(*_shipped(CATALOGUE), EVERYTHING)
+    ),
+    Parser("weights", reading("weights.toml", read_weights, ValueError), lambda: toml(WEIGHTS)),
     Parser("firmware", reading("report.json", _firmware, LawError), lambda: texts(_reports())),
     Parser("elf", reading("program.elf", _elf, LawError), lambda: blobs([_ELF])),
-    Parser("campaign", _campaign, lambda: texts([CAMPAIGN])),
+    Parser("campaign", _campaign, lambda: toml(CAMPAIGN)),
     Parser("conformity", _conformity, _conformity_files),
     Parser(
         "conformity_results",

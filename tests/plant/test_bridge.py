@@ -10,7 +10,15 @@ from pydantic import ValidationError
 
 from gfm_plant import Plant, fault, make_plant, plant_advance, plant_equilibrium
 from gfm_plant.bridge import advance_bridges, modulate
-from gfm_plant.circuit import Branch, Capacitor, Shunt, VoltageSource, find_modes, find_rates
+from gfm_plant.circuit import (
+    Branch,
+    Capacitor,
+    Circuit,
+    Shunt,
+    VoltageSource,
+    find_modes,
+    find_rates,
+)
 from gfm_plant.model import V_DC
 from gfm_plant.protection import trip
 
@@ -74,18 +82,18 @@ def test_two_cycles_are_exact(name):
 
 def test_rates_and_modes_are_of_one_circuit():
     """A = X diag(lambda + j omega_b) X^-1, with a node where branches alone meet."""
-    omega_b, order = 100 * math.pi, ["i_f", "v", "i_o", "i_l", "i_g"]
-    branches = [
+    omega_b, order = 100 * math.pi, ("i_f", "v", "i_o", "i_l", "i_g")
+    branches = (
         Branch("i_f", "bridge", "terminal", 0.02, 0.002),
         Branch("i_o", "terminal", "bus", 0.1, 0.01),
         Branch("i_l", "bus", "ground", 0.3, 0.9),
         Branch("i_g", "bus", "far", 0.2, 0.02),
-    ]
-    parts = branches, [Capacitor("v", "terminal", 0.2)]
-    sources = [VoltageSource("bridge", "bridge"), VoltageSource("grid", "far")]
-    shunts = [Shunt("r", "terminal", 5.0)]
-    modes = find_modes(*parts, sources, omega_b, order, shunts)
-    rates = find_rates(*parts, sources, omega_b, order, shunts)
+    )
+    sources = VoltageSource("bridge", "bridge"), VoltageSource("grid", "far")
+    whole = Circuit(
+        branches, (Capacitor("v", "terminal", 0.2),), sources, (Shunt("r", "terminal", 5.0),)
+    )
+    modes, rates = find_modes(whole, omega_b, order), find_rates(whole, omega_b, order)
     by_modes = modes.states @ np.diag(modes.rates + 1j * omega_b) @ modes.modes
     assert np.abs(by_modes - rates.by_w).max() < 1e-9 * rates.fastest
     assert np.abs(modes.states @ modes.drive - rates.by_s).max() < 1e-9 * rates.fastest

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gfm_plant.circuit import GROUND, Branch, Capacitor, Modes, VoltageSource, find_modes
+from gfm_plant.circuit import GROUND, Branch, Capacitor, Circuit, Modes, VoltageSource, find_modes
 
 OMEGA_B = 100 * np.pi
 GRID = VoltageSource("grid", "g")
 E, F = VoltageSource("e", "e"), VoltageSource("f", "e")
+
+
+def modes(branches: Any, capacitors: Any, sources: Any, order: Any) -> Modes:
+    circuit = Circuit(tuple(branches), tuple(capacitors), tuple(sources))
+    return find_modes(circuit, OMEGA_B, tuple(order))
 
 
 def moved(m: Modes, w: Any, s: Any, t: float) -> Any:
@@ -34,7 +39,7 @@ def converter(k: int, node: str, L: float = 0.1) -> tuple[list[Branch], Capacito
 def test_lc_filter_against_the_matrix_exponential():
     branches, capacitor, bridge = converter(1, "g")
     order = ["i_f1", "i_o1", "v1"]
-    m = find_modes(branches, [capacitor], [bridge, GRID], OMEGA_B, order)
+    m = modes(branches, [capacitor], [bridge, GRID], order)
     A = OMEGA_B * np.array([
         [-0.002 / 0.02, 0.0, -1 / 0.02], [0.0, -0.01 / 0.1, 1 / 0.1], [1 / 0.2, -1 / 0.2, 0.0],
     ]) - 1j * OMEGA_B * np.eye(3)  # fmt: skip
@@ -48,14 +53,14 @@ def test_lc_filter_against_the_matrix_exponential():
 
 def test_a_line_in_two_pieces_is_the_same_line():
     branches, capacitor, bridge = converter(1, "g", L=0.1)
-    whole = find_modes(branches, [capacitor], [bridge, GRID], OMEGA_B, ["i_f1", "i_o1", "v1"])
+    whole = modes(branches, [capacitor], [bridge, GRID], ["i_f1", "i_o1", "v1"])
     pieces = [
         branches[0],
         Branch("i_o1", "t1", "middle", 0.03, 0.004),
         Branch("i_g", "middle", "g", 0.07, 0.006),
     ]
     order = ["i_f1", "i_o1", "v1", "i_g"]
-    split = find_modes(pieces, [capacitor], [bridge, GRID], OMEGA_B, order)
+    split = modes(pieces, [capacitor], [bridge, GRID], order)
     w, s = np.array([0.3, 0.1j, 1.0]), np.array([1.0 + 0.1j, 0.9])
     a, b = moved(whole, w, s, 2e-3), moved(split, np.append(w, w[1]), s, 2e-3)
     np.testing.assert_allclose(b[:3], a, atol=1e-12)
@@ -73,10 +78,10 @@ def test_identical_converters_in_parallel(n):
         sources.append(bridge)
         order += [f"i_f{k}", f"i_o{k}", f"v{k}"]
     branches.append(Branch("i_g", "bus", "g", 0.3, 0.02))
-    many = find_modes(branches, capacitors, [*sources, GRID], OMEGA_B, [*order, "i_g"])
+    many = modes(branches, capacitors, [*sources, GRID], [*order, "i_g"])
     two, capacitor, bridge = converter(0, "bus")
-    one = find_modes(
-        [*two, Branch("i_g", "bus", "g", 0.3 * n, 0.02 * n)], [capacitor], [bridge, GRID], OMEGA_B,
+    one = modes(
+        [*two, Branch("i_g", "bus", "g", 0.3 * n, 0.02 * n)], [capacitor], [bridge, GRID],
         ["i_f0", "i_o0", "v0", "i_g"],
     )  # fmt: skip
     w, e = np.array([0.2, 0.1 + 0.1j, 1.0]), 1.0 + 0.1j
@@ -88,9 +93,9 @@ def test_identical_converters_in_parallel(n):
 
 def test_switching_keeps_the_flux_of_a_loop():
     """Two inductors that an opened breaker puts in series share (L1 i1 + L2 i2) / (L1 + L2)."""
-    m = find_modes(
+    m = modes(
         [Branch("a", "e", "n", 0.3, 0.1), Branch("b", "n", GROUND, 0.2, 0.5)], [],
-        [E], OMEGA_B, ["a", "b"],
+        [E], ["a", "b"],
     )  # fmt: skip
     after = m.states @ (m.modes @ np.array([1.0, 0.4j]))
     np.testing.assert_allclose(after, np.full(2, (0.3 + 0.2 * 0.4j) / 0.5), atol=1e-14)
@@ -111,4 +116,4 @@ A, B = Branch("a", "e", "n", 0.1, 0.0), Branch("b", "n", "g", 0.1, 0.0)
 )
 def test_circuits_that_cannot_be(branches, capacitors, sources, message):
     with pytest.raises(ValueError, match=message):
-        find_modes(branches, capacitors, sources, OMEGA_B, ["a", "b", "c"])
+        modes(branches, capacitors, sources, ["a", "b", "c"])

@@ -3,7 +3,7 @@ law file with the gains that a synthesis found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.misses.tolerance import LatencyTolerance
 from gfm_design.misses.tolerance import latency_tolerance as _latency_tolerance
-from gfm_design.model.closed_loop import ClosedLoop, least_stable
+from gfm_design.model.closed_loop import least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
@@ -36,7 +36,7 @@ from gfm_hil.scenario.schema import LatePolicy
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant
-from gfm_runtime import BuiltLaw, law_file
+from gfm_runtime import law_file
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile, shipped_law
 
@@ -220,32 +220,23 @@ def tune(
         UserError: a number or a weight that cannot be; the package cma is missing.
         LawError: the law is none, or declares no such free gain.
     """
-    for what, value in (("evaluations", evaluations), ("starts", starts)):
-        if value is not None and value < 1:
-            raise UserError(f"{what} = {value}: must be at least 1")
-    for what, number in (("seed", seed), ("decay", decay)):
-        if not 0 <= number < np.inf:
-            raise UserError(f"{what} = {number}: must be finite and not negative")
+    _check_search(evaluations, starts, seed, decay)
     law = as_law(law)
-    file = law.file
-    among: Callable[[BuiltLaw], ClosedLoop] | None = None
-    others: Sequence[Callable[[BuiltLaw], ClosedLoop]] = ()
-    if on is not None:
-        scenario = on if isinstance(on, Scenario) else load_scenario(on)
-        file = law.staged(scenario, converter)
-        among, *others = (
-            partial(loop_under, scenario=one, converter=converter) for one in _at(scenario, scr)
-        )
-    elif scr:
+    scenario = load_scenario(on) if isinstance(on, str | Path) else on
+    if scenario is None and scr:
         raise UserError("scr: are those of a scenario's grid; say which scenario")
-
-    paper = PAPER_START.get(law.name, {}) if among is None else dict[str, float]()
+    loops = [
+        partial(loop_under, scenario=one, converter=converter)
+        for one in ([] if scenario is None else _at(scenario, scr))
+    ]
+    paper = PAPER_START.get(law.name, {}) if scenario is None else {}
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
-    gains = free_gains(law.file, at, only)
     try:
         problem = PaperProblem(
-            file, gains, weights=_weights(weights), among=among, decay=decay, others=tuple(others)
-        )
+            law.file if scenario is None else law.staged(scenario, converter),
+            free_gains(law.file, at, only), weights=_weights(weights),
+            among=loops[0] if loops else None, decay=decay, others=tuple(loops[1:]),
+        )  # fmt: skip
     except NoEquilibrium as none:
         raise UserError(str(none)) from None
     starts = starts or starts_for(len(problem.gains))
@@ -255,14 +246,7 @@ def tune(
             lambda done, best: watch.progress(done, evaluations * starts, f"γ {best:.4g}"),
         )  # fmt: skip
     except NotStabilised as none:
-        loop = problem.closed_loop(none.values)
-        where = "on the scenario" if converter is None else f"in the network of {converter}"
-        mode = loop.modes()[0].words()
-        if on is None:
-            where = f"on the paper's converter at P_ref = {problem.references[1]:g}"
-            mode = least_stable(loop).words()
-        wanted = f" against a decay of {decay:g} 1/s" if decay else ""
-        raise NotTuned(f"{none}{wanted}; in the way, {where}: {mode}") from None
+        raise NotTuned(_in_the_way(none, problem, converter)) from None
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
     named = problem.law.named(found.values)
@@ -270,6 +254,27 @@ def tune(
     each = (loop.channels(problem.weights) for loop in problem.all_loops(found.values))
     channels = Gamma(tuned.name, worst_channels(each))
     return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
+
+
+def _check_search(evaluations: int, starts: int | None, seed: int, decay: float) -> None:
+    for what, value in (("evaluations", evaluations), ("starts", starts)):
+        if value is not None and value < 1:
+            raise UserError(f"{what} = {value}: must be at least 1")
+    for what, number in (("seed", seed), ("decay", decay)):
+        if not 0 <= number < np.inf:
+            raise UserError(f"{what} = {number}: must be finite and not negative")
+
+
+def _in_the_way(none: NotStabilised, problem: PaperProblem, converter: str | None) -> str:
+    """Which mode is unstable, or too slow, where the search came closest."""
+    loop = problem.closed_loop(none.values)
+    where = "on the scenario" if converter is None else f"in the network of {converter}"
+    mode = loop.modes()[0].words()
+    if problem.among is None:
+        where = f"on the paper's converter at P_ref = {problem.references[1]:g}"
+        mode = least_stable(loop).words()
+    wanted = f" against a decay of {problem.decay:g} 1/s" if problem.decay else ""
+    return f"{none}{wanted}; in the way, {where}: {mode}"
 
 
 def _at(scenario: Scenario, scr: Sequence[float]) -> list[Scenario]:

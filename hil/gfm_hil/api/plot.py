@@ -16,6 +16,15 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.figures import (
+    COLOURS,
+    GREY,
+    complex_plane,
+    draw_circle,
+    draw_panel,
+    dress,
+    pyplot_panels,
+)
 from gfm_hil.studies.linear_loop import title_of
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -26,9 +35,8 @@ Vector = NDArray[np.float64]
 
 _LOWEST_HZ, _TOP_HZ = 0.02, 5e3  # of a figure; a sampled loop ends at its Nyquist frequency
 _POINTS = 1000
+_TWO = 7.6, 5.6  # inches, of gain and phase
 _LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
-_NYQUIST = 3.0  # half a side of the figure: beyond it L is not near -1
-_GREY = "#888888"
 _SHOWN = 12  # modes of the figure of participations
 _LEAST = 0.005  # a part below this in every mode is left out
 
@@ -42,32 +50,24 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     Raises:
         UserError: the loop does not use such a channel.
     """
-    gain, phase = _panels(2)
+    gain, phase = pyplot_panels(2, _TWO)
     for k, (name, hz, L) in enumerate(_gains(loop, at)):
         _curve(gain, hz, 20 * np.log10(np.abs(L)), k, name)
         _curve(phase, hz, _degrees(L), k, name)
-    gain.axhline(0.0, color=_GREY, lw=0.8)
+    gain.axhline(0.0, color=GREY, lw=0.8)
     gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
-    phase.axhline(-180.0, color=_GREY, lw=0.8)
+    phase.axhline(-180.0, color=GREY, lw=0.8)
     return _finish([gain, phase], f"{title_of(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
 
 
 def nyquist(loop: ClosedLoop, *at: str) -> Axes:
     """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
     ``bode``."""
-    from matplotlib import pyplot
-
-    from gfm_hil.results.figures import COLOURS, dress
-
-    _, axes = pyplot.subplots(figsize=(5.6, 5.6), layout="constrained")
+    axes = complex_plane(f"{title_of(loop)}: L, one loop cut")
+    draw_circle(axes, 0.0, 1.0)
     for k, (name, _, L) in enumerate(_gains(loop, at)):
         axes.plot(L.real, L.imag, color=COLOURS[k % len(COLOURS)], lw=1.2, label=name)
-    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
-    axes.plot(turn.real, turn.imag, color=_GREY, lw=0.7, ls=(0, (4, 3)))
-    axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
-    axes.set(xlim=(-_NYQUIST, _NYQUIST), ylim=(-_NYQUIST, _NYQUIST), aspect="equal")
     axes.set(xlabel="Re L", ylabel="Im L")
-    dress(axes, f"{title_of(loop)}: L, one loop cut")
     axes.legend(fontsize=8, frameon=False, loc="upper right")
     return axes
 
@@ -84,10 +84,6 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
     Raises:
         UserError: no such input.
     """
-    from matplotlib import pyplot
-
-    from gfm_hil.results.figures import COLOURS, draw_panel
-
     of = of or stepped_by_default(loop)
     title = f"after a unit step of {of}"
     curves: list[tuple[Vector, str, str]]
@@ -102,17 +98,15 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
             curves = [(y, COLOURS[0], "")]
     except ValueError as problem:
         raise UserError(f"step: {problem}") from None
-    figure, panels = pyplot.subplots(
-        len(Y_NAMES), 1, sharex=True, figsize=(8.6, 8.2), layout="constrained"
-    )
+    panels = pyplot_panels(len(Y_NAMES), (8.6, 8.2))
     for k, (axes, signal) in enumerate(zip(panels, Y_NAMES, strict=True)):
         lines = [(t, x[:, k], colour, name or signal) for x, colour, name in curves]
         draw_panel(axes, f"{signal} [p.u.]", lines)
     panels[-1].set_xlabel("t [s]", fontsize=9)
     if len(curves) > 1:
         panels[0].legend(fontsize=8, frameon=False, loc="best", ncols=4)
-    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
-    return list(panels)
+    panels[0].figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    return panels
 
 
 def stepped_by_default(loop: ClosedLoop | NetworkLoop) -> str:
@@ -123,11 +117,7 @@ def stepped_by_default(loop: ClosedLoop | NetworkLoop) -> str:
 def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     """Draw the poles: sigma [1/s] and frequency [Hz], over symmetric logarithms; of a network each
     in the colour of the part that takes part in it most."""
-    from matplotlib import pyplot
-
-    from gfm_hil.results.figures import COLOURS, dress
-
-    _, axes = pyplot.subplots(figsize=(6.6, 4.6), layout="constrained")
+    (axes,) = pyplot_panels(1, (6.6, 4.6))
     if isinstance(loop, NetworkLoop):
         _mark_parts(axes, loop)
         title = "poles, stable where σ < 0; colour: the part with the largest participation"
@@ -172,7 +162,7 @@ def impedance(loop: ClosedLoop) -> list[Axes]:
     Raises:
         ValueError: the loop was made of matrices.
     """
-    size, phase = _panels(2)
+    size, phase = pyplot_panels(2, _TWO)
     hz = _hz(loop)
     Z = loop.output_impedance(2 * np.pi * hz)
     for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
@@ -191,13 +181,8 @@ def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     Args:
         most: how many modes, at least 1.
     """
-    from matplotlib import pyplot
-
-    from gfm_hil.results.figures import dress
-
     modes = loop.modes()[:most]
-    figsize = 7.6, 1.2 + 0.3 * len(modes)
-    _, axes = pyplot.subplots(figsize=figsize, layout="constrained")
+    (axes,) = pyplot_panels(1, (7.6, 1.2 + 0.3 * len(modes)))
     left = np.zeros(len(modes))
     for part, colour in _colours(loop).items():
         share = np.array([mode.participation[part] for mode in modes])
@@ -220,8 +205,6 @@ def _label(mode: Mode) -> str:
 
 
 def _colours(loop: NetworkLoop) -> dict[str, str]:
-    from gfm_hil.results.figures import COLOURS
-
     return {part: COLOURS[k % len(COLOURS)] for k, part in enumerate(loop.network.parts)}
 
 
@@ -245,16 +228,7 @@ def _hz(loop: ClosedLoop) -> Vector:
     return np.unique(np.concatenate([base, near[(near > _LOWEST_HZ) & (near < base[-1])]]))
 
 
-def _panels(rows: int) -> list[Axes]:
-    from matplotlib import pyplot
-
-    _, panels = pyplot.subplots(rows, 1, sharex=True, figsize=(7.6, 5.6), layout="constrained")
-    return list(panels)
-
-
 def _curve(axes: Axes, hz: Vector, values: Vector, k: int, label: str) -> None:
-    from gfm_hil.results.figures import COLOURS
-
     axes.semilogx(hz, values, color=COLOURS[k % len(COLOURS)], lw=1.2, label=label)
 
 
@@ -265,8 +239,6 @@ def _degrees(L: NDArray[np.complex128]) -> Vector:
 
 
 def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
-    from gfm_hil.results.figures import dress
-
     for axes, label in zip(panels, labels, strict=True):
         dress(axes)
         axes.set_ylabel(label, fontsize=9.5)

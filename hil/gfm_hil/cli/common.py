@@ -67,7 +67,7 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
 
 def add_inner(command: argparse.ArgumentParser) -> None:
     """The option that gives every law an inner stage."""
-    said = "inner stage of every law: a shipped name (gfmhil laws), a file, or none"
+    said = "inner stage: a shipped name (gfmhil laws), a file, or none; by default each law's own"
     command.add_argument("--inner", metavar="NAME", help=said)
 
 

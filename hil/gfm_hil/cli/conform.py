@@ -62,8 +62,8 @@ def add(command: argparse.ArgumentParser) -> None:
     diff.add_argument("--html", type=Path, metavar="FILE", help="write a page too")
     diff.add_argument("--json", action="store_true", help="print all of it as JSON, nothing else")
     command.add_argument(
-        "--law", action="append", metavar="LAW",
-        help="catalogue name or law file; may be repeated; all: the whole catalogue",
+        "--law", action="extend", nargs="+", metavar="LAW",
+        help="catalogue names or law files; all: the whole catalogue",
     )  # fmt: skip
     command.add_argument(
         "--controller", metavar="KIND:FILE",
@@ -74,9 +74,8 @@ def add(command: argparse.ArgumentParser) -> None:
     add_map(command, "--controller")
     add_inner(command)
     command.add_argument(
-        "--against", action="append", metavar="SET",
-        help=f"{', '.join(shipped_sets())}, or a path of your own; may be repeated; all: the "
-        "shipped ones (default)",
+        "--against", action="extend", nargs="+", metavar="SET",
+        help=f"{', '.join(shipped_sets())}, or paths of your own; all: the shipped ones (default)",
     )  # fmt: skip
     command.add_argument(
         "--converter", metavar="FILE", help="the converter under test; the shipped one by default"

@@ -155,7 +155,8 @@ def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Ex
     known, first = set(options(top)), words[0]
     close = meant(first.partition("=")[0], known)
     if first.endswith(".toml") and "--law" in known:
-        close = f"; a law's file comes after --law, a scenario's before all options: --law {first}"
+        place = "after --scenario" if "--scenario" in known else "before all options"
+        close = f"; a law's file comes after --law, a scenario's {place}"
     elif "=" in first and not first.startswith("-"):
         close = "; a scenario's file says such values, an option changes what --help lists"
     return UserError(f"{' '.join(words)}: gfmhil {command} does not know it{close}")

@@ -9,7 +9,7 @@ from typing import Any
 from rich.markup import escape
 
 from gfm_hil.api.studies import scan
-from gfm_hil.cli.common import add_study_options, new_folder, watching
+from gfm_hil.cli.common import add_inner, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.core.terminal import terminal
@@ -32,10 +32,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "--scenario", metavar="NAME",
         help="scenario on whose plant a law is measured; pref_step by default",
     )  # fmt: skip
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage: a shipped name (gfmhil laws), a file, or none; the law's own by default",
-    )  # fmt: skip
+    add_inner(command)
     command.add_argument("--from", type=float, default=1.0, metavar="HZ", dest="start",
                          help="lowest frequency in the dq frame; 1 by default")  # fmt: skip
     command.add_argument("--to", type=float, default=1000.0, metavar="HZ", dest="stop",

@@ -33,7 +33,8 @@ _STYLES = ("-", (0, (5, 4)), (0, (6, 4, 1.5, 4)), (0, (1.5, 4)))
 _POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
 _LABELS = 40  # events with a label
 _BINS = 60  # of the histogram of misses
-_GREY = "#888888"
+GREY = "#888888"
+_NEAR = 3.0  # half a side of the complex plane: beyond it a locus is not near -1
 
 
 def _thin(t: ColumnLike, x: ColumnLike, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -69,11 +70,11 @@ def dress(axes: Axes, title: str = "") -> None:
     axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
     axes.grid(True, color="#e4e4e4", lw=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8.5, color=_GREY)
+    axes.tick_params(labelsize=8.5, color=GREY)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
-        axes.spines[side].set_color(_GREY)
+        axes.spines[side].set_color(GREY)
 
 
 def draw_panel(
@@ -111,7 +112,7 @@ def _draw_columns(
 
 
 def _mark(
-    axes: Sequence[Axes], events: Sequence[dict[str, Any]], colour: str = _GREY, above: int = 20
+    axes: Sequence[Axes], events: Sequence[dict[str, Any]], colour: str = GREY, above: int = 20
 ) -> None:
     """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one.
 
@@ -137,7 +138,7 @@ def _mark(
             event["label"], (event["t"], 1.0), (-3 if late else 3, above + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
             ha="right" if late else "left",
-            color="#444444" if colour == _GREY else colour,
+            color="#444444" if colour == GREY else colour,
         )  # fmt: skip
 
 
@@ -309,9 +310,9 @@ def draw_signals(
     E = "E_law" if "E_law" in signals else "u_E_u"  # with an inner stage u_E_u is e_d
     signals = {**signals, "i_ref": Magnitude(*(signals[n] for n in I_REF))} if inner else signals
     panels: list[tuple[str, list[tuple[str, str, str]]]] = [
-        ("active power p", [("true_p", blue, "p"), ("ref_P_ref", _GREY, "P_ref")]),
-        ("reactive power q", [("true_q", blue, "q"), ("ref_Q_ref", _GREY, "Q_ref")]),
-        ("frequency", [("true_omega_u", blue, "converter"), ("true_omega_g", _GREY, "grid")]),
+        ("active power p", [("true_p", blue, "p"), ("ref_P_ref", GREY, "P_ref")]),
+        ("reactive power q", [("true_q", blue, "q"), ("ref_Q_ref", GREY, "Q_ref")]),
+        ("frequency", [("true_omega_u", blue, "converter"), ("true_omega_g", GREY, "grid")]),
         ("voltage V", [("true_V", blue, "V"), (E, red, "E_u")]),
         ("DC voltage v_dc", [("true_v_dc", blue, "v_dc")]),
         ("currents", [("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *inner, *i_u]),
@@ -408,7 +409,7 @@ def draw_timing(
         beyond = 1 - before / max(1, len(spread))
         us = np.maximum(spread.ns / 1e3, 0.1)
         left.loglog(us, beyond, color=colour, lw=1.2, label=duration.meaning)
-    left.axvline(scenario.T_s * 1e6, color=_GREY, lw=0.8, ls=(0, (4, 3)))
+    left.axvline(scenario.T_s * 1e6, color=GREY, lw=0.8, ls=(0, (4, 3)))
     left.text(
         scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
         color="#444444", transform=left.get_xaxis_transform(),
@@ -472,10 +473,33 @@ def draw_comparison(
 # Figures for a notebook, drawn with pyplot.
 
 
-def _pyplot_figure(size: tuple[float, float]) -> Figure:
+def pyplot_figure(size: tuple[float, float]) -> Figure:
+    """An empty figure of pyplot, of a size in inches."""
     from matplotlib import pyplot
 
     return pyplot.figure(figsize=size, layout="constrained")
+
+
+def pyplot_panels(rows: int, size: tuple[float, float]) -> list[Axes]:
+    """Panels below each other over one axis in a figure of pyplot, of a size in inches."""
+    return list(pyplot_figure(size).subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+
+
+def complex_plane(title: str) -> Axes:
+    """A panel in a figure of pyplot that shows the complex plane around -1; ``legend`` it once it
+    has its curves."""
+    (axes,) = pyplot_panels(1, (5.6, 5.6))
+    axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
+    axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
+    dress(axes, title)
+    return axes
+
+
+def draw_circle(axes: Axes, centre: float, radius: float, **how: Any) -> None:
+    """A dashed circle in the complex plane."""
+    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    z = centre + radius * turn
+    axes.plot(z.real, z.imag, color=GREY, lw=0.7, ls=(0, (4, 3)), **how)
 
 
 def plot(run: Run, *names: str) -> list[Axes]:
@@ -485,11 +509,10 @@ def plot(run: Run, *names: str) -> list[Axes]:
         UserError: a signal that was not recorded.
     """
     if not names:
-        return draw_signals(_pyplot_figure(SIZE), run.scenario, run.columns, run.summary)
+        return draw_signals(pyplot_figure(SIZE), run.scenario, run.columns, run.summary)
     signals = run.signals
     curves = [(signals["t"], signals[name], COLOURS[0], name) for name in names]
-    figure = _pyplot_figure((8.6, 2.2 * len(names)))
-    axes = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+    axes = pyplot_panels(len(names), (8.6, 2.2 * len(names)))
     for a, curve in zip(axes, curves, strict=True):
         draw_panel(a, curve[-1], [curve])
     axes[-1].set_xlabel("t [s]")
@@ -511,7 +534,7 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
     if (start is None) != (stop is None):
         raise UserError(f"start = {start}, stop = {stop}: give both or neither")
     window = None if start is None or stop is None else (start, stop)
-    figure = _pyplot_figure(SIZE_WAVES)
+    figure = pyplot_figure(SIZE_WAVES)
     axes = draw_waveforms(figure, run.scenario, run.columns, run.summary, window)
     if not axes:
         pyplot.close(figure)
@@ -522,7 +545,7 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
 
 def plot_network(run: NetworkRun) -> list[Axes]:
     """p, frequency, q and v_dc of all converters in one figure."""
-    return draw_laws(_pyplot_figure(SIZE_LAWS), run.scenario, run.columns, run.events)
+    return draw_laws(pyplot_figure(SIZE_LAWS), run.scenario, run.columns, run.events)
 
 
 def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
@@ -530,4 +553,4 @@ def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
     first = next(iter(runs.values()))
     events = max((one.summary["events"] for one in runs.values()), key=len)
     columns = {law: one.columns for law, one in runs.items()}
-    return draw_laws(_pyplot_figure(SIZE_LAWS), first.scenario, columns, events)
+    return draw_laws(pyplot_figure(SIZE_LAWS), first.scenario, columns, events)

@@ -10,9 +10,8 @@ from matplotlib.lines import Line2D
 
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
-from gfm_hil.results.figures import COLOURS, dress
+from gfm_hil.results.figures import COLOURS, GREY, dress
 
-_GREY = "#888888"
 _SPAN = 100.0  # 1/s; colours of sigma end there
 _DELAYS = 300
 
@@ -60,7 +59,7 @@ def draw_delay(path: Path, loop: ClosedLoop, label: str, margin: float) -> None:
     figure = Figure(figsize=(6.6, 3.4), layout="constrained")
     axes = figure.subplots()
     axes.plot(1e6 * delays, sigma, color=COLOURS[0], lw=1.4)
-    axes.axhline(0.0, color=_GREY, lw=0.8)
+    axes.axhline(0.0, color=GREY, lw=0.8)
     if np.isfinite(margin):
         axes.axvline(1e6 * margin, color=COLOURS[1], lw=1.0, ls=(0, (4, 3)))
         axes.annotate(

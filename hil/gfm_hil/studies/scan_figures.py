@@ -11,22 +11,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.results.figures import COLOURS, dress, headline
+from gfm_hil.results.figures import (
+    COLOURS,
+    complex_plane,
+    draw_circle,
+    dress,
+    headline,
+    pyplot_figure,
+    pyplot_panels,
+)
 from gfm_hil.studies.scan import FrequencyScan
 
-_GREY = "#888888"
 _CELLS = ("dd", "dq", "qd", "qq")
-_NYQUIST = 3.0  # half a side of the figure
 
 
 def admittance(of: FrequencyScan) -> list[Axes]:
     """Gain and phase of the four entries: two rows of panels a row of Y."""
-    from matplotlib import pyplot
-
-    figure, panels = pyplot.subplots(
-        4, 2, sharex=True, figsize=(9.2, 8.6), layout="constrained",
-        gridspec_kw={"height_ratios": [3, 2, 3, 2]},
-    )  # fmt: skip
+    figure = pyplot_figure((9.2, 8.6))
+    panels = figure.subplots(4, 2, sharex=True, height_ratios=[3, 2, 3, 2])
     for k, cell in enumerate(_CELLS):
         row, column = divmod(k, 2)
         gain, phase = panels[2 * row, column], panels[2 * row + 1, column]
@@ -46,15 +48,9 @@ def admittance(of: FrequencyScan) -> list[Axes]:
 
 def passivity(of: FrequencyScan) -> list[Axes]:
     """The least eigenvalue of Y + Y^H, and the deviation of Y from the model."""
-    from matplotlib import pyplot
-
-    dev = of.deviation
+    dev, least = of.deviation, of.passivity
     rows = 1 if dev is None else 2
-    _, found = pyplot.subplots(
-        rows, 1, sharex=True, squeeze=False, figsize=(7.6, 2.9 * rows), layout="constrained"
-    )
-    panels = list(found[:, 0])
-    least = of.passivity
+    panels = pyplot_panels(rows, (7.6, 2.9 * rows))
     panels[0].semilogx(of.frequency, least, "o-", color=COLOURS[0], ms=3.5, lw=1.0)
     panels[0].axhline(0.0, color="k", lw=0.8)
     panels[0].fill_between(
@@ -73,9 +69,7 @@ def nfp(of: FrequencyScan, figure: Figure | None = None) -> list[Axes]:
     """Gain and phase of the change of p over that of the grid's frequency; in a figure of its own
     if none is given."""
     if figure is None:
-        from matplotlib import pyplot
-
-        figure = pyplot.figure(figsize=(7.6, 5.6), layout="constrained")
+        figure = pyplot_figure((7.6, 5.6))
         headline(figure, f"{of.name}: network frequency perturbation", 9.5)
     gain, phase = figure.subplots(2, 1, sharex=True)
     _bode(gain, phase, of.frequency, of.nfp, of.nfp_model)
@@ -88,23 +82,16 @@ def nfp(of: FrequencyScan, figure: Figure | None = None) -> list[Axes]:
 
 def nyquist_on_grid(of: FrequencyScan, scr: float, x_over_r: float) -> Axes:
     """The eigenvalues of Z Y, over positive frequencies, near -1."""
-    from matplotlib import pyplot
-
     found = of.stability(scr, x_over_r)
-    _, axes = pyplot.subplots(figsize=(5.6, 5.6), layout="constrained")
-    for k, locus in enumerate(of.eigenloci(scr, x_over_r).T):
-        colour = COLOURS[k]
-        axes.plot(
-            locus.real, locus.imag, "o-", color=colour, ms=2.5, lw=1.0, label=f"λ{k + 1}(Z Y)"
-        )
-    axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
-    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
-    circle = -1.0 + found.margin * turn
-    axes.plot(circle.real, circle.imag, color=_GREY, lw=0.7, ls=(0, (4, 3)), label="margin")
-    axes.set(xlim=(-_NYQUIST, _NYQUIST), ylim=(-_NYQUIST, _NYQUIST), aspect="equal")
-    axes.set(xlabel="Re", ylabel="Im")
     verdict = {True: "stable", False: "unstable", None: "cannot be judged"}[found.stable]
-    dress(axes, f"{of.name}, SCR {scr:g}, X/R {x_over_r:g}: {verdict}, margin {found.margin:.2g}")
+    axes = complex_plane(
+        f"{of.name}, SCR {scr:g}, X/R {x_over_r:g}: {verdict}, margin {found.margin:.2g}"
+    )
+    for k, locus in enumerate(of.eigenloci(scr, x_over_r).T):
+        label = f"λ{k + 1}(Z Y)"
+        axes.plot(locus.real, locus.imag, "o-", color=COLOURS[k], ms=2.5, lw=1.0, label=label)
+    draw_circle(axes, -1.0, found.margin, label="margin")
+    axes.set(xlabel="Re", ylabel="Im")
     axes.legend(fontsize=8, frameon=False, loc="upper right")
     return axes
 

@@ -13,18 +13,16 @@ piece. v_f itself follows the parabola through v at the beginning, the middle an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gfm_plant.circuit import CurrentSource
-from gfm_plant.components.part import Fed, LinearPart, Matrix
+from gfm_plant.components.part import DRAWN, Drawing, LinearPart, Matrix, see_middle
 from gfm_plant.layout import field
 from gfm_plant.parameters import Positive
-from gfm_plant.solution import draw, state
+from gfm_plant.solution import draw
 from gfm_runtime.compiled import compiled
 
 _LAG = 5.0  # shortest lag of the measurement, in sampling periods
@@ -59,11 +57,6 @@ def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 
 @compiled
-def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    one.v_middle = state(n, now, c, one.sees)
-
-
-@compiled
 def _end(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     """Take the measured voltage on by a piece, at whose end w is."""
     a = field(n, "lag_weights")[part, one.lag]
@@ -84,7 +77,7 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.v_f = one.v_f_before
 
 
-class ConstantPowerLoad(Fed):
+class ConstantPowerLoad(Drawing):
     """A load whose control holds P and Q, such as a drive or a charger: it draws the current
     conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
     as the filter of such a load is."""
@@ -96,20 +89,19 @@ class ConstantPowerLoad(Fed):
         "capacitors": {"c": {"node": "bus", "Q": 0.1}},
     }
     more_states: ClassVar = (("v_f", "p.u., a space vector", "the voltage that it has measured"),)
-    is_voltage: ClassVar = False
+    lacks: ClassVar = "{} draws constant power, so the node needs a bank of network.capacitors"
     record: ClassVar = np.dtype(
         [
-            ("source", "i8"), ("sees", "i8"), ("lag", "i8"),
+            *DRAWN, ("lag", "i8"),
             ("S", "c16"),  # P + jQ, p.u. of the network
             ("tau", "f8"),  # s
             ("least_v2", "f8"),  # the square of V_least
             ("v_f", "c16"), ("v_f_before", "c16"),  # now, and at the last tick
-            ("v_begin", "c16"), ("v_middle", "c16"),  # the true voltage along a piece
         ],
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": _middle, "end": _end, "go_back": _go_back
+        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
@@ -126,9 +118,6 @@ class ConstantPowerLoad(Fed):
         """P + jQ, p.u."""
         return complex(self.P, self.Q)
 
-    def elements(self, name: str) -> tuple[CurrentSource]:
-        return (CurrentSource(name, self.node),)
-
     def label(self) -> str:
         return f"constant P {self.P:g}, Q {self.Q:g} p.u."
 
@@ -141,14 +130,6 @@ class ConstantPowerLoad(Fed):
                 f"{where}: tau_s = {self.tau_s:g}: must be >= {_LAG * T_s:g} s at this T_s"
             )
         record["S"], record["tau"], record["least_v2"] = self.S, self.tau_s, self.V_least**2
-
-    def sees(self, name: str, banks: Mapping[str, str]) -> str:
-        if self.node not in banks:
-            raise ValueError(
-                f"node {self.node}: {name} draws constant power, so the node needs a bank of"
-                " network.capacitors"
-            )
-        return banks[self.node]
 
     def current(self, v: complex, slip: float) -> tuple[complex, complex]:
         """The measured voltage and the current that it draws at rest, at a voltage v that turns

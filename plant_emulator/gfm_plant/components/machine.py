@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -68,46 +68,59 @@ def _at_rest(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.slope = 0.0
 
 
-class Machine(Fed):
-    """A synchronous machine in its classical model: a constant voltage behind the transient
-    reactance, the swing equation, and a governor. It has no voltage regulator, no dampers, no
-    saliency and no limits."""
+SPEED = [
+    ("source", "i8"), ("sees", "i8"),
+    ("leads", "i8"),  # without a grid, its speed is omega_g
+    *SWING, ("omega", "f8"), ("slope", "f8"),  # its d/dt, 1/s
+]  # fmt: skip
+"""Fields of the record of a machine."""
 
-    title: ClassVar = "Synchronous machine"
+
+class Rotating(Fed):
+    """What machines have in common: the swing equation and a governor."""
+
     symbol: ClassVar = "SM"
-    example: ClassVar = {"machines": {"x": {"node": "bus", "S": 1.0, "H": 3.0, "P": 0.2}}}
-    more_states: ClassVar = (
+    more_states: ClassVar[Sequence[tuple[str, str, str]]] = (
         ("omega", "p.u.", "its speed, by the swing equation"),
-        ("angle", "rad", "of the voltage behind its reactance"),
+        ("angle", "rad", "of its rotor"),
         ("P_turbine", "p.u. of its rating", "power of its turbine, behind the governor"),
     )
     columns: ClassVar = ("true_omega_g",)
     is_voltage: ClassVar = True
-    unknowns: ClassVar = 1  # the angle of its voltage, rad
-    record: ClassVar = np.dtype(
-        [
-            ("source", "i8"), ("sees", "i8"),
-            ("leads", "i8"),  # without a grid, its speed is omega_g
-            *SWING, ("E", "f8"),
-            ("omega", "f8"), ("slope", "f8"),  # its d/dt, 1/s
-        ],
-        align=True,
-    )  # fmt: skip
-    hooks: ClassVar = {
-        "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
-        "tick": _tick, **KEPT,
-    }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is")
     S: Positive = Field(description="rating over that of the first converter")
     H: Positive = Field(description="inertia constant, s")
     P: float = Field(description="power at nominal frequency, p.u. of its rating")
-    E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")
-    X: Positive = Field(0.3, description="transient reactance, p.u. of its rating")
-    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
     D: NonNegative = Field(0.0, description="damping by frequency, p.u./p.u.")
     droop: Positive = Field(0.05, description="frequency by power of the governor, p.u./p.u.")
     T_gov: Positive = Field(0.5, description="lag of governor and turbine, s")
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+        return name
+
+    def asked(self, omega: float) -> float:
+        """The power that governor and damping ask for at rest, p.u. of its rating."""
+        return self.P - (omega - 1.0) * (1.0 / self.droop + self.D)
+
+
+class Machine(Rotating):
+    """A synchronous machine in its classical model: a constant voltage behind the transient
+    reactance, the swing equation, and a governor. It has no voltage regulator, no dampers, no
+    saliency and no limits."""
+
+    title: ClassVar = "Synchronous machine"
+    example: ClassVar = {"machines": {"x": {"node": "bus", "S": 1.0, "H": 3.0, "P": 0.2}}}
+    unknowns: ClassVar = 1  # the angle of its voltage, rad
+    record: ClassVar = np.dtype([*SPEED, ("E", "f8")], align=True)
+    hooks: ClassVar = {
+        "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
+        "tick": _tick, **KEPT,
+    }  # fmt: skip
+
+    E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")
+    X: Positive = Field(0.3, description="transient reactance, p.u. of its rating")
+    R: NonNegative = Field(0.0, description="resistance, p.u. of its rating")
 
     def elements(self, name: str) -> tuple[Branch]:
         return (Branch(name, emf(name), self.node, self.X / self.S, self.R / self.S),)
@@ -119,16 +132,12 @@ class Machine(Fed):
         pack_swing(self, record, self.X / self.S, where, T_s, omega_b)
         record["E"], record["P_set"] = self.E, self.P
 
-    def sees(self, name: str, banks: Mapping[str, str]) -> str:
-        return name
-
     def steady(
         self, v: complex, omega: float, omega_b: float, z: Matrix
     ) -> tuple[complex, list[float]]:
         voltage = self.E * cmath.exp(1j * z[0])
         i = (voltage - v) / complex(self.R / self.S, omega * (self.X / self.S))
-        asked = self.P - (omega - 1.0) * (1.0 / self.droop + self.D)
-        return i, [(voltage * i.conjugate()).real / self.S - asked]
+        return i, [(voltage * i.conjugate()).real / self.S - self.asked(omega)]
 
     def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         record["omega"] = omega

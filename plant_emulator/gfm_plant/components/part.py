@@ -10,8 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.circuit import Element
+from gfm_plant.circuit import CurrentSource, Element
 from gfm_plant.parameters import Options
+from gfm_plant.solution import state
+from gfm_runtime.compiled import compiled
 
 Matrix = NDArray[np.float64]
 
@@ -152,6 +154,35 @@ class Fed(Dynamic):
             slip: of its island against the common frame, rad/s.
         """
         raise NotImplementedError
+
+
+DRAWN = [
+    ("source", "i8"), ("sees", "i8"),
+    ("v_begin", "c16"), ("v_middle", "c16"),  # the voltage of its node along a piece
+]  # fmt: skip
+"""Fields of the record of a current source."""
+
+
+@compiled
+def see_middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Keep the voltage in the middle of a piece, for the hook at its end."""
+    one.v_middle = state(n, now, c, one.sees)
+
+
+class Drawing(Fed):
+    """A component that draws a current from a node whose voltage a capacitor holds."""
+
+    is_voltage: ClassVar = False
+    #: what a node without a capacitor lacks, after its name and that of the component
+    lacks: ClassVar[str]
+
+    def elements(self, name: str) -> Sequence[Element]:
+        return (CurrentSource(name, self.node),)
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+        if self.node not in banks:
+            raise ValueError(f"node {self.node}: {self.lacks.format(name)}")
+        return banks[self.node]
 
 
 def emf(name: str) -> str:

@@ -15,17 +15,15 @@ rule. Resistances of the circuit alone take a constant flux away.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from gfm_plant.circuit import CurrentSource
-from gfm_plant.components.part import Fed, LinearPart, Matrix
+from gfm_plant.components.part import DRAWN, Drawing, LinearPart, Matrix, see_middle
 from gfm_plant.layout import field
 from gfm_plant.parameters import Options, Positive
-from gfm_plant.solution import draw, state, turned
+from gfm_plant.solution import draw, turned
 from gfm_plant.steady_state import NoEquilibrium
 from gfm_runtime.compiled import compiled
 
@@ -68,11 +66,6 @@ def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 
 @compiled
-def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    one.v_middle = state(n, now, c, one.sees)
-
-
-@compiled
 def _end(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     v, by = field(now, "w")[one.sees], n.omega_b * field(n, "half_h")[part] / 3.0
     one.flux += by * (one.v_begin * one.turn + v * one.turn_end)
@@ -98,7 +91,7 @@ class Core(Options):
     X_air: Positive = Field(0.4, description="reactance beyond that, p.u. of the rating")
 
 
-class Saturation(Core, Fed):
+class Saturation(Core, Drawing):
     """The core of a transformer, which draws a current beyond its knee: after energising it, and
     when the voltage comes back after a fault. Its node needs a capacitor, of a bank or of a
     converter's filter. The magnetising current below the knee is that of ``X_m`` of a transformer.
@@ -111,41 +104,30 @@ class Saturation(Core, Fed):
         "capacitors": {"c": {"node": "bus", "Q": 0.1}},
     }
     more_states: ClassVar = (("flux", "p.u., a space vector", "of its core"),)
-    is_voltage: ClassVar = False
+    lacks: ClassVar = (
+        "the core of {} needs a capacitor there, of network.capacitors or of a converter's filter"
+    )
     record: ClassVar = np.dtype(
         [
-            ("source", "i8"), ("sees", "i8"),
-            ("knee", "f8"), ("X_air", "f8"),  # p.u. of the network
+            *DRAWN, ("knee", "f8"), ("X_air", "f8"),  # p.u. of the network
             ("flux", "c16"), ("flux_before", "c16"),  # in the frame that stands still
             # from the common frame to that one, along a piece, and at the last tick
             ("turn", "c16"), ("turn_middle", "c16"), ("turn_end", "c16"), ("turn_before", "c16"),
-            ("v_begin", "c16"), ("v_middle", "c16"),  # along a piece
         ],
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": _middle, "end": _end, "go_back": _go_back
+        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor")
     S: Positive = Field(description="rating over that of the first converter")
-
-    def elements(self, name: str) -> tuple[CurrentSource]:
-        return (CurrentSource(name, self.node),)
 
     def label(self) -> str:
         return f"knee {self.knee:g}, $X_{{air}}$ {self.X_air:g}"
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
         record["knee"], record["X_air"] = self.knee, self.X_air / self.S
-
-    def sees(self, name: str, banks: Mapping[str, str]) -> str:
-        if self.node not in banks:
-            raise ValueError(
-                f"node {self.node}: the core of {name} needs a capacitor there, of"
-                " network.capacitors or of a converter's filter"
-            )
-        return banks[self.node]
 
     def steady(
         self, v: complex, omega: float, omega_b: float, z: Matrix

@@ -27,7 +27,6 @@ error falls with the square of T_s. V is the mean over a tick, which e'', R and 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
@@ -35,10 +34,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from gfm_plant.circuit import Branch
-from gfm_plant.components.part import Fed, LinearPart, Matrix, emf
+from gfm_plant.components.machine import SPEED, Rotating
+from gfm_plant.components.part import LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
     KEPT,
-    SWING,
     lead,
     pack_swing,
     slopes,
@@ -177,32 +176,25 @@ class Regulator(Options):
         return self
 
 
-class SynchronousMachine(Fed):
+class SynchronousMachine(Rotating):
     """A synchronous machine with transient and subtransient reactances, a voltage regulator and a
     governor: field and damper windings of order 6, the subtransient reactance the same in both
     axes. It has no saturation and no stabiliser. The defaults are those of the machines of
     Kundur's two areas (Power System Stability and Control, example 12.6)."""
 
     title: ClassVar = "Synchronous machine of order 6"
-    symbol: ClassVar = "SM"
     example: ClassVar = {
         "synchronous_machines": {"x": {"node": "bus", "S": 1.0, "H": 3.0, "P": 0.2, "avr": {}}}
     }
     more_states: ClassVar = (
-        ("omega", "p.u.", "its speed, by the swing equation"),
-        ("angle", "rad", "of its rotor's d axis"),
-        ("P_turbine", "p.u. of its rating", "power of its turbine, behind the governor"),
+        *Rotating.more_states,
         ("E_q', E_d', ψ_kd, ψ_kq", "p.u. of its rating", "of field and damper windings"),
         ("V_m, x, E_fd", "p.u. of its rating", "of the voltage regulator"),
     )
-    columns: ClassVar = ("true_omega_g",)
-    is_voltage: ClassVar = True
     unknowns: ClassVar = 4  # its current, p.u. of its rating, and the voltage at its terminals
     record: ClassVar = np.dtype(
         [
-            ("source", "i8"), ("sees", "i8"),
-            ("leads", "i8"),  # without a grid, its speed is omega_g
-            *SWING, ("omega", "f8"), ("slope", "f8"),  # its d/dt, 1/s
+            *SPEED,
             # X_dd is X_d - X_d', X_dl is X_d' - X_l, and so for q; k and a as in the equations
             *((name, "f8") for name in ("X_dd", "X_qq", "X_dl", "X_ql", "k_d", "k_q", "a_d")),
             *((name, "f8") for name in ("a_q", "X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20")),
@@ -224,10 +216,6 @@ class SynchronousMachine(Fed):
         "tick": _tick, **KEPT,
     }  # fmt: skip
 
-    node: str = Field(min_length=1, description="where it is")
-    S: Positive = Field(description="rating over that of the first converter")
-    H: Positive = Field(description="inertia constant, s")
-    P: float = Field(description="power at nominal frequency, p.u. of its rating")
     V: Positive = Field(1.0, description="voltage of its node at the start, p.u.")
     X_d: Positive = Field(1.8, description="synchronous reactance X_d, p.u. of its rating")
     X_q: Positive = Field(1.7, description="synchronous reactance X_q, p.u.")
@@ -240,9 +228,6 @@ class SynchronousMachine(Fed):
     T_q10: Positive = Field(0.4, description="open-circuit transient time constant T_q0', s")
     T_d20: Positive = Field(0.03, description="open-circuit subtransient time constant T_d0'', s")
     T_q20: Positive = Field(0.05, description="open-circuit subtransient time constant T_q0'', s")
-    D: NonNegative = Field(0.0, description="damping by frequency, p.u./p.u.")
-    droop: Positive = Field(0.05, description="frequency by power of the governor, p.u./p.u.")
-    T_gov: Positive = Field(0.5, description="lag of governor and turbine, s")
     avr: Regulator | None = Field(None, description="voltage regulator; E_fd is constant if none")
 
     @model_validator(mode="after")
@@ -290,16 +275,14 @@ class SynchronousMachine(Fed):
             record[f"k_{axis}"] = (X_1 - self.X_2) / (X_1 - self.X_l) ** 2
         record["P_set"], record["begins"] = self.P, 1
 
-    def sees(self, name: str, banks: Mapping[str, str]) -> str:
-        return name
-
     def steady(
         self, v: complex, omega: float, omega_b: float, z: Matrix
     ) -> tuple[complex, list[float]]:
         i, terminal = complex(*z[:2]), v - complex(*z[2:])
         torque = ((v + self.R * i) * i.conjugate()).real / omega
-        asked = self.P - (omega - 1.0) * (1.0 / self.droop + self.D)
-        return self.S * i, [abs(v) - self.V, torque - asked, terminal.real, terminal.imag]
+        return self.S * i, [
+            abs(v) - self.V, torque - self.asked(omega), terminal.real, terminal.imag
+        ]  # fmt: skip
 
     def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         i, v = complex(*z[:2]), complex(*z[2:])

@@ -40,7 +40,7 @@ plant short.toml --link zmq | link.endpoint: not set
 laws show vsg-99 | vsg-99
 run short.toml --zzz 3 | gfmhil: --zzz 3: gfmhil run does not know it
 firmware export vsg-1 --reel float32 -o out | does not know it; did you mean '--real'?
-design poles own.toml | --law own.toml
+design poles own.toml | a law's file comes after --law, a scenario's after --scenario
 run virtual P_ref=0.8 | a scenario's file says such values
 runn pref_step | runn: no command; did you mean 'run'? must be one of ['run'
 # benchmarks

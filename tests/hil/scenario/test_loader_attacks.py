@@ -1,26 +1,15 @@
 """Attacks on the loaders: every file yields a value, or one line per mistake."""
 
-import contextlib
-import copy
 import os
 import tomllib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from gfm_design.norms.performance import read_weights
 from gfm_hil.cli import main
-from gfm_hil.core.errors import UserError
-from gfm_hil.engine.setup import make_bench
-from gfm_hil.scenario import SCENARIO_FOLDERS, load_scenario, scenario_toml, toml_text
-from gfm_hil.studies.campaign.loading import load_campaign
-from gfm_plant import NoEquilibrium
-from gfm_runtime import LawError, discretise, load_law
+from gfm_hil.scenario import load_scenario, toml_text
 from gfm_runtime.toml_file import MAX_BYTES
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -241,140 +230,3 @@ def test_a_key_cannot_write_to_the_terminal(kind, refused):
     text = texts.get(kind, (LAWS / "vsg-2.toml").read_text())
     Path("key.toml").write_text('"a\\nb\\u001b[31m" = 1\n' + text)
     assert "a\\nb\\x1b" in refused(*commands("key.toml")[kind])
-
-
-# ------------------------------------------------------------------------- anything, anywhere
-
-WEIRD = st.one_of(
-    st.sampled_from([0, -1, 2**31, 2**63 - 1, 2**63, 10**29, 10**400, -(10**400)]),
-    st.sampled_from([0.0, -0.0, -1.0, 1e300, -1e300, 1e-300, 5e-324, 1e12, 1e-12]),
-    st.sampled_from([float("nan"), float("inf"), -float("inf")]),
-    st.sampled_from(["", " ", "a" * 300, "a\0b", "a\nb", "é", "/dev/zero", "pipe.toml", "P_ref"]),
-    st.sampled_from([True, False, [], {}, [[]], [[1.0]], {"a": 1}, [1] * 100, ["x"], "@date"]),
-    st.floats(),
-    st.integers(-3, 10**6),
-)
-_SLOW = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-
-
-def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path of every value in nested tables and arrays."""
-    items: Any = ()
-    if isinstance(content, dict):
-        items = content.items()
-    elif isinstance(content, list):
-        items = enumerate(content)
-    for key, value in items:
-        yield (*path, key)
-        yield from places(value, (*path, key))
-
-
-def spoilt(content: dict[str, Any]) -> st.SearchStrategy[str]:
-    """The TOML of a file in which one to three values were replaced or removed."""
-    changes = st.lists(
-        st.tuples(st.sampled_from(list(places(content))), st.one_of(st.just(None), WEIRD)),
-        min_size=1, max_size=3,
-    )  # fmt: skip
-
-    def apply(chosen: list[tuple[tuple[Any, ...], Any]]) -> str:
-        changed = copy.deepcopy(content)
-        for path, value in chosen:
-            at: Any = changed
-            with contextlib.suppress(KeyError, IndexError, TypeError):  # changed before
-                for key in path[:-1]:
-                    at = at[key]
-                last = str(path[-1]) if isinstance(at, dict) else path[-1]
-                if value is None:
-                    del at[last]
-                else:
-                    at[last] = copy.deepcopy(value)  # else a list could contain itself
-        return toml_text(changed).replace('"@date"', "1979-05-27")
-
-    return changes.map(apply)
-
-
-def full(name: str) -> dict[str, Any]:
-    """A shipped scenario with every key, in process, with at least one event."""
-    content = tomllib.loads(scenario_toml(load_scenario(name)))
-    content["plant"]["factors"] = {"L_g": 1.0, "R_f": 1.0}
-    return content
-
-
-def holds(load: Callable[[str], Any], text: str) -> None:
-    """Check that a file is read, or refused with one line per mistake."""
-    file = Path("spoilt.toml")
-    file.write_text(text, encoding="utf-8")
-    try:
-        load(str(file))
-    except (UserError, LawError, NoEquilibrium) as problem:
-        for line in str(problem).split("\n"):
-            assert line and line.isprintable() and len(line) < 3000
-
-
-def ready(name: str) -> None:
-    """Do what ``gfmhil run`` does before it writes anything."""
-    make_bench(load_scenario(name, mode="lockstep", link__type="inproc"))
-
-
-def law_ready(name: str) -> None:
-    for stage in load_law(name).laws:
-        discretise(stage, 1e-4)
-
-
-@pytest.mark.parametrize("name", ["pref_step", "switchover", "weakening_grid"])
-@given(data=st.data())
-@settings(max_examples=60, suppress_health_check=_SLOW)
-def test_any_scenario_is_read_or_refused_in_lines(name, data):
-    holds(ready, data.draw(spoilt(full(name))))
-
-
-@pytest.mark.parametrize("name", ["zmq", "can", "shm"])
-@given(data=st.data())
-@settings(max_examples=30, suppress_health_check=_SLOW)
-def test_any_link_is_read_or_refused_in_lines(name, data):
-    link = {"type": name, "endpoint": "tcp://127.0.0.1:5555", "peer_timeout_s": 1.0,
-            "options": {"fd": True, "every": 1, "curve": "keys", "plain": True, "bitrate": 1000000},
-            "impairment": {"pause_at": 3, "kill_at": 3, "seed": 3}}  # fmt: skip
-    holds(load_scenario, data.draw(spoilt({"title": "x", "duration": 0.05, "link": link})))
-
-
-@given(data=st.data())
-@settings(max_examples=100, suppress_health_check=_SLOW)
-def test_any_converter_is_read_or_refused_in_lines(data):
-    Path("conv.toml").write_text(data.draw(spoilt(tomllib.loads(CONVERTER.read_text()))))
-    holds(ready, BASE + '[plant]\nconverter = "conv.toml"\n')
-
-
-@pytest.mark.parametrize("name", ["mimo-gfm", "droop-5", "mimo-gfm-scheduled", "dvoc"])
-@given(data=st.data())
-@settings(max_examples=60, suppress_health_check=_SLOW)
-def test_any_law_is_read_or_refused_in_lines(name, data):
-    holds(law_ready, data.draw(spoilt(tomllib.loads((LAWS / f"{name}.toml").read_text()))))
-
-
-@given(data=st.data())
-@settings(max_examples=60, suppress_health_check=_SLOW)
-def test_any_campaign_is_read_or_refused_in_lines(data):
-    holds(load_campaign, data.draw(spoilt(tomllib.loads(CAMPAIGN))))
-
-
-@given(data=st.data())
-@settings(max_examples=60)
-def test_any_weights_are_read_or_refused(data):
-    text = data.draw(spoilt({"W_11": {"num": [1.0, 4.0], "den": [1.0, 4e-4]}}))
-    Path("weights.toml").write_text(text)
-    try:
-        read_weights(Path("weights.toml"))
-    except ValueError as problem:
-        assert str(problem).isprintable()
-
-
-@given(lines=st.lists(st.integers(0, 60), max_size=4), noise=st.text(max_size=10))
-@settings(max_examples=60, suppress_health_check=_SLOW)
-def test_any_text_is_read_or_refused_in_lines(lines, noise):
-    """Lines of a shipped file replaced by noise."""
-    (folder,) = [f for f in SCENARIO_FOLDERS if f.is_dir()]
-    text = (folder / "switchover.toml").read_text().splitlines()
-    for k in lines:
-        text[k % len(text)] = noise.encode("utf-8", "replace").decode()
-    holds(load_scenario, "\n".join(text))

@@ -1,17 +1,10 @@
-"""What the design commands share: the inner stage and the converter of a loop."""
+"""What the design commands share: the options that choose a loop."""
 
 import argparse
+from typing import Any
 
-from gfm_hil.cli.common import OPTIONS
+from gfm_hil.cli.common import OPTIONS, add_inner
 from gfm_hil.scenario import Scenario, load_scenario
-
-
-def add_inner_option(command: argparse.ArgumentParser) -> None:
-    """The inner stage."""
-    command.add_argument(
-        "--inner", metavar="NAME",
-        help="inner stage: a shipped name (gfmhil laws), a file, or none; the law's own by default",
-    )  # fmt: skip
 
 
 def add_converter_option(command: argparse.ArgumentParser) -> None:
@@ -21,6 +14,21 @@ def add_converter_option(command: argparse.ArgumentParser) -> None:
         help="of a scenario with a network: the converter whose loop it is, and that gets --law and"
         " --inner",
     )  # fmt: skip
+
+
+def add_loop_options(command: argparse.ArgumentParser) -> Any:
+    """Law, inner stage, scenario and converter of a loop, and JSON; returns the group in which
+    something else may stand in place of the scenario."""
+    command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
+    add_inner(command)
+    where = command.add_mutually_exclusive_group()
+    where.add_argument(
+        "--scenario", default="pref_step",
+        help="scenario file or shipped name: plant, references, T_s; pref_step by default",
+    )  # fmt: skip
+    add_converter_option(command)
+    command.add_argument("--json", action="store_true", help="as JSON")
+    return where
 
 
 def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:

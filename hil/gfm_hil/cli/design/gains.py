@@ -23,8 +23,8 @@ from gfm_hil.api.design import (
     write_law,
 )  # fmt: skip
 from gfm_hil.api.law import Law
-from gfm_hil.cli.common import EXIT_OTHERWISE, watching
-from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, watching
+from gfm_hil.cli.design.common import add_converter_option, chosen_scenario
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
@@ -79,7 +79,7 @@ def judged_on(options: argparse.Namespace) -> Scenario | None:
 def add_law_options(command: argparse.ArgumentParser) -> None:
     """The law, its inner stage, its gains, the weights, and JSON."""
     command.add_argument("--law", required=True, help="catalogue name or law file")
-    add_inner_option(command)
+    add_inner(command)
     command.add_argument("--gains", help="k=v,…: other values (tune: other starts)")
     command.add_argument("--weights", help="TOML file of weights; the paper's six by default")
     command.add_argument("--json", action="store_true", help="as JSON")

@@ -11,8 +11,8 @@ from gfm_design.misses.tolerance import LatencyTolerance
 from gfm_hil.api.design import latency_tolerance
 from gfm_hil.api.latency import measured_misses
 from gfm_hil.api.law import laws
-from gfm_hil.cli.common import EXIT_OTHERWISE, watching
-from gfm_hil.cli.design.common import add_converter_option, add_inner_option
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, watching
+from gfm_hil.cli.design.common import add_converter_option
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
@@ -30,7 +30,7 @@ def add(kinds: Any) -> None:
         "--law", nargs="+", metavar="LAW",
         help=f"catalogue names or law files, or {_ALL}; the scenario's by default",
     )  # fmt: skip
-    add_inner_option(command)
+    add_inner(command)
     add_converter_option(command)
     command.add_argument(
         "--scenario",

@@ -12,7 +12,7 @@ from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
-from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
+from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
 from gfm_hil.cli.design.margins import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -40,13 +40,7 @@ def add(kinds: Any) -> None:
         ),
     ):  # fmt: skip
         command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
-        command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
-        add_inner_option(command)
-        command.add_argument(
-            "--scenario", default="pref_step",
-            help="scenario file or shipped name: plant, references, T_s; pref_step by default",
-        )  # fmt: skip
-        add_converter_option(command)
+        add_loop_options(command)
         if find is _margins:
             command.add_argument(
                 "--at", help="channels of u or y, separated by commas; all of u by default"
@@ -59,7 +53,6 @@ def add(kinds: Any) -> None:
         command.add_argument(
             "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
         )
-        command.add_argument("--json", action="store_true", help="as JSON")
         command.set_defaults(call=call, find=find, draw=draw)
 
 

@@ -26,7 +26,7 @@ from gfm_design.margins.locus import DiskMargin
 from gfm_design.margins.tolerance import POINTS, End, GridStrength, Range, Region, stable_region
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.cli.common import EXIT_OTHERWISE, watching
-from gfm_hil.cli.design.common import add_converter_option, add_inner_option, chosen_scenario
+from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import Run
@@ -41,19 +41,11 @@ def add(kinds: Any) -> None:
     command = kinds.add_parser(
         "margins", help="gain, phase, delay and disk margins, parameter ranges, stable grids"
     )
-    command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
-    add_inner_option(command)
-    add_converter_option(command)
-    where = command.add_mutually_exclusive_group()
-    where.add_argument(
-        "--scenario", default="pref_step",
-        help="scenario file or shipped name: plant, references, T_s; pref_step by default",
-    )  # fmt: skip
+    where = add_loop_options(command)
     where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
     command.add_argument(
         "--figures", type=Path, metavar="DIR", help="draw region.png and delay.png into DIR"
     )
-    command.add_argument("--json", action="store_true", help="as JSON")
     command.set_defaults(call=call)
 
 
