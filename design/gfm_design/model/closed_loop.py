@@ -321,7 +321,7 @@ class ClosedLoop(LinearLoop):
 
     @property
     def op(self) -> OperatingPoint:
-        """Where the converter and its law rest.
+        """The operating point of the converter and its law.
 
         Raises:
             ValueError: the loop was made of matrices.
@@ -510,7 +510,7 @@ class ClosedLoop(LinearLoop):
         """Z of the converter at its capacitor, as the grid sees it: shape (K, 2, 2), p.u. of Z_b.
 
         (-v_d, -v_q) = Z (i_od, i_oq) for small deviations, in the dq frame that turns steadily at
-        the grid's frequency and lies on the converter's own frame at rest, so that the
+        the grid's frequency and lies on the converter's own frame in steady state, so that the
         synchronisation is part of Z (Wen et al., "Analysis of D-Q Small-Signal Impedance of
         Grid-Tied Inverters", IEEE Trans. Power Electron. 31(1), 2016). The line is not part of it.
         Of a sampled loop this is the answer at the frequency itself: sampling also excites its
@@ -525,17 +525,17 @@ class ClosedLoop(LinearLoop):
         x, omega = self.made_of.op.x, np.asarray(omega, float)
         whole, s = self.plant, 1j * omega
         io = np.array([_I_O, _I_O + 1])
-        rest = np.delete(np.arange(len(whole.A)), io)
-        delta = int(np.flatnonzero(rest == DELTA)[0])
+        others = np.delete(np.arange(len(whole.A)), io)
+        delta = int(np.flatnonzero(others == DELTA)[0])
         turn = np.array([x[_I_O + 1], -x[_I_O]])  # of i_o in the converter's frame, by delta
-        A, C = whole.A[np.ix_(rest, rest)], whole.C[:, rest]
-        by_i, y_by_i = whole.A[np.ix_(rest, io)], whole.C[:, io]
+        A, C = whole.A[np.ix_(others, others)], whole.C[:, others]
+        by_i, y_by_i = whole.A[np.ix_(others, io)], whole.C[:, io]
         A[:, delta] += by_i @ turn
         C[:, delta] += y_by_i @ turn
-        v = np.zeros((2, len(rest)))
-        v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # these come before i_o: the same places in rest
+        v = np.zeros((2, len(others)))
+        v[0, _V_C], v[1, _V_C + 1] = 1.0, 1.0  # these come before i_o: the same places in others
         v[:, delta] = -x[_V_C + 1], x[_V_C]  # v in the steady frame, by delta
-        alone = LinearPlant(A, whole.B[rest], whole.B_d[rest], C, whole.C_true[:, rest])
+        alone = LinearPlant(A, whole.B[others], whole.B_d[others], C, whole.C_true[:, others])
         of = alone, self.law, self.T_s, self.u_delay, self.y_delay
         p, c, at = ClosedLoop(*of, stage=self.stage).held, self.controller, self._at(omega)
         n_y, n_u = p.C.shape[0], p.B.shape[1]

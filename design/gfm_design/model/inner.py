@@ -130,7 +130,7 @@ def linearise_stage(
     i, v, i_o = (y[k] + 1j * y[k + 1] for k in (NY, NY + 2, NY + 4))
     x = {name: w[2 * k] + 1j * w[2 * k + 1] for k, name in enumerate(both)}
     then = {"v_f": x["v_f"] + c["follow_v"] * (v - x["v_f"])}
-    if dual:  # at rest there is no negative sequence, so that the turning of its frame is constant
+    if dual:  # steady, there is no negative sequence: the turning of its frame is constant
         h = 2.0 * omega_0 * c["half_turn"]
         h += h**3 * c["third"]
         back = (1.0 - 1j * h) / (1.0 + 1j * h)

@@ -133,8 +133,8 @@ def linearise_plant(
     grid: FiniteGrid | None = None,
     inner: bool = False,
 ) -> LinearPlant:
-    """The plant with its DC source and sensors, at rest at ``op`` on a grid of omega_g and V_g,
-    ideal or finite; ``inner``: with the commands and the measurements of an inner stage."""
+    """The plant with its DC source and sensors in its steady state ``op``, on a grid of omega_g and
+    V_g, ideal or finite; ``inner``: with the commands and the measurements of an inner stage."""
     r = par[0]
     commands = op.commands if inner else op.u
     n_u = len(commands)

@@ -1,4 +1,5 @@
-"""The closed loop of a network: all its converters, each under its law, around their common rest.
+"""The closed loop of a network: all its converters, each under its law, around their common
+operating point.
 
 The circuit is the one that the plant solves: ``gfm_plant.wiring`` gives its modes, and here each of
 them is two states, its real and its imaginary part. What a converter adds, its DC link, DC source
@@ -111,7 +112,7 @@ class LinearConverter:
 
 @dataclass(frozen=True)
 class LinearNetwork:
-    """The network without its controllers: continuous, in deviations from its rest."""
+    """The network without its controllers: continuous, in deviations from its operating point."""
 
     #: with the commands and the measurements of all converters one after the other; C_true is (5 N,
     #: n). Its last states are the angles of the islands' references.
@@ -169,10 +170,10 @@ class NetworkLoop(LinearLoop):
             NoEquilibrium: there is no operating point, or a limit of an inner stage acts there.
         """
         refs = [np.asarray(ref, float) for ref in references]
-        points, rests = operating_points(plant, laws, refs)
-        resting = plant.copy()
+        points, components = operating_points(plant, laws, refs)
+        steady = plant.copy()
         x, u = (np.array([getattr(op, name) for op in points]) for name in ("x", "commands"))
-        resting.start(x, u, rests)
+        steady.start(x, u, components)
         T_s = float(plant.net[0]["T_s"])
         members, delays, at_u, at_y = list[LinearConverter](), list[float](), 0, 0
         each = zip(plant.wiring.units, plant.par, laws, refs, points, strict=True)
@@ -186,7 +187,7 @@ class NetworkLoop(LinearLoop):
             members.append(LinearConverter(unit.name, title, linear, stage, op, ref, *places))
             delays += [float(r["delay"] + r["fraction"]) * T_s] * n_u
             at_u, at_y = at_u + n_u, at_y + n_y
-        return cls(_Writing(resting, members).written(), members, T_s, np.array(delays))
+        return cls(_Writing(steady, members).written(), members, T_s, np.array(delays))
 
     def __repr__(self) -> str:
         titles = ", ".join(member.title for member in self.members)
@@ -405,13 +406,13 @@ def _closed(p: LinearPlant, members: Sequence[LinearConverter]) -> Matrix:
 
 
 class _Writing:
-    """The matrices of a network at rest, as ``Network.start`` leaves it, while they are written.
+    """The matrices of a network in steady state, as ``Network.start`` leaves it, being written.
 
     The states are the modes of the circuit, their real parts and then their imaginary parts; of
     each converter its angle and what ``linearise_plant`` has from v_dc on; of each machine angle,
     speed and power of the turbines; of a finite grid the same, of an ideal one the angle; of each
     load of constant power the two parts of the voltage that it has measured. Each island is seen
-    from a frame that turns at its speed at rest.
+    from a frame that turns at its steady speed.
     """
 
     def __init__(self, plant: Network, members: Sequence[LinearConverter]) -> None:
@@ -462,7 +463,7 @@ class _Writing:
         return next(k for k, nodes in enumerate(self.islands) if there in nodes)
 
     def _linear(self, one: Fed, record: Any) -> LinearPart:
-        """A component with a source around its rest."""
+        """A component with a source around its steady state."""
         slip = self.omega_b * (self.speed[self._island(one.node)] - 1.0)
         source = complex(self.plant.now[0]["unit"][record["source"]])
         source *= complex(record["E"]) if one.is_voltage else 0.0
@@ -527,10 +528,10 @@ class _Writing:
             rows = slice(2 * j, 2 * j + 2)
             seen[rows, self.z] = _rows(scale * back * self.modes.states[N_OWN * k + j])
             seen[rows, own.start] = _parts(-1j * np.array([complex(*member.op.x[rows])]))
-        rest = slice(own.start + 1, own.stop)
-        seen[V_DC:, rest] = np.eye(len(alone.A) - V_DC)
-        self.A[rest] = alone.A[V_DC:] @ seen
-        self.B[rest, member.u] = alone.B[V_DC:]
+        behind = slice(own.start + 1, own.stop)  # the angle
+        seen[V_DC:, behind] = np.eye(len(alone.A) - V_DC)
+        self.A[behind] = alone.A[V_DC:] @ seen
+        self.B[behind, member.u] = alone.B[V_DC:]
         self.C[member.y], self.C_true[NY * k : NY * (k + 1)] = alone.C @ seen, alone.C_true @ seen
 
     def _against_references(self) -> LinearNetwork:

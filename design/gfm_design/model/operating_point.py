@@ -64,13 +64,13 @@ def operating_point(
         omega_g, V_g: the grid, p.u.
 
     Raises:
-        NoEquilibrium: the law has no rest state there (a frequency that its droop cannot reach
+        NoEquilibrium: the law has no steady state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
-    side = _ConverterRest(par, law, np.asarray(ref))
+    side = _ConverterEquilibrium(par, law, np.asarray(ref))
     z = _newton(lambda z: side.residual(z, V_g, omega_g), side.first(V_g, omega_g))
     if z is None:
-        raise NoEquilibrium(side.no_rest(f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."))
+        raise NoEquilibrium(side.no_steady_state(f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."))
     return side.found(z, omega_g)
 
 
@@ -97,17 +97,17 @@ def operating_points(
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
     """
-    rest = _NetworkRest(plant, laws, refs)
-    z = _newton(rest.residual, rest.first(refs))
+    network = _NetworkEquilibrium(plant, laws, refs)
+    z = _newton(network.residual, network.first(refs))
     if z is None:
         each = zip(plant.wiring.units, laws, strict=True)
         names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
         raise NoEquilibrium(f"{names}: have no common steady state")
-    return rest.found(z)
+    return network.found(z)
 
 
-class _NetworkRest:
-    """The unknowns z of a network at rest, and what must vanish.
+class _NetworkEquilibrium:
+    """The unknowns z of a network in its steady state, and what must vanish.
 
     z has the unknowns of each converter, the two parts of each node's voltage, the unknowns of each
     component with a source, and the speed of each island.
@@ -117,7 +117,7 @@ class _NetworkRest:
         self.wiring = wiring = plant.wiring
         self.V_g, self.omega_g = complex(plant.now[0]["V_g"]), float(plant.now[0]["omega_g"])
         self.sides = [
-            _ConverterRest(plant.par[k : k + 1], law, np.asarray(ref))
+            _ConverterEquilibrium(plant.par[k : k + 1], law, np.asarray(ref))
             for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
         ]
         self.fixed = wiring.grid if wiring.closed else None
@@ -155,7 +155,7 @@ class _NetworkRest:
             i_o = complex(mine[4], mine[5]) * cmath.exp(1j * mine[DELTA])
             missing[unit.node] += i_o / float(side.par[0]["current"])
             volts[unit.terminal] = complex(mine[2], mine[3]) * cmath.exp(1j * mine[DELTA])
-            missing[unit.terminal] = 0j  # of a core, which draws nothing at rest
+            missing[unit.terminal] = 0j  # of a core, which draws nothing in steady state
         for branch in wiring.branches:
             if branch.name not in wiring.opened:
                 ends_of = volts.get(branch.start, 0j) - volts.get(branch.end, 0j)
@@ -193,8 +193,8 @@ class _NetworkRest:
         own, _, speeds = self._split(z)
         each = zip(self.sides, self.wiring.units, own, strict=False)
         points = [side.found(mine, speeds[unit.node]) for side, unit, mine in each]
-        rests = zip(own[len(points) :], self.wiring.fed, strict=True)
-        return points, [(mine, speeds[one.node]) for mine, (_, one) in rests]
+        parts = zip(own[len(points) :], self.wiring.fed, strict=True)
+        return points, [(mine, speeds[one.node]) for mine, (_, one) in parts]
 
 
 def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
@@ -210,7 +210,7 @@ def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     return found
 
 
-class _ConverterRest:
+class _ConverterEquilibrium:
     """One converter under its law: unknowns, what must vanish, and what is found.
 
     The unknowns are the plant's state (8,), the DC current, E_u, and the law's states.
@@ -224,7 +224,7 @@ class _ConverterRest:
             [i for i, row in enumerate(law.rows) if self.controlled or row != 0], dtype=int
         )
         self.size = N_X + 2 + len(self.kept)
-        self._rests = np.delete(np.arange(N_X), DELTA)  # delta rests by omega_u = omega_g
+        self._steady = np.delete(np.arange(N_X), DELTA)  # delta is steady by omega_u = omega_g
         self._measured = np.array(SENSED)
         self._gain, self._offset = (
             par[0][name][: len(SENSED)].copy() for name in ("gain", "offset")
@@ -252,10 +252,10 @@ class _ConverterRest:
         u_law, x_next = self._law(x_law, ref, y)
         dx = f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
-        ac = dx[self._rests]
+        ac = dx[self._steady]
         u[2] = abs(_internal(law, x, u, limited=False))
-        rest = (x_next - x_law)[self.kept] / law.T_s
-        return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], rest])
+        change = (x_next - x_law)[self.kept] / law.T_s
+        return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], change])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
         """The operating point at the unknowns z."""
@@ -279,7 +279,7 @@ class _ConverterRest:
         u = law.u_0 + law.D_u0 @ ref + law.C @ x + law.D_r @ r + law.D_y @ measured
         return u, law.A @ x + law.B_r @ r + law.B_y @ measured
 
-    def no_rest(self, grid: str) -> str:
+    def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
         idle = self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any())
         cause = "; nothing holds v_dc: row 1 answers to no measurement" if idle else ""
@@ -314,7 +314,7 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:
-    """The law's E for a bridge that rests at u: with an inner stage another voltage, behind it."""
+    """The law's E for a bridge at a steady u: with an inner stage another voltage, behind it."""
     inner, e = law.law.inner, complex(u[2])
     if inner is None:
         return e

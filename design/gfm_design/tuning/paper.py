@@ -174,13 +174,13 @@ class PaperProblem:
         controlled = self.plant.dc_source.mode == "controlled"
         if self.among is None:
             ideal = not self.is_sampled
-            self._rest = ClosedLoop.of(law, self._judged, ref, T_s=self.T_s, ideal=ideal)
+            self._nominal = ClosedLoop.of(law, self._judged, ref, T_s=self.T_s, ideal=ideal)
         else:
-            self._rest = self.among(law)
-            assert self._rest.T_s is not None
-            self.T_s, ref = self._rest.T_s, self._rest.ref
-            controlled = self._rest.dc_control
-        self.late = self._rest if self.is_sampled else self._rest.sampled(self.T_s, self.T_s)
+            self._nominal = self.among(law)
+            assert self._nominal.T_s is not None
+            self.T_s, ref = self._nominal.T_s, self._nominal.ref
+            controlled = self._nominal.dc_control
+        self.late = self._nominal if self.is_sampled else self._nominal.sampled(self.T_s, self.T_s)
         self.law = GainedLaw(self.file, self.gains, self.op, ref, controlled)
         for other in self._others:
             other.move_to(named)
@@ -192,13 +192,13 @@ class PaperProblem:
 
     @property
     def op(self) -> OperatingPoint:
-        """Where plant and law rest."""
-        return self._rest.op
+        """The operating point of plant and law."""
+        return self._nominal.op
 
     @property
     def linear(self) -> LinearPlant:
         """The plant around its operating point."""
-        return self._rest.plant
+        return self._nominal.plant
 
     def loops(self, values: Vector) -> StateSpace:
         """T(s) at these gains; rows of gains give stacked loops, nan where they make no law."""
@@ -219,11 +219,11 @@ class PaperProblem:
         Raises:
             LawError: the gains make no law.
         """
-        return self._rest.with_law(self._runs(self.law.exact(values)))
+        return self._nominal.with_law(self._runs(self.law.exact(values)))
 
     def closed_loops(self, values: Vector) -> ClosedLoop:
         """The loops at rows of gains, in one; nan where they make no law."""
-        return self._rest.with_law(self._runs(self.law(values)))
+        return self._nominal.with_law(self._runs(self.law(values)))
 
     def _runs(self, law: LinearLaw) -> LinearLaw:
         """The law as the loop has it, continuous or from tick to tick."""

@@ -205,7 +205,7 @@ class Law:
         ideal: bool = False,
         **more: Any,
     ) -> ClosedLoop:
-        """This law around a plant, linearised where both rest.
+        """This law around a plant, linearised at their operating point.
 
         Args:
             on: a scenario (name, file or ``Scenario``), of which plant, references, sampling time

@@ -16,15 +16,7 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.figures import (
-    COLOURS,
-    GREY,
-    complex_plane,
-    draw_circle,
-    draw_panel,
-    dress,
-    pyplot_panels,
-)
+from gfm_hil.results.figures import COLOURS, GREY, complex_plane, draw_panel, dress, pyplot_panels
 from gfm_hil.studies.linear_loop import title_of
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
@@ -63,13 +55,8 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
 def nyquist(loop: ClosedLoop, *at: str) -> Axes:
     """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
     ``bode``."""
-    axes = complex_plane(f"{title_of(loop)}: L, one loop cut")
-    draw_circle(axes, 0.0, 1.0)
-    for k, (name, _, L) in enumerate(_gains(loop, at)):
-        axes.plot(L.real, L.imag, color=COLOURS[k % len(COLOURS)], lw=1.2, label=name)
-    axes.set(xlabel="Re L", ylabel="Im L")
-    axes.legend(fontsize=8, frameon=False, loc="upper right")
-    return axes
+    loci = {name: L for name, _, L in _gains(loop, at)}
+    return complex_plane(f"{title_of(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
 
 
 def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float = 1.0) -> list[Axes]:

@@ -485,21 +485,32 @@ def pyplot_panels(rows: int, size: tuple[float, float]) -> list[Axes]:
     return list(pyplot_figure(size).subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
 
 
-def complex_plane(title: str) -> Axes:
-    """A panel in a figure of pyplot that shows the complex plane around -1; ``legend`` it once it
-    has its curves."""
+def complex_plane(
+    title: str,
+    loci: Mapping[str, NDArray[np.complex128]],
+    circle: tuple[float, float, str | None],
+    of: str = "",
+    style: str = "-",
+) -> Axes:
+    """Loci by their labels in the complex plane around -1, in a figure of pyplot.
+
+    Args:
+        circle: its centre, radius and label, to be dashed.
+        of: what the axes are the parts of.
+    """
     (axes,) = pyplot_panels(1, (5.6, 5.6))
+    for k, (label, z) in enumerate(loci.items()):
+        colour = COLOURS[k % len(COLOURS)]
+        axes.plot(z.real, z.imag, style, color=colour, ms=2.5, lw=1.1, label=label)
+    centre, radius, name = circle
+    z = centre + radius * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
+    axes.plot(z.real, z.imag, color=GREY, lw=0.7, ls=(0, (4, 3)), label=name)
     axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
     axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
+    axes.set(xlabel=f"Re {of}".rstrip(), ylabel=f"Im {of}".rstrip())
     dress(axes, title)
+    axes.legend(fontsize=8, frameon=False, loc="upper right")
     return axes
-
-
-def draw_circle(axes: Axes, centre: float, radius: float, **how: Any) -> None:
-    """A dashed circle in the complex plane."""
-    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 200))
-    z = centre + radius * turn
-    axes.plot(z.real, z.imag, color=GREY, lw=0.7, ls=(0, (4, 3)), **how)
 
 
 def plot(run: Run, *names: str) -> list[Axes]:

@@ -1,4 +1,4 @@
-"""The linear loop of a scenario, where it rests when the run starts."""
+"""The linear loop of a scenario, at the operating point where the run starts."""
 
 from __future__ import annotations
 

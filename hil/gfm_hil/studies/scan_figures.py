@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from gfm_hil.results.figures import (
     COLOURS,
     complex_plane,
-    draw_circle,
     dress,
     headline,
     pyplot_figure,
@@ -84,16 +83,9 @@ def nyquist_on_grid(of: FrequencyScan, scr: float, x_over_r: float) -> Axes:
     """The eigenvalues of Z Y, over positive frequencies, near -1."""
     found = of.stability(scr, x_over_r)
     verdict = {True: "stable", False: "unstable", None: "cannot be judged"}[found.stable]
-    axes = complex_plane(
-        f"{of.name}, SCR {scr:g}, X/R {x_over_r:g}: {verdict}, margin {found.margin:.2g}"
-    )
-    for k, locus in enumerate(of.eigenloci(scr, x_over_r).T):
-        label = f"λ{k + 1}(Z Y)"
-        axes.plot(locus.real, locus.imag, "o-", color=COLOURS[k], ms=2.5, lw=1.0, label=label)
-    draw_circle(axes, -1.0, found.margin, label="margin")
-    axes.set(xlabel="Re", ylabel="Im")
-    axes.legend(fontsize=8, frameon=False, loc="upper right")
-    return axes
+    title = f"{of.name}, SCR {scr:g}, X/R {x_over_r:g}: {verdict}, margin {found.margin:.2g}"
+    loci = {f"λ{k + 1}(Z Y)": z for k, z in enumerate(of.eigenloci(scr, x_over_r).T)}
+    return complex_plane(title, loci, (-1.0, found.margin, "margin"), style="o-")
 
 
 def save_figures(of: FrequencyScan, folder: Path, grids: Sequence[tuple[float, float]]) -> None:
