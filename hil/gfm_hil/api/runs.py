@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.api.law import Law, law_files
-from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.engine.compiling import compile_external
 from gfm_hil.engine.processes import Progress
 from gfm_hil.recording.run import Run, converters_of
 from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
@@ -20,7 +18,7 @@ from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.network_run import NetworkRun, save_network
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario import INPROC, Scenario, load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.workers import SILENT, Watch
 
 __all__ = [
@@ -109,7 +107,7 @@ def run(
         if isinstance(law, Law):
             raise UserError(f"law = {law!r}: save it first, as the folder names its file")
         checked = _checked(scenario, {**changes, "law": law})
-        command = _external_command(checked, controller, ports, notice)
+        command = runner.controller_program(checked, controller, ports, notice)
         report = _explained if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
@@ -163,33 +161,6 @@ def _named(made: Run, law: Law) -> Run:
     """The run of a ``Law``: its name in place of its temporary file, and its text."""
     scenario = made.scenario.model_copy(update={"law": law.name})
     return replace(made, scenario=scenario, law_text=law.to_toml())
-
-
-def _external_command(
-    scenario: Scenario, controller: str | None, ports: str | Path | None, notice: Notice
-) -> list[str]:
-    """The program that steps an external controller; empty without one.
-
-    Raises:
-        UserError: there is no such controller or map, or the run is in process, has no operating
-            point, or does not carry what it measures.
-    """
-    if controller is None:
-        if ports is not None:
-            raise UserError("a port map is for an external controller; name the controller too")
-        return []
-    if scenario.link.type == INPROC:
-        raise UserError(
-            "an external controller is a process, which a run in process has not; choose a link"
-        )
-    real = precision(controller)
-    if not controller.startswith(PIL):
-        controller_file(controller, FORMS)
-    places = None if ports is None else Path(ports)
-    read_map(places)
-    check_currents(controller, scenario.has_inner)
-    compile_external(scenario, notice, real)
-    return runner.external_command(controller, places)
 
 
 def load_run(folder: str | Path) -> Run:

@@ -64,13 +64,16 @@ def dense(pairs: Sequence[Sequence[int]]) -> Counts:
 
 
 def summary(rounds: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
-    """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of rounds of times in ns.
+    """``summary_of_counts`` of rounds of times in ns; rounds without times are ignored."""
+    return summary_of_counts([histogram(times) for times in rounds if len(times)])
+
+
+def summary_of_counts(counts: Sequence[Counts]) -> dict[str, Any]:
+    """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of the histograms of rounds.
 
     p50, p90 and p99 are medians over the rounds; from p99.9 on a round has too few times, so these
-    percentiles and the histogram are of all rounds together. Rounds without times are ignored; None
-    stands for an unknown value.
+    percentiles and the histogram are of all rounds together. None stands for an unknown value.
     """
-    counts = [histogram(times) for times in rounds if len(times)]
     found: dict[str, Any] = {f"{name}_us": None for name in SHARES}
     found |= {"n": 0, "rounds_p50_us": [], "histogram": []}
     if not counts:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
 from gfm_hil.bench.cpu_load import Load, cpu_load
 from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.one_way import ways
 from gfm_hil.bench.options import BenchOptions, Mode
 from gfm_hil.bench.pair import pair
 from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
@@ -31,8 +33,10 @@ class _RoundTrips:
     mode: Mode
     load: Load
     compiled: bool
+    bench_us: float | None  # of a round trip, the bench's own share; None for a limit
     rounds: dict[int, NDArray[np.int64]] = field(default_factory=dict)
     silent: int = 0
+    sides: list[dict[str, Any]] = field(default_factory=list)  # see ``one_way.delays``
 
 
 def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) -> None:
@@ -43,7 +47,8 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     cells: list[_RoundTrips] = []
     with ExitStack() as stack:
         place = memory_folder(stack)
-        contenders, remarks = contenders_of([*options.links, *options.peers], place)
+        elsewhere = [_peer(options, place)] if options.to else []
+        contenders, remarks = contenders_of([*options.links, *options.peers], place, elsewhere)
         two = stack.enter_context(pair(options.policies[0], place))
         load = stack.enter_context(cpu_load())
         for c in contenders:
@@ -51,9 +56,17 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             try:
                 compiled = two.open(c, options.payload)
             except UserError as problem:
+                if c in elsewhere:
+                    raise
                 remarks.append(f"{c.name}: not measured: {problem}")
                 continue
-            cells += [_RoundTrips(c, m, w, compiled) for w in options.loads for m in options.modes]
+            code = "compiled" if compiled else "Python"
+            bench_us = None if c.source else two.share_us(code, c in elsewhere)
+            cells += [
+                _RoundTrips(c, m, w, compiled, bench_us)
+                for w in options.loads
+                for m in options.modes
+            ]
 
         def one_round(cell: _RoundTrips, seconds: float, share: float) -> NDArray[np.int64]:
             show(f"{cell.contender.name}, {cell.mode}, {cell.load}", share)
@@ -70,11 +83,21 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             times = one_round(cell, options.seconds, share)
             if len(times):
                 cell.rounds[number] = times
+            if sides := two.sides(cell.contender):
+                cell.sides.append(sides)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
     content["results"] += [
         _row(c, by_key.get((c.contender.limit, c.mode, c.load)), options) for c in cells
     ]
     content["remarks"] += remarks
+
+
+def _peer(options: BenchOptions, place: Path) -> Contender:
+    from gfm_hil.bench.peer import peer_of  # with it comes the plant
+
+    assert options.to is not None
+    to, name = options.to
+    return peer_of(to, name, dict(options.option), options.ports, options.ptp_us, place)
 
 
 def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) -> dict[str, Any]:
@@ -93,4 +116,6 @@ def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) ->
         "ratio_to_baseline_p50": round(float(np.median(ratios)), 4) if ratios else None,
         "rounds_ratio": [round(ratio, 4) for ratio in ratios],
         "silent_rounds": cell.silent,
+        "bench_us": cell.bench_us,
+        **(ways(cell.sides) if cell.sides else {}),
     }  # fmt: skip

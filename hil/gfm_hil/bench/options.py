@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal
 
 from gfm_hil.bench.c_code import FLAGS
@@ -17,7 +18,7 @@ from gfm_hil.bench.cpu_load import LOADS, Load
 from gfm_hil.bench.pair import Policy
 from gfm_hil.bench.rounds import ShowProgress
 from gfm_hil.core.errors import UserError
-from gfm_hil.links import link_kind
+from gfm_hil.links import link_kind, link_names
 from gfm_hil.realtime.environment import may_sched_fifo
 from gfm_runtime import get_law
 
@@ -46,6 +47,10 @@ class BenchOptions:
     seconds: float  # of one round
     rounds: int  # of each; fewer if they would not end by ``until`` (``time.monotonic``)
     until: float
+    to: tuple[str, str | None] | None = None  # who answers elsewhere, and its name in the tables
+    option: Sequence[tuple[str, Any]] = ()  # of the link to it
+    ports: Path | None = None  # map of a controller's ports
+    ptp_us: float = 0.0  # how far CLOCK_TAI may be off here; 0: nobody says
 
 
 def measurements(options: Namespace) -> list[Measurement]:
@@ -73,7 +78,9 @@ def measurements(options: Namespace) -> list[Measurement]:
 
 def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
     of = options.get
-    links = _split("--links", of("links"))
+    links = _split(
+        "--links", of("links", "" if "to" in options else ",".join(link_names())) or None
+    )
     try:
         for name in links:
             link_kind(name)
@@ -81,16 +88,20 @@ def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
         raise UserError(f"--links: {problem}") from None
     return BenchOptions(
         links=links,
-        peers=_peers(of("peers", "installed")),
+        peers=_peers(of("peers", "none" if "to" in options else "installed")),
         modes=_split("--mode", of("mode"), MODES) or MODES,
         loads=_split("--load", of("load"), LOADS) or LOADS,
-        policies=_policies(of("policy", "auto")),
+        policies=policies(of("policy", "auto")),
         payload=_within("--payload", of("payload", FRAME), 1, 504),
         laws=[get_law(name).name for name in _split("--laws", of("laws"))],
         cflags=of("cflags", FLAGS),
         seconds=_within("--seconds", of("seconds", 0.1), *_SECONDS.get(kind, (0.01, 60))),
         rounds=_within("--rounds", of("rounds"), 1, 1000),
         until=of("until", math.inf),
+        to=(options["to"], of("as_name")) if "to" in options else None,
+        option=of("option", ()),
+        ports=of("map"),
+        ptp_us=_within("--ptp", of("ptp", 0.0), 0.0, 1e6),
     )
 
 
@@ -125,7 +136,7 @@ def _within(option: str, value: Any, low: Any, high: Any) -> Any:
     return value
 
 
-def _policies(wanted: str) -> list[Policy]:
+def policies(wanted: str) -> list[Policy]:
     """The selected policies; the best one that is permitted comes first."""
     allowed = may_sched_fifo()
     if wanted == "fifo" and not allowed:

@@ -7,11 +7,16 @@ once. Both are pinned; with the policy fifo they also get the real-time priority
 from __future__ import annotations
 
 import multiprocessing
+import os
+import shutil
 import signal
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,15 +25,16 @@ from numpy.typing import NDArray
 
 from gfm_hil.bench.contenders import Contender
 from gfm_hil.bench.pingpong import PingPong
+from gfm_hil.bench.share import own_share_us
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
-from gfm_runtime.children import end_with_parent
 
 Policy = Literal["fifo", "other"]
 
 CAPACITY = 1 << 20  # most round trips in a round
 _PATIENCE_S = 120.0
 _WARM_NS = 20_000_000
+_END_S = 1.5  # a loop that gets no answer ends after a second
 
 # state in each of the two processes
 _role: Role = "plant"
@@ -65,6 +71,14 @@ class Pair:
         finally:
             self._stop[0] = 1
             _wait(answers)
+
+    def sides(self, contender: Contender) -> dict[str, Any]:
+        """What the last round says of both ways, see ``PingPong``."""
+        return dict(_wait(self._pools["plant"].submit(_sides, contender.name)))
+
+    def share_us(self, code: str, of_frames: bool) -> float:
+        """The bench's own share of a round trip, see ``gfm_hil.bench.share``."""
+        return float(_wait(self._pools["plant"].submit(own_share_us, code, of_frames)))
 
 
 def _wait(future: Future[Any]) -> Any:
@@ -107,12 +121,26 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
 
 def _set_up(role: Role, policy: Policy, stop: str) -> None:
     global _role, _took, _stop
-    end_with_parent()
+    # before the priority of a run: its thread must not wait for a loop that never sleeps
+    threading.Thread(target=_end_with_parent, args=(Path(stop).parent,), daemon=True).start()
     (ask_for_real_time if policy == "fifo" else own_processor)(role)
     _role, _took = role, np.zeros(CAPACITY, np.int64)
     _took += 1  # touch all pages before a round
     _stop = np.asarray(np.memmap(stop, np.int64, "r+"))
     no_collector_pauses()
+
+
+def _end_with_parent(place: Path) -> None:
+    """Once the parent is gone, even if it was killed: free the links, remove its folder, end."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    _stop[:] = 1
+    time.sleep(_END_S)  # the loops end by themselves
+    with suppress(Exception):
+        _close()
+    shutil.rmtree(place, ignore_errors=True)
+    os._exit(1)
 
 
 def _started() -> None:
@@ -133,6 +161,10 @@ def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
         if (n := _ends[name].ping(_stop, period_ns, duration, _took)) < 0:
             return _took[:0]
     return _took[:n]
+
+
+def _sides(name: str) -> dict[str, Any]:
+    return _ends[name].sides()
 
 
 def _close() -> None:

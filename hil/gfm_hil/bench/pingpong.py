@@ -59,6 +59,8 @@ class PingPong:
     pong: Callable[[Numbers], object]  # answers until stopped: (stop)
     close: Callable[[], None]  # frees all resources
     compiled: bool  # whether its loops are compiled
+    # of the last round: ``gfm_hil.bench.one_way.delays``, empty if its exchanges carry no clock
+    sides: Callable[[], dict[str, Any]] = dict
 
 
 @cached

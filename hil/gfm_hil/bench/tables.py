@@ -64,8 +64,33 @@ def latency_tables(content: Row) -> Iterator[Table]:
         yield _table(
             f"Round trip, {mode}, {load} [µs] ({some[0]['policy']}, {some[0]['payload']} B)",
             some,
-            {"": "name", "code": "code", **_PERCENTILES, "n": _number("n"), "p50 : limit": _limit},
+            {
+                "": "name",
+                "code": "code",
+                **_PERCENTILES,
+                "n": _number("n"),
+                "of it the bench": lambda row: micro(row.get("bench_us")),
+                "p50 : limit": _limit,
+            },
         )
+    yield from _way_tables(content)
+
+
+def _way_tables(content: Row) -> Iterator[Table]:
+    """Both ways to who answers elsewhere, and what was lost."""
+    rows = [row for row in content["results"] if "sent" in row]
+    if rows:
+        columns: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
+        for way, words in (("there", "there"), ("between", "its own"), ("back", "back")):
+            for name in ("p50", "p99"):
+                columns[f"{words} {name}"] = lambda r, way=way, name=name: micro(
+                    r[way][f"{name}_us"]
+                )
+        columns["± "] = lambda r: micro(r.get("within_us"))
+        columns["clock"] = lambda r: r.get("clock", "not read")
+        columns["lost"] = lambda r: percent(r["lost_pct"])
+        columns["95 %"] = lambda r: "{:.3g}–{:.3g} %".format(*r["lost_pct_95"])
+        yield _table("Both ways [µs]", rows, columns)
 
 
 def _limit(row: Row) -> str:
@@ -82,7 +107,7 @@ def latency_verdicts(content: Row) -> Iterator[str]:
     rows = content["results"]
     limits = {(r["name"], r["mode"], r["load"]): r for r in rows if r["peer"] == "C"}
     for row in rows:
-        if row["peer"] != "ours" or row["p50_us"] is None:
+        if row["peer"] not in ("ours", "to") or row["p50_us"] is None:
             continue
         text = f"{row['name']}, {row['mode']}, {row['load']}: p50 {micro(row['p50_us'])} µs"
         ratio = row["ratio_to_baseline_p50"]

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn
 
 from gfm_hil.bench.contenders import PEERS
-from gfm_hil.cli.common import new_folder, progress
+from gfm_hil.cli.common import add_map, link_option, new_folder, progress
+from gfm_hil.controllers import FORMS
 from gfm_hil.core.terminal import terminal
 from gfm_hil.links import link_names
 from gfm_hil.run.run_folder import check_free
@@ -20,11 +22,10 @@ _WIDTH = 100  # columns: a table cut short is no use in a file
 
 #: options of several kinds of benchmark, as argparse takes them
 _OPTIONS: dict[str, dict[str, Any]] = {
-    "--links": {"default": ",".join(link_names()), "help": "by commas (default: %(default)s)"},
+    "--links": {"help": f"by commas (default: {','.join(link_names())}, with --to none)"},
     "--peers": {
-        "default": "installed",
         "help": f"what one would pick instead, by commas: {', '.join(PEERS)}; installed: those that"
-        " are, or none (default: %(default)s)",
+        " are, or none (default: installed, with --to none)"
     },
     "--mode": {
         "default": "lockstep,realtime",
@@ -44,6 +45,24 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "default": 64,
         "help": "bytes there; 64: the bench's frames, 64 there and 48 back (default: %(default)s)",
     },
+    "--to": {
+        "metavar": "ENDPOINT",
+        "help": "who answers elsewhere: the endpoint of gfmhil bench answer or of a controller of"
+        f" docs/own-controller.md; or a controller here, {FORMS}",
+    },
+    "--as": {"metavar": "NAME", "dest": "as_name", "help": "its name in the tables"},
+    "--option": {
+        "action": "append",
+        "default": [],
+        "metavar": "KEY=VALUE",
+        "type": link_option,
+        "help": "a key of link.options, e.g. curve=keys; may be repeated",
+    },
+    "--ptp": {
+        "type": float,
+        "metavar": "US",
+        "help": "CLOCK_TAI follows PTP within so many µs; both sides say so, for one-way delays",
+    },
     "--laws": {"help": "names, by commas (default: all that are stable there)"},
     "--cflags": {"default": "-O3", "help": "for the C compiler (default: %(default)s)"},
     "--seconds": {"type": float, "help": "of a round (default: %(default)s)"},
@@ -56,7 +75,8 @@ _OPTIONS: dict[str, dict[str, Any]] = {
 _KINDS = {
     "latency": (
         "round trip of every link, of what one would pick instead, and of the limit in C",
-        "--links --peers --mode --load --policy --payload --seconds --rounds",
+        "--links --peers --to --as --option --ptp --mode --load --policy --payload --seconds"
+        " --rounds",
     ),
     "jitter": (
         "how late a loop that only paces begins its ticks",
@@ -78,8 +98,36 @@ def add(command: argparse.ArgumentParser) -> None:
         kind = kinds.add_parser(name, help=text)
         for option in (*options.split(), "--out", "--json", "--quiet"):
             kind.add_argument(option, **_OPTIONS[option])
+        if name == "latency":
+            add_map(kind, "--to")
         kind.set_defaults(seconds=_SECONDS.get(name))
     _add_compare(kinds)
+    _add_answer(kinds)
+
+
+def _add_answer(kinds: Any) -> None:
+    text = "answer a bench on another machine, which names this endpoint by latency --to"
+    command = kinds.add_parser("answer", help=text)
+    command.add_argument(
+        "endpoint", help="zmq, shm, serial or CAN, as of a run; or udp://host:port"
+    )
+    for option in ("--option", "--ptp", "--policy", "--quiet"):
+        command.add_argument(option, **_OPTIONS[option])
+    command.set_defaults(call=answer_call)
+
+
+def answer_call(options: argparse.Namespace) -> int:
+    """Answer until a signal comes; returns the exit code."""
+    from gfm_hil.bench.options import policies
+    from gfm_hil.bench.peer import answer
+
+    def say(text: str) -> None:
+        if not options.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    fifo = policies(options.policy)[0] == "fifo"
+    answer(options.endpoint, dict(options.option), options.ptp or 0.0, fifo, say)
+    return 0
 
 
 def _add_compare(kinds: Any) -> None:

@@ -57,7 +57,7 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
         " each converter, as NAME=ENDPOINT",
     )  # fmt: skip
     command.add_argument(
-        "--option", action="append", default=[], metavar="KEY=VALUE", type=_link_option,
+        "--option", action="append", default=[], metavar="KEY=VALUE", type=link_option,
         help="override a key of link.options, e.g. curve=keys; may be repeated",
     )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
@@ -79,7 +79,7 @@ def add_map(command: argparse.ArgumentParser, option: str) -> None:
     )  # fmt: skip
 
 
-def _link_option(text: str) -> tuple[str, Any]:
+def link_option(text: str) -> tuple[str, Any]:
     """KEY=VALUE with the value as in TOML, or as text where it is none."""
     key, equals, value = text.partition("=")
     if not (key.isidentifier() and equals):

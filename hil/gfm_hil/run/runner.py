@@ -11,11 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.controllers import ExternalController
+from gfm_hil.controllers import (
+    FORMS,
+    PIL,
+    ExternalController,
+    check_currents,
+    controller_file,
+    precision,
+    read_map,
+)
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.compiling import compiled_benches
+from gfm_hil.engine.compiling import compile_external, compiled_benches
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
@@ -29,7 +37,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
 from gfm_hil.run.summary import origin, stages, summarise
-from gfm_hil.scenario import Scenario, write_scenario
+from gfm_hil.scenario import INPROC, Scenario, write_scenario
 
 Notice = Callable[[str], None]
 
@@ -64,6 +72,40 @@ def run_scenario(
     own = str(folder.absolute())
     command = tuple(word.replace("{folder}", own) for word in controller_command)
     return _run(scenario, folder, progress, notice, report, command)[""]
+
+
+def controller_program(
+    scenario: Scenario, controller: str | None, ports: str | Path | None, notice: Notice
+) -> list[str]:
+    """The ``controller_command`` of a run whose controller steps a model in place of the law, or
+    runs the laws on another processor; empty without one.
+
+    Args:
+        scenario: of the run.
+        controller: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` or ``pil:TARGET``.
+        ports: file of the map of its ports.
+        notice: as for ``run_scenario``.
+
+    Raises:
+        UserError: there is no such controller or map, or the run is in process, has no operating
+            point, or does not carry what it measures.
+    """
+    if controller is None:
+        if ports is not None:
+            raise UserError("a port map is for an external controller; name the controller too")
+        return []
+    if scenario.link.type == INPROC:
+        raise UserError(
+            "an external controller is a process, which a run in process has not; choose a link"
+        )
+    real = precision(controller)
+    if not controller.startswith(PIL):
+        controller_file(controller, FORMS)
+    places = None if ports is None else Path(ports)
+    read_map(places)
+    check_currents(controller, scenario.has_inner)
+    compile_external(scenario, notice, real)
+    return external_command(controller, places)
 
 
 def external_command(model: str, ports: Path | None) -> list[str]:

@@ -67,11 +67,14 @@ def missing_packages(peer: str) -> list[str]:
     return [package for package in PEERS[peer] if find_spec(package) is None]
 
 
-def contenders_of(names: Sequence[str], place: Path) -> tuple[list[Contender], list[str]]:
-    """The contenders of links and peers, and their limits; and remarks: without a C compiler
-    there are no limits. ``place`` is an empty folder in memory with a short path."""
+def contenders_of(
+    names: Sequence[str], place: Path, more: Sequence[Contender] = ()
+) -> tuple[list[Contender], list[str]]:
+    """The contenders of links and peers, ``more`` of them, and their limits; and remarks: without a
+    C compiler there are no limits. ``place`` is an empty folder in memory with a short path."""
     files = [import_module(f"{__name__}.{name}") for name in (*FILES, *PEERS)]
     each: list[Contender] = [one for file in files for one in file.contenders(names, place)]
+    each += more
     wanted = {one.limit for one in each if one.source is None}
     every = [one for one in each if one.source is None or one.name in wanted]
     try:

@@ -1,0 +1,84 @@
+"""UDP as a link of ``gfmhil bench latency --to`` alone: it shows what the network loses.
+
+It neither encrypts nor knows its peer, so no run uses it.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.links.base import LONGEST, LinkKind, LinkOptions
+from gfm_hil.links.port import Port, free_port_function
+
+_DONTWAIT = int(socket.MSG_DONTWAIT)
+_transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
+_send: Any = types.ExternalFunction("send", _transfer)
+_recv: Any = types.ExternalFunction("recv", _transfer)
+_SPINS = 1000
+
+
+@free_port_function
+def _port_send(handle, message):
+    return 1 if _send(handle[0], message.ctypes.data, len(message), _DONTWAIT) > 0 else 0
+
+
+@free_port_function
+def _port_receive(handle, message):
+    return max(0, _recv(handle[0], message.ctypes.data, len(message), _DONTWAIT))
+
+
+class UdpLink:
+    """One end of UDP; implements ``gfm_hil.links.Link``. The controller answers the one from whom
+    it last took a message by ``receive``."""
+
+    def __init__(self, role: Role, endpoint: str) -> None:
+        host, _, port = endpoint.removeprefix("udp://").rpartition(":")
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._serves = role == "controller"
+        try:
+            place = self._socket.bind if self._serves else self._socket.connect
+            place((host, int(port)))
+        except OSError as problem:
+            self.close()
+            raise UserError(f"{endpoint}: cannot be used: {problem.strerror}") from None
+        self.port = Port(np.array([self._socket.fileno()]), _port_send, _port_receive, _SPINS)
+
+    def send(self, message: bytes) -> bool:
+        with suppress(OSError):  # nobody is there yet
+            return self._socket.send(message) > 0
+        return False
+
+    def receive(self) -> bytes | None:
+        try:
+            message, sender = self._socket.recvfrom(LONGEST + 1)
+        except OSError:
+            return None
+        if self._serves:
+            self._socket.connect(sender)
+        return message
+
+    def wait(self, seconds: float) -> bool:
+        return bool(select.select([self._socket], [], [], seconds)[0])
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+KIND = LinkKind(
+    name="udp",
+    text="UDP, for the bench alone",
+    pattern=r"udp://[^/\s]+:\d{1,5}",
+    form="udp://host:port",
+    fresh=lambda folder: "udp://127.0.0.1:0",
+    open=lambda role, endpoint, options: UdpLink(role, endpoint),
+    options=LinkOptions,
+)

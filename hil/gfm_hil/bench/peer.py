@@ -1,0 +1,333 @@
+"""``gfmhil bench latency --to``: a controller on another machine, a program, a DLL or FMU.
+
+This side is a plant without a plant: its y is that of the operating point, and does not answer to
+u. The other side is ``gfmhil bench answer``, or any controller of docs/own-controller.md.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.bench import datagram
+from gfm_hil.bench.contenders import Contender, shm, udp, zmq
+from gfm_hil.bench.exchange import GONE, LEFT, OTHER, SILENT, answer_all, frames, send_all
+from gfm_hil.bench.one_way import DUE, RECEIVED, SENT, delays
+from gfm_hil.bench.pingpong import Messages, Numbers, PingPong
+from gfm_hil.controllers import FORMS
+from gfm_hil.core.errors import PeerLost, UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.engine.drive import send_last
+from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.setup import make_bench
+from gfm_hil.links import Link, link_kind, link_names
+from gfm_hil.links.base import LinkKind
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.links.pump import ported
+from gfm_hil.realtime.priority import ask_for_real_time, own_processor, restore_priority
+from gfm_hil.run.runner import controller_program
+from gfm_hil.scenario import Scenario, check_scenario, write_scenario
+from gfm_plant import plant_sample
+from gfm_runtime.children import end_now, guarded
+from gfm_runtime.states import STOPPED
+
+ANSWERER = "gfmhil bench answer"
+PEER = "to"  # of a contender, in place of ``ours``
+_LAW, _STAGE = "vsg-2", "virtual-stator"
+_TICKS = 600_000  # exchanges at most with a controller that the bench starts: it records each
+_MOST = 1 << 20  # exchanges of a round
+_LOST_NS = 100_000_000  # after which an answer counts as lost
+_SILENCE_NS = 20_000_000_000
+_START_S, _LOOK_S = 30.0, 0.1
+_LIMITS = {"shm": shm.LIMIT, "zmq": zmq.TCP, "udp": udp.LIMIT, "can": udp.LIMIT}
+_CLOCK_TAI = 11
+_UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
+
+
+def kind_of(endpoint: str) -> LinkKind:
+    """The link that has such endpoints. Raises UserError: none has."""
+    kinds = [*map(link_kind, link_names()), datagram.KIND]
+    for kind in kinds:
+        if re.fullmatch(kind.pattern, endpoint):
+            return kind
+    forms = ", ".join(kind.form for kind in kinds)
+    raise UserError(f"{endpoint}: must be {forms}, or a controller: {FORMS}")
+
+
+def scenario_of(inner: bool = False, ticks: int = _TICKS) -> Scenario:
+    """What both sides compare at the start: the scenario of the bench's exchanges."""
+    content: dict[str, Any] = {
+        "title": "gfmhil bench latency", "duration": ticks * 1e-4, "T_s": 1e-4, "law": _LAW,
+        "mode": "lockstep", "link": {"type": "shm", "start_timeout_s": _START_S,
+                                     "peer_timeout_s": 60.0},
+    }  # fmt: skip
+    return check_scenario(content | ({"inner": _STAGE} if inner else {}), "bench")
+
+
+def peer_of(
+    to: str, name: str | None, options: dict[str, Any], ports: Path | None, ptp_us: float,
+    place: Path,
+) -> Contender:  # fmt: skip
+    """The contender that answers at an endpoint, or is the controller ``KIND:NAME``.
+
+    Args:
+        to: endpoint, or controller.
+        name: in the tables.
+        options: of the link.
+        ports: map of the controller's ports.
+        ptp_us: how far CLOCK_TAI of this machine may be off, 0: nobody says.
+        place: folder for an endpoint of our own.
+
+    Raises:
+        UserError: neither, or nothing can be reached there.
+    """
+    more: dict[str, Any] = {"link": options, "ptp_us": ptp_us, "program": None, "inner": False}
+    if ptp_us:
+        tai_offset(ptp_us)
+    if to.partition(":")[0] in ("dll", "fmu", "c", "pil"):
+        return _controller(to, name or to, ports, place, more)
+    kind = kind_of(to)
+    if ports is not None:
+        raise UserError(f"--map {ports}: is for a controller {FORMS}; {to} is an endpoint")
+    try:
+        kind.checked(to, options)
+    except ValueError as problem:
+        raise UserError(f"--to: {problem}") from None
+    _check_route(to)
+    limit = zmq.IPC if to.startswith("ipc:") else _LIMITS.get(kind.name, "")
+    return Contender(name or to, kind.name, to, _open, PEER, more, limit)
+
+
+def _controller(
+    model: str, name: str, ports: Path | None, place: Path, more: dict[str, Any]
+) -> Contender:
+    """The contender of a controller that the bench starts. Raises UserError: there is none such."""
+    folder, inner = place / "controller", model.startswith("c:")
+    folder.mkdir()
+    scenario = scenario_of(inner)
+    words = controller_program(scenario, model, ports, lambda text: None)
+    write_scenario(folder, scenario)
+    endpoint = link_kind("shm").fresh(folder)
+    for mark, value in (
+        ("{scenario}", folder / "scenario.toml"), ("{endpoint}", endpoint), ("{folder}", folder),
+    ):  # fmt: skip
+        words = [word.replace(mark, str(value)) for word in words]
+    more |= {"program": words, "inner": inner, "log": folder / "log"}
+    return Contender(name, "shm", endpoint, _open, PEER, more, shm.LIMIT)
+
+
+def _check_route(endpoint: str) -> None:
+    """See that a host has an address and a route. Raises UserError: it has none."""
+    network = re.fullmatch(r"(?:tcp|udp)://(.+):(\d+)", endpoint)
+    if network is None:
+        return
+    try:
+        family, *_, address = socket.getaddrinfo(network[1].strip("[]"), int(network[2]))[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect(address)  # sends nothing
+    except (OSError, OverflowError) as problem:
+        raise UserError(f"{endpoint}: no route: {getattr(problem, 'strerror', problem)}") from None
+
+
+def open_end(role: Role, endpoint: str, options: dict[str, Any]) -> Link:
+    """One end of the link that has such endpoints. Raises UserError: it cannot be opened."""
+    kind = kind_of(endpoint)
+    try:
+        checked = kind.checked(endpoint, options)
+    except ValueError as problem:
+        raise UserError(f"link: {problem}") from None
+    return kind.open(role, endpoint, checked)
+
+
+def tai_offset(ptp_us: float) -> int:
+    """CLOCK_TAI less CLOCK_MONOTONIC, ns, of a machine whose clock follows PTP. Raises UserError:
+    the kernel does not know TAI, or says that its clock follows none."""
+    timex = (ctypes.c_long * 64)()
+    ctypes.CDLL(None).adjtimex(timex)
+    # struct timex: modes, offset, freq, maxerror, esterror, status, …
+    where = f"--ptp {ptp_us:g}"
+    if timex[5] & _UNSYNCHRONISED:
+        raise UserError(f"{where}: the kernel's clock follows none (adjtimex: STA_UNSYNC)")
+    if abs(time.clock_gettime_ns(_CLOCK_TAI) - time.time_ns()) < 1_000_000_000:
+        raise UserError(f"{where}: CLOCK_TAI is UTC here: ptp4l or phc2sys sets its offset")
+    return _tai_now()
+
+
+def _tai_now() -> int:
+    best, found = 10**9, 0
+    for _ in range(20):
+        before = time.monotonic_ns()
+        tai = time.clock_gettime_ns(_CLOCK_TAI)
+        after = time.monotonic_ns()
+        if after - before < best:
+            best, found = after - before, tai - (before + after) // 2
+    return found
+
+
+class _Caller:
+    """The side that sends y; ``ping`` of a ``PingPong``."""
+
+    def __init__(self, c: Contender) -> None:
+        more = c.options
+        inner = more["inner"]
+        scenario = scenario_of(inner)
+        bench = make_bench(scenario)
+        plant_sample(bench.plant.records, 0, bench.y)
+        self._name, self._values = c.name, bench.y
+        self._good = open_end("plant", c.endpoint, more["link"])
+        try:
+            named = scenario.model_copy(
+                update={"link": scenario.link.model_copy(update={"endpoint": c.endpoint})}
+            )
+            start = shake_hands("plant", self._good, named, lambda: False, lambda text: None)
+        except PeerLost as problem:
+            self._good.close()
+            said = Path(more["log"]).read_text("utf-8").split("gfmhil: ") if "log" in more else [""]
+            raise UserError(f"{c.name}: {said[-1].strip() or problem}") from None
+        self._reads_clocks = start.controller == ANSWERER
+        self._y, self._u = frames("y", inner), frames("u", inner, clocks=True)
+        self._tick, self._one_clock, self._ptp_us = 0, start.one_clock, more["ptp_us"]
+        self._stamps = np.zeros((_MOST, 5), np.int64)
+        self._most = _TICKS if more["program"] else 2**62
+        self.link = ported(self._good)
+        getattr(self.link, "start", lambda: None)()
+        self.sides: dict[str, Any] = {}
+
+    def ping(self, stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
+        """One round. Raises UserError: the other side left, or the link is gone."""
+        port, stamps = self.link.port, self._stamps[: min(len(took), self._most - self._tick)]
+        assert port is not None
+        n = send_all(
+            port.handle, port.send, port.receive, port.spins, self._y, self._u, self._values,
+            period_ns, _LOST_NS, duration_ns, self._tick, stamps,
+        )  # fmt: skip
+        if n in (LEFT, GONE):
+            why = "it is in its safe state, or has left" if n == LEFT else "the link is gone"
+            raise UserError(f"{self._name}: answers no more: {why}")
+        self._tick += n
+        stamps = stamps[:n]
+        self.sides = self._delays(stamps)
+        done = stamps[stamps[:, RECEIVED] >= 0]
+        took[: len(done)] = done[:, RECEIVED] - done[:, DUE]
+        return len(done)
+
+    def _delays(self, stamps: Numbers) -> dict[str, Any]:
+        if not self._reads_clocks:
+            stamps = stamps.copy()
+            stamps[:, 2:4] = -1
+            return delays(stamps, False)
+        error_ns = float(self._u.record["values"][0, 2])  # in its newest answer
+        if not (error_ns and self._ptp_us):
+            return delays(stamps, self._one_clock)
+        ours = stamps.copy()
+        for column in (SENT, RECEIVED):
+            ours[:, column] += np.where(ours[:, column] >= 0, tai_offset(self._ptp_us), 0)
+        return delays(ours, False, 1e3 * self._ptp_us + error_ns)
+
+    def close(self) -> None:
+        """Say goodbye."""
+        getattr(self.link, "stop", lambda: None)()
+        writer = FrameWriter("y", len(self._values) > 5)
+        writer.sequence[:] = self._y.sequence
+        send_last(self._good, writer, self._tick, STOPPED, 0, self._values)
+        self._good.close()
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    """The plant's end calls; the controller's end is elsewhere, or is started here."""
+    nothing: Callable[..., Any] = lambda *_: None  # noqa: E731
+    if role == "controller":
+        close = _started(c) if c.options["program"] else nothing
+        return PingPong(nothing, nothing, close, True)
+    caller = _Caller(c)
+    compiled = caller.link is caller._good
+    return PingPong(caller.ping, nothing, caller.close, compiled, lambda: caller.sides)
+
+
+def _started(c: Contender) -> Callable[[], None]:
+    """Start the controller of a contender; returns what ends it."""
+    with Path(c.options["log"]).open("wb") as log:
+        process = subprocess.Popen(
+            guarded(c.options["program"], bounded=True), stdout=log, stderr=log,
+            start_new_session=True, preexec_fn=restore_priority,
+        )  # fmt: skip
+
+    def close() -> None:
+        end_now(process)
+        process.wait()
+
+    return close
+
+
+def answer(
+    endpoint: str, options: dict[str, Any], ptp_us: float, fifo: bool, say: Callable[[str], None]
+) -> None:
+    """Answer one bench after another at an endpoint, until a signal comes.
+
+    Args:
+        endpoint, options: of the link.
+        ptp_us: as of ``peer_of``.
+        fifo: ask for the priority of a run in real time.
+        say: is called with a line for whoever watches.
+
+    Raises:
+        UserError: the endpoint cannot be used.
+    """
+    open_end("controller", endpoint, options).close()
+    tai_ns = tai_offset(ptp_us) if ptp_us else 0
+    say(f"answering at {endpoint}; Ctrl-C ends it")
+    scenario = scenario_of()
+    patient = {"start_timeout_s": 604800.0, "endpoint": endpoint}
+    scenario = scenario.model_copy(update={"link": scenario.link.model_copy(update=patient)})
+    with Interrupt() as interrupt:
+        while not interrupt.came:
+            (ask_for_real_time if fifo else own_processor)("controller")
+            link = open_end("controller", endpoint, options)
+            try:
+                shake_hands(
+                    "controller", link, scenario, lambda: interrupt.came, lambda text: None,
+                    name=ANSWERER,
+                )  # fmt: skip
+                say("a bench has begun")
+                say(_answer_one(ported(link), tai_ns, 1e3 * ptp_us, interrupt))
+            except PeerLost as problem:
+                if not interrupt.came:
+                    say(str(problem))
+            finally:
+                link.close()
+
+
+def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) -> str:
+    """Answer until the bench ends; returns how it did."""
+    port, stop, why = link.port, np.zeros(1, np.int64), [0]
+    assert port is not None
+    clocks = np.array([0, 0, int(error_ns)])
+
+    def work() -> None:
+        why[0] = answer_all(
+            port.handle, port.send, port.receive, port.spins, frames("y"),
+            frames("u", clocks=True), clocks, tai_ns, _SILENCE_NS, stop,
+        )  # fmt: skip
+
+    getattr(link, "start", lambda: None)()
+    thread = threading.Thread(target=work)
+    thread.start()
+    restore_priority()
+    while thread.is_alive():
+        thread.join(_LOOK_S)
+        stop[0] = interrupt.came
+    getattr(link, "stop", lambda: None)()
+    return {
+        LEFT: "the bench has ended", GONE: "the link is gone", OTHER: "another bench begins",
+        SILENT: f"the bench has said nothing for {_SILENCE_NS * 1e-9:g} s", 0: "stopped",
+    }[why[0]]  # fmt: skip

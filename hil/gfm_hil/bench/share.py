@@ -1,0 +1,89 @@
+"""The bench's own share of a round trip: the same loops over a link that takes no time.
+
+There the answer is back at the first look. What remains is reading the clock, copying a message,
+and, with frames whose clocks are compared, their CRCs on both sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gfm_hil.bench.exchange import frames, send_all
+from gfm_hil.bench.one_way import RECEIVED, SENT
+from gfm_hil.bench.pingpong import frames as messages
+from gfm_hil.bench.pingpong import over_link
+from gfm_hil.links.crc import crc32
+from gfm_hil.links.frame import FrameWriter
+from gfm_hil.links.port import Port, port_function
+from gfm_runtime.signals import NY
+
+_TIMES, _ROUND_NS = 2000, 100_000_000
+# words of the handle: whether a message is under way, and frames are; bytes of the answer; a CRC
+_HERE, _FRAMES, _SIZE, _CRC_OF_Y = range(4)
+_ANSWER = 8  # word at which the answer begins
+_TICK, _CRC = slice(12, 20), 4  # bytes of a frame, and those at its end
+
+
+@port_function
+def _send(handle, message):
+    handle[_HERE] = 1
+    if handle[_FRAMES] != 0:
+        answer = handle[_ANSWER:].view(np.uint8)
+        last = handle[_SIZE] - _CRC
+        answer[_TICK] = message[_TICK]
+        handle[_CRC_OF_Y] = crc32(message, len(message) - _CRC)
+        crc = np.int64(crc32(answer, last))
+        for k in range(_CRC):
+            answer[last + k] = (crc >> (8 * k)) & 0xFF
+    return 1
+
+
+@port_function
+def _receive(handle, message):
+    if handle[_HERE] == 0:
+        return 0
+    handle[_HERE] = 0
+    answer, size = handle[_ANSWER:].view(np.uint8), handle[_SIZE]
+    for k in range(size):
+        message[k] = answer[k]
+    return size
+
+
+class _Mirror:
+    """A link whose answer is back at once; with a port, or with Python methods alone."""
+
+    def __init__(self, ported: bool, of_frames: bool) -> None:
+        answer = FrameWriter("u").pack(0, 1, 0, np.ones(3))
+        handle = np.zeros(_ANSWER + 8, np.int64)
+        handle[_FRAMES], handle[_SIZE] = of_frames, len(answer)
+        handle[_ANSWER:].view(np.uint8)[: len(answer)] = np.frombuffer(answer, np.uint8)
+        self.port = Port(handle, _send, _receive, 1000) if ported else None
+        self._answer, self._here = answer, False
+
+    def send(self, message: bytes) -> bool:
+        self._here = True
+        return True
+
+    def receive(self) -> bytes | None:
+        here, self._here = self._here, False
+        return self._answer if here else None
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+def own_share_us(code: str, of_frames: bool) -> float:
+    """The median over exchanges in one process, µs; ``code`` as in the tables, ``compiled`` or
+    ``Python``; ``of_frames``: with those that ``exchange`` checks."""
+    if not of_frames:
+        took = np.zeros(_TIMES, np.int64)
+        end = over_link(_Mirror(code == "compiled", False), messages("y"))
+        n = end.ping(np.zeros(1, np.int64), 0, _ROUND_NS, took)
+        return round(float(np.median(took[:n])) / 1e3, 4)
+    port, stamps = _Mirror(True, True).port, np.zeros((_TIMES, 5), np.int64)
+    assert port is not None
+    n = send_all(
+        port.handle, port.send, port.receive, port.spins, frames("y"), frames("u", clocks=True),
+        np.ones(NY), 0, _ROUND_NS, _ROUND_NS, 0, stamps,
+    )  # fmt: skip
+    return round(float(np.median((stamps[:, RECEIVED] - stamps[:, SENT])[:n])) / 1e3, 4)

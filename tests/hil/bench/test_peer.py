@@ -1,0 +1,150 @@
+"""``gfmhil bench latency --to``: who answers elsewhere. The tests judge no time."""
+
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import pytest
+
+from gfm_hil.bench.contenders import free_port
+from gfm_hil.bench.peer import scenario_of
+from gfm_hil.cli import main
+from gfm_hil.scenario import write_scenario
+
+from .test_bench import bench, processes_with
+
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
+
+GFMHIL = [sys.executable, "-m", "gfm_hil"]
+SHORT = ("--seconds", "0.05", "--load", "idle")
+OWN = Path(__file__).parents[3] / "examples" / "own_controller" / "controller.py"
+
+
+@contextlib.contextmanager
+def other_side(*line):
+    """A program that answers."""
+    with subprocess.Popen([*line], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+@pytest.mark.parametrize("link", ["tcp", "udp", "shm", "pty", "can"])
+def test_both_ways_over_every_link(link, tmp_path, capsys):
+    place, port = uuid.uuid4().hex, free_port()
+    endpoint = {
+        "shm": f"shm://{place}", "pty": f"pty://{tmp_path}/line", "can": "can+udp://127.0.0.1:"
+        f"{20000 + port % 20000}",
+    }.get(link, f"{link}://127.0.0.1:{port}")  # fmt: skip
+    with other_side(*GFMHIL, "bench", "answer", endpoint):
+        rows = bench(tmp_path, capsys, "latency", "--to", endpoint, "--as", "far", *SHORT)
+    rows = [row for row in rows["results"] if row["peer"] == "to"]
+    assert [(row["name"], row["mode"]) for row in rows] == [
+        ("far", "lockstep"), ("far", "realtime")
+    ]  # fmt: skip
+    for row in rows:
+        assert row["n"] == row["sent"] - row["lost"] > 0
+        assert 0 < row["bench_us"] < row["p50_us"]
+        if link == "can":  # its frames have no room for a clock
+            assert "clock" not in row
+            continue
+        assert (row["clock"], row["within_us"]) == ("one clock", 0.0)
+        assert 0 < row["there"]["p50_us"] + row["back"]["p50_us"] < row["max_us"]
+        assert row["between"]["n"] == row["n"]
+
+
+def test_a_program_of_docs_own_controller(tmp_path, capsys):
+    endpoint = f"ipc://{tmp_path}/own"
+    write_scenario(tmp_path, scenario_of())
+    program = [sys.executable, str(OWN), endpoint, str(tmp_path / "scenario.toml")]
+    again = f"until {shlex.join(program)}; do :; done"  # it waits for 20 s at a time
+    with other_side("sh", "-c", again) as process:
+        found = bench(tmp_path, capsys, "latency", "--to", endpoint, "--mode", "lockstep", *SHORT)
+        assert process.wait(30) == 0, process.stderr.read()  # we say goodbye
+    (row,) = [row for row in found["results"] if row["peer"] == "to"]
+    assert row["n"] > 0 and row["lost"] == 0 and "clock" not in row
+
+
+@pytest.mark.apt
+def test_a_controller_that_the_bench_starts(tmp_path, capsys):
+    assert main(["firmware", "dll", "vsg-2", "--out", str(tmp_path / "law")]) == 0
+    capsys.readouterr()
+    (file,) = (tmp_path / "law").rglob("*.so")
+    options = ("--to", f"dll:{file}", "--as", "vsg-2", "--mode", "lockstep", *SHORT)
+    (row,) = (
+        row
+        for row in bench(tmp_path, capsys, "latency", *options)["results"]
+        if row["peer"] == "to"
+    )
+    assert row["name"] == "vsg-2" and row["n"] > 0 and row["lost"] == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (["--to", "foo://x"], "foo://x: must be "),
+        (["--to", "tcp://no-host.invalid:5", "--option", "plain=true"], "no route: "),
+        (["--to", "tcp://192.0.2.1:5"], "goes beyond this machine, unencrypted"),
+        (["--to", "tcp://127.0.0.1:5", "--ptp", "1"], "--ptp 1: "),
+        (["--to", "tcp://127.0.0.1:5", "--map", "m.toml"], "--map m.toml: is for a controller"),
+        (["--to", "dll:none.so"], "none.so: there is no such file"),
+        (["--to", "udp://127.0.0.1:5", "--option", "x=1"], "options.x = 1: unknown key"),
+    ],
+)
+def test_wrong_peers_are_refused_in_a_line(line, said, tmp_path, capsys):
+    assert main(["bench", "latency", *line, "--out", str(tmp_path / "none")]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not (tmp_path / "none").exists()
+
+
+def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
+    endpoint = f"ipc://{tmp_path}/link"
+    other = (
+        "import sys, gfm_hil.engine.handshake as h\n"
+        "h.TABLE_VERSION += 1\n"
+        "from gfm_hil.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    with other_side(sys.executable, "-c", other, "bench", "answer", endpoint) as process:
+        line = ["bench", "latency", "--to", endpoint, "--out", str(tmp_path / "none")]
+        assert main(line) == 2
+        process.send_signal(signal.SIGINT)
+        answerer = process.communicate(timeout=60)[1].decode()
+    assert "runs another version of the signal table" in capsys.readouterr().err
+    assert "the plant runs another version of the signal table" in answerer
+
+
+@pytest.mark.timeout(400)
+def test_a_killed_benchmark_leaves_nothing_behind(tmp_path):
+    """No process, no memory segment, no folder."""
+    shm = Path("/dev/shm")
+    mark, before = f"GFMHIL_TEST={uuid.uuid4()}", {*shm.rglob("*")}
+    line = ["bench", "latency", "--links", "shm,zmq", "--peers", "none", "--seconds", "8"]
+    with subprocess.Popen(
+        [*GFMHIL, *line, "--out", str(tmp_path / "bench")],
+        env={**os.environ, **dict([mark.split("=")])},
+    ) as process:  # fmt: skip
+        try:
+            until = time.monotonic() + 90
+            while processes_with(mark) < 3 + len(os.sched_getaffinity(0)):
+                assert process.poll() is None and time.monotonic() < until
+                time.sleep(0.2)
+            time.sleep(5)
+        finally:
+            process.kill()
+    until = time.monotonic() + 60
+    left: set[Path] = set()
+    while time.monotonic() < until:
+        left = {path for path in {*shm.rglob("*")} - before if "gfmhil" in str(path)}
+        if not processes_with(mark) and not left:
+            return
+        time.sleep(0.2)
+    pytest.fail(f"{processes_with(mark)} processes, {left}")
