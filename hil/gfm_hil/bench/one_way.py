@@ -62,7 +62,7 @@ def offset(stamps: Numbers, one_clock: bool, tai_ns: float = 0.0) -> Offset:
     line = np.polyfit(when[quick], middle[quick], min(1, count - 1), w=1 / (trip[quick] + 1))
     ns = np.polyval(line, when)
     within = trip.min() / 2 + float(np.abs(ns - middle)[quick].max())
-    # each exchange bounds the difference: no line of a real clock within all bounds, and one stepped
+    # each exchange bounds the difference: if no line is within all bounds, a clock has stepped
     beyond = max((ns - there).max(), (-back - ns).max())
     steady = beyond <= trip.min() / 2 and (count == 1 or abs(line[0]) < _FASTEST)
     return Offset(ns, within, "quickest exchanges" if steady else STEPPED)

@@ -82,15 +82,16 @@ def _way_tables(content: Row) -> Iterator[Table]:
     if rows:
         columns: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
         for way, words in (("there", "there"), ("between", "its own"), ("back", "back")):
-            for name in ("p50", "p99"):
-                columns[f"{words} {name}"] = lambda r, way=way, name=name: micro(
-                    r[way][f"{name}_us"]
-                )
+            columns |= {f"{words} {name}": _of_way(way, f"{name}_us") for name in ("p50", "p99")}
         columns["± "] = lambda r: micro(r.get("within_us"))
         columns["clock"] = lambda r: r.get("clock", "not read")
         columns["lost"] = lambda r: percent(r["lost_pct"])
         columns["95 %"] = lambda r: "{:.3g}–{:.3g} %".format(*r["lost_pct_95"])
         yield _table("Both ways [µs]", rows, columns)
+
+
+def _of_way(way: str, key: str) -> Column:
+    return lambda row: micro(row[way][key])
 
 
 def _limit(row: Row) -> str:

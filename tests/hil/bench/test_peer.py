@@ -106,7 +106,7 @@ def test_wrong_peers_are_refused_in_a_line(line, said, tmp_path, capsys):
 
 
 def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
-    endpoint = f"ipc://{tmp_path}/link"
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
     other = (
         "import sys, gfm_hil.engine.handshake as h\n"
         "h.TABLE_VERSION += 1\n"
