@@ -59,7 +59,7 @@ scenario = "rig_pref_step"
 laws = ["vsg-2"]
 runs = 2
 [set]
-duration = 0.1
+duration = 1.5
 "references.Q_ref" = 0.0
 [figure]
 x = "plant.factors.L_g"
@@ -80,6 +80,12 @@ high = 1.3
 path = "plant.delay.samples"
 type = "choice"
 values = [1, 2]
+[[draw]]
+path = "plant.factors.C_f"
+type = "uniform"
+low = 0.9
+high = 1.1
+also = ["plant.factors.R_f"]
 """
 PROFILE = """# a course
 t,f_hz,V_g
@@ -148,12 +154,21 @@ title = "x"
 duration = 0.05
 [link]
 type = "%s"
-endpoint = "tcp://127.0.0.1:5555"
+endpoint = "%s"
 peer_timeout_s = 1.0
-options = { fd = true, every = 1, curve = "keys", plain = true, bitrate = 1000000 }
+options = { %s }
 impairment = { pause_at = 3, kill_at = 3, seed = 3 }
 """
-WEIGHTS = "W_11 = { num = [1.0, 4.0], den = [1.0, 4e-4] }"
+LINKS = (
+    LINK % ("zmq", "tcp://127.0.0.1:5555", 'curve = "keys"'),
+    LINK % ("zmq", "tcp://192.0.2.1:5555", "plain = true"),
+    LINK % ("can", "can+udp://127.0.0.1:4000", "fd = true, every = 1, bitrate = 1000000"),
+    LINK % ("shm", "shm://x", ""),
+)
+WEIGHTS = """
+W_11 = { num = [1.0, 4.0], den = [1.0, 4e-4] }
+W_22 = { num = [1.0], den = [1.0, 0.1] }
+"""
 
 
 def _shipped(*folders: Path) -> list[str]:
@@ -166,10 +181,8 @@ def toml(*seeds: str) -> st.SearchStrategy[bytes]:
 
 
 def _scenarios() -> st.SearchStrategy[bytes]:
-    """Shipped ones, every event, links with all that they can have, and every key that there is."""
-    whole = load_scenario("switchover").model_copy(deep=True)
-    links = [LINK % kind for kind in ("zmq", "can", "shm")]
-    return toml(*_shipped(*SCENARIO_FOLDERS), EVENTS, *links, scenario_toml(whole))
+    """Shipped ones, every event, and every key that there is."""
+    return toml(*_shipped(*SCENARIO_FOLDERS), EVENTS, scenario_toml(load_scenario("switchover")))
 
 
 def reading(
@@ -455,6 +468,7 @@ _ELF = (CORPUS / "elf" / "vsg_2_records").read_bytes()
 FILES = (
     Parser("profile", reading("a.csv", _profile, UserError), lambda: texts([PROFILE])),
     Parser("scenario", reading("scenario.toml", _scenario, UserError, _written_again), _scenarios),
+    Parser("link", reading("scenario.toml", _scenario, UserError), lambda: toml(*LINKS)),
     Parser(
         "converter",
         reading("converter.toml", _converter, (UserError, NoEquilibrium)),

@@ -149,7 +149,7 @@ class OperatorPort(ABC):
         name: in the registry.
 
     Attributes:
-        text: what the command does, for its help.
+        text: what the command does, for its help, if the registry does not say all of it.
         risk: what may happen at an address that others reach.
         remedy: what permits such an address, in words.
         opens: the option by which a user permits it without encryption, and its help.
@@ -162,7 +162,7 @@ class OperatorPort(ABC):
         tls: how it encrypts, once the options are checked; None: plainly.
     """
 
-    text: str
+    text = ""
     risk: str
     remedy = "--plain if it shall"
     opens: tuple[str, str]
@@ -179,7 +179,8 @@ class OperatorPort(ABC):
 
     def add(self, command: argparse.ArgumentParser) -> None:
         """Add the options that every port has, then its own."""
-        command.description = self.text
+        said = PORTS[self.name].text
+        command.description = self.text or f"{said[0].upper()}{said[1:]}, to its end."
         command.add_argument("folder", type=Path, metavar="RUN", help="the run folder")
         command.add_argument("--wait", action="store_true", help="wait for the run to begin")
         command.add_argument(

@@ -199,6 +199,18 @@ def test_files_of_the_user_in_a_run_folder_stay(whole, tmp_path):
     assert (folder / "commands_mine.json").exists() and (folder / "events_plant.jsonl").is_dir()
 
 
+def put(kind: str, path: Path, original: Path) -> None:
+    """Something else in place of a file: a pipe, 1 GB of zeros, or a link."""
+    path.unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "gigabyte":
+        path.touch()
+        os.truncate(path, GIGABYTE)
+    else:
+        path.symlink_to("/dev/zero" if kind == "zero" else original)
+
+
 @pytest.mark.attack(
     "16.4",
     "a pipe or a file of 1 GB in place of a file of a run folder",
@@ -209,14 +221,7 @@ def test_files_of_the_user_in_a_run_folder_stay(whole, tmp_path):
 def test_what_is_no_file_of_a_run_is_said_in_a_line(kind, name, cut, tmp_path, refused, attack_now):
     folder, path = tmp_path / "run", tmp_path / "run" / name
     shutil.copytree(cut, folder)
-    path.unlink(missing_ok=True)
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "gigabyte":
-        path.touch()
-        os.truncate(path, GIGABYTE)
-    else:
-        path.symlink_to("/dev/zero" if kind == "zero" else cut / name)
+    put(kind, path, cut / name)
     reason = {"pipe": "is not a regular file", "gigabyte": ""}.get(kind, "is a link, which is not")
     assert f"{path}: {reason}" in refused("recover", str(folder))
     assert (folder / "parts" / "plant_times.npy").exists()  # what was recorded is kept
@@ -228,14 +233,7 @@ def test_what_is_no_file_of_a_run_is_said_in_a_line(kind, name, cut, tmp_path, r
 def test_a_finished_run_is_read_from_regular_files(kind, name, whole, tmp_path, refused):
     folder, path = tmp_path / "run", tmp_path / "run" / name
     shutil.copytree(whole, folder)
-    path.unlink()
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "gigabyte":
-        path.touch()
-        os.truncate(path, GIGABYTE)
-    else:
-        path.symlink_to(whole / name)
+    put(kind, path, whole / name)
     for words in (["recover", str(folder)], ["export", str(folder), "-o", f"{tmp_path}/x.mat"]):
         assert refused(*words).startswith(f"gfmhil: {path}")
 

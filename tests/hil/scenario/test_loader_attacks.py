@@ -187,8 +187,9 @@ def test_places_that_cannot_be_written(command, here, run, refused, attack_now):
     attack_now(f"{len(WRITERS)} commands, one line each, exit code 2, nothing written")
 
 
+@pytest.mark.processes
 def test_a_folder_named_like_an_option_serves_as_any_other(here):
-    Path("two.toml").write_text('title = "x"\nduration = 0.02\n')  # sides as processes
+    Path("two.toml").write_text('title = "x"\nduration = 0.02\n')
     assert main(["run", "two.toml", "--out=./--", "--quiet", "--no-figures"]) == 0
     assert (here / "--" / "summary.json").is_file()
 

@@ -57,7 +57,6 @@ _Request = tuple[int, int, bytes]  # transaction, unit, PDU
 class ModbusPort(OperatorPort):
     """The SunSpec device of ``gfmhil modbus``."""
 
-    text = "Serve a run that is going on as a SunSpec device on Modbus/TCP, to its end."
     risk = "and Modbus does not ask who commands"
     remedy = "use --tls CERT KEY CLIENT-CA, or --anyone-may-command"
     opens = (

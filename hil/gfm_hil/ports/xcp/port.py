@@ -201,10 +201,6 @@ def packed(line: Transport, timeout_ms: int, commands: Sequence[str]) -> list[st
 class XcpPort(OperatorPort):
     """The slave of ``gfmhil xcp``."""
 
-    text = (
-        "Serve a run that is going on to a calibration tool, as an XCP slave on UDP or CAN FD, to "
-        "its end."
-    )
     risk = "and XCP neither encrypts nor asks who calls"
     opens = (
         "--plain",
