@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.bench.attribution import CAUSES, attribute
 from gfm_hil.bench.contenders import memory_folder
 from gfm_hil.bench.jitter import HYBRID, lost, pace_both, pace_here
 from gfm_hil.bench.pair import pair
@@ -36,6 +35,7 @@ from gfm_hil.core.terminal import markdown
 from gfm_hil.realtime.environment import environment, may_sched_fifo
 from gfm_hil.recording.columns import TIMES_OF
 from gfm_hil.recording.live import LiveRun
+from gfm_hil.run.attribution import CAUSES, attribute
 
 T_S = 1e-4  # s
 _SETTLE_S = 0.5  # between two rounds, not counted: clients come and go
@@ -217,7 +217,7 @@ def _count(timing: Timing, stretches: list[Turn]) -> Found:
         found.ticks += len(there)
         found.missed.append(int((~there).sum()))
         found.trips.append((part["plant_received"] - part["plant_scheduled"])[there])
-        causes = attribute(part, round(T_S * 1e9))
+        causes = attribute(part, round(T_S * 1e9)).causes
         found.causes += np.bincount(causes, minlength=len(CAUSES))
         found.answers += round_.answers
         found.seconds += (round_.end - round_.begin) * 1e-9

@@ -26,13 +26,13 @@ import numpy as np
 from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
-from gfm_hil.bench.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
 from gfm_hil.bench.contenders import memory_folder
 from gfm_hil.bench.cpu_load import cpu_load
 from gfm_hil.bench.histogram import summary
-from gfm_hil.bench.jitter import HYBRID, lost, pace_both, pace_here
+from gfm_hil.bench.jitter import lost, pace_both, pace_here
 from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.pair import pair
+from gfm_hil.bench.pingpong import HYBRID
 from gfm_hil.bench.rounds import RUNS, ShowProgress, in_turn, quickest, seconds, spread, take_turns
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
@@ -41,7 +41,10 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
+from gfm_hil.run.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
 from gfm_hil.run.runner import run_scenario
+from gfm_hil.run.stalls import Watch, loops_of
+from gfm_hil.run.taken import Taken
 from gfm_hil.scenario import INPROC, Scenario, check_scenario, load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled
@@ -73,6 +76,8 @@ class _Run:
     timing: dict[str, Times]
     scheduling: list[str]  # of the two sides
     early: str  # why it ended early; empty if it did not
+    taken: Taken | None  # who had the processors
+    processors: list[int]  # of the two sides
     late: Times | None = None  # of the bare loop, (2, ticks), ns
 
 
@@ -187,7 +192,7 @@ def _realtime(
 def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
     trips, missed, beyond = list[Times](), list[Times](), list[float]()
     ticks = host = host_ticks = 0
-    causes = Counter[str]()
+    causes, names = Counter[str](), Counter[str]()
     for run in runs:
         assert run.late is not None
         timing = run.timing
@@ -196,7 +201,9 @@ def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
         trips.append(trip)
         missed.append(missed_ticks(timing))
         ticks += len(there)
-        causes.update(counts(attribute(timing, _T_NS)))
+        why = attribute(timing, _T_NS, (), run.taken, run.processors)
+        causes.update(counts(why.causes))
+        names.update(filter(None, why.names))
         allowed = _T_NS - (float(np.median(trip)) if len(trip) else 0.0)
         alone = len(lost(run.late, allowed))
         host += alone
@@ -219,6 +226,8 @@ def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
         "rounds_beyond_host_pct": [round(value, 4) for value in beyond],
         "by_work_or_link_pct": round(100 * ours / ticks, 4) if ticks else None,
         "causes": dict(causes),
+        "names": dict(names.most_common()),
+        "method": runs[0].taken.method if runs[0].taken else None,
         "bursts": bursts(missed),
         **summary(trips),
     }
@@ -235,13 +244,15 @@ def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario
 
 
 def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
-    """Run a scenario; the context ``beside`` begins with its first ticks, not while it starts."""
+    """Run a scenario; in real time, the context ``beside`` and the watch over the processors begin
+    with its first ticks, not while it starts."""
     folder, begin = place / f"run-{time.monotonic_ns()}", 0
-    with ExitStack() as during:
+    with ExitStack() as during, Watch() as watch:
 
         def progress(ticks: int, misses: int) -> None:
             nonlocal begin
-            if ticks and not begin and beside is not nullcontext:
+            if ticks and not begin and scenario.mode == "realtime":
+                watch.begin(loops_of(folder))
                 during.enter_context(beside())
                 begin = ticks + _SETTLE
 
@@ -256,7 +267,7 @@ def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
         ends = dict.fromkeys(log.read_text("utf-8").strip().splitlines()[-1] for log in logs)
         early = f"{run.status} {' / '.join(filter(None, ends)) or run.summary['reason']}".strip()
     shutil.rmtree(folder)
-    return _Run(timing, policies, early)
+    return _Run(timing, policies, early, watch.taken, [*watch.loops])
 
 
 @compiled

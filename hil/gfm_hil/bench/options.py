@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from gfm_hil.bench.c_code import FLAGS
 from gfm_hil.bench.contenders import FRAME, PEERS, missing_packages
-from gfm_hil.bench.cpu_load import LOADS, Load
+from gfm_hil.bench.cpu_load import EVERY, LOADS, Load
 from gfm_hil.bench.pair import Policy
 from gfm_hil.bench.rounds import ShowProgress
 from gfm_hil.core.errors import UserError
@@ -25,7 +25,9 @@ from gfm_runtime import get_law
 Mode = Literal["lockstep", "realtime"]
 MODES: tuple[Mode, ...] = ("lockstep", "realtime")
 #: each is a module with ``measure(options, content, show)``, which adds to the result's content
-KINDS = ("latency", "jitter", "kernel", "loop")
+KINDS = ("latency", "jitter", "kernel", "loop", "sweep")
+#: longest message of a sweep, bytes: the most of UDP is 65,507
+_PAYLOADS, _RATES_KHZ = (1, 65507), (0.01, 100.0)
 
 _SECONDS = {"loop": (0.1, 3600)}  # of a round, where others than the usual ones are allowed
 _FEW_LAWS = "mimo-gfm,vsg-2,droop-2"  # of the loop in `all`
@@ -42,6 +44,10 @@ class BenchOptions:
     loads: Sequence[Load]  # idle, or busy: with a CPU load on each processor
     policies: Sequence[Policy]  # scheduling of the two processes, the best one first
     payload: int  # bytes of a request; ``FRAME`` means the bench's frames, 64 there and 48 back
+    payloads: Sequence[int]  # bytes of a message of a sweep
+    rates: Sequence[float]  # kHz, of a sweep, ascending
+    waits: Sequence[str]  # of a sweep: how the sender waits for its deadline
+    most_missed_pct: float  # at the highest rate of a sweep
     laws: Sequence[str]  # names; none: the benchmark's own choice
     cflags: str  # for the C compiler
     seconds: float  # of one round
@@ -90,9 +96,13 @@ def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
         links=links,
         peers=_peers(of("peers", "none" if "to" in options else "installed")),
         modes=_split("--mode", of("mode"), MODES) or MODES,
-        loads=_split("--load", of("load"), LOADS) or LOADS,
+        loads=_split("--load", of("load"), EVERY if kind == "sweep" else LOADS) or LOADS,
         policies=policies(of("policy", "auto")),
         payload=_within("--payload", of("payload", FRAME), 1, 504),
+        payloads=_numbers("--payloads", of("payloads", "64"), int, *_PAYLOADS),
+        rates=_numbers("--rates", of("rates", "10"), float, *_RATES_KHZ),
+        waits=_split("--wait", of("wait", "both"), ("both", "spin", "sleep")),
+        most_missed_pct=_within("--missed", of("missed", 1.0), 0.0, 100.0),
         laws=[get_law(name).name for name in _split("--laws", of("laws"))],
         cflags=of("cflags", FLAGS),
         seconds=_within("--seconds", of("seconds", 0.1), *_SECONDS.get(kind, (0.01, 60))),
@@ -128,6 +138,15 @@ def _split(option: str, text: str | None, allowed: Sequence[Any] | None = None) 
             wanted = f"from {', '.join(allowed)}" if allowed is not None else "none empty"
             raise UserError(f"{option} {text!r}: names separated by commas, {wanted}")
     return names
+
+
+def _numbers(option: str, text: str, kind: type, low: Any, high: Any) -> list[Any]:
+    """Numbers from a comma-separated list, in ascending order."""
+    try:
+        values = sorted({kind(word) for word in text.split(",")})
+    except ValueError:
+        raise UserError(f"{option} {text!r}: numbers separated by commas") from None
+    return [_within(option, value, low, high) for value in values]
 
 
 def _within(option: str, value: Any, low: Any, high: Any) -> Any:

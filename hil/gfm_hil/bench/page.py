@@ -29,6 +29,7 @@ _SECTIONS = {
     "jitter": (tables.jitter_tables, plots.jitter),
     "lockstep": (tables.lockstep_tables, plots.lockstep),
     "kernel": (tables.kernel_tables, plots.kernel),
+    "sweep": (tables.sweep_tables, plots.sweep),
 }
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.bench.contenders import Contender
-from gfm_hil.bench.pingpong import PingPong
+from gfm_hil.bench.pingpong import HYBRID, PingPong
 from gfm_hil.bench.share import own_share_us
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
@@ -40,7 +40,7 @@ _END_S = 1.5  # a loop that gets no answer ends after a second
 _role: Role = "plant"
 _ends: dict[str, PingPong] = {}
 _took = np.zeros(0, np.int64)
-_stop = np.zeros(1, np.int64)
+_stop = np.zeros(2, np.int64)
 
 
 class Pair:
@@ -61,9 +61,11 @@ class Pair:
             compiled = _wait(self._pools[role].submit(_open, contender, payload))
         return bool(compiled)
 
-    def round(self, contender: Contender, period_ns: int, seconds: float) -> NDArray[np.int64]:
+    def round(
+        self, contender: Contender, period_ns: int, seconds: float, how: int = HYBRID
+    ) -> NDArray[np.int64]:
         """Times of the round trips of one round in ns; none if the peer stopped answering."""
-        self._stop[0] = 0
+        self._stop[:] = 0, how
         answers = self._pools["controller"].submit(_pong, contender.name)
         name, duration_ns = contender.name, int(seconds * 1e9)
         try:
@@ -92,7 +94,7 @@ def _wait(future: Future[Any]) -> Any:
 def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     """Start both; ``place`` is a folder in memory."""
     path = place / "stop"
-    path.write_bytes(bytes(8))
+    path.write_bytes(bytes(16))
     context = multiprocessing.get_context("spawn")
     pools = {
         role: ProcessPoolExecutor(

@@ -6,7 +6,8 @@ called through its Python methods. ``contenders/pingpong.h`` is the same in C.
 A loop fills ``took`` (capacity,) with the ns of its round trips and returns their number, or -1 if
 the peer stopped answering. With ``period_ns`` 0 they follow each other. Else one begins every
 period, at absolute deadlines, and its time counts from the deadline, so that a late start is
-included. ``stop`` is one number in memory that both processes share.
+included. ``stop`` are two numbers in memory that both processes share: not 0 to stop, and how to
+wait for a deadline.
 """
 
 from __future__ import annotations
@@ -25,12 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.links.frame import FrameWriter
-from gfm_hil.realtime.clock import now_ns, spin_or_yield, wait_until
+from gfm_hil.realtime.clock import now_ns, sleep_until, spin_or_yield, wait_until
 from gfm_runtime.compiled import cached
 from gfm_runtime.signals import Vector, names
 
 SILENCE_NS = 1_000_000_000
-LONGEST = 512  # bytes
+LONGEST = 65536  # bytes
+HYBRID, SPIN, SLEEP = range(3)  # ways to wait
 _DIFFERENT = 256  # messages in turn, so that a link that checks the sequence accepts all
 _POLLS = 1024  # between two reads of the clock
 
@@ -64,6 +66,17 @@ class PingPong:
 
 
 @cached
+def wait_for(due, spins, how):
+    """Wait for a deadline: sleep until shortly before it and spin the rest, only spin, or sleep."""
+    if how == HYBRID:
+        wait_until(due, spins)
+    elif how == SLEEP:
+        sleep_until(due)
+    while now_ns() < due:
+        pass
+
+
+@cached
 def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_ns, took):
     """``ping`` through a port's functions."""
     answer = np.empty(LONGEST, np.uint8)
@@ -74,7 +87,7 @@ def ping_port(handle, send, receive, spins, messages, stop, period_ns, duration_
     end, due, n = begin + duration_ns, begin + period_ns, 0
     while n < len(took) and begin < end:
         if period_ns > 0:
-            wait_until(due, spins)
+            wait_for(due, spins, stop[1])
             begin = due
             due += period_ns
         for i in range(len(message)):
@@ -132,7 +145,7 @@ def _ping_python(
     end, due, n = begin + duration_ns, begin + period_ns, 0
     while n < len(took) and begin < end:
         if period_ns:
-            wait_until(due, 0)
+            wait_for(due, 0, stop[1])
             begin, due = due, due + period_ns
         link.send(sent[n % _DIFFERENT])
         while link.receive() is None:

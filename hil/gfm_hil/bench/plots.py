@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.bench.attribution import CAUSES
 from gfm_hil.bench.histogram import dense, lower_ends
-from gfm_hil.bench.tables import lockstep_name
+from gfm_hil.bench.tables import lockstep_name, micro
 from gfm_hil.links import link_names
 from gfm_hil.results.figures import COLOURS, dress
+from gfm_hil.run.attribution import CAUSES
 
 _GREY = "#888888"
 _BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
@@ -194,4 +195,42 @@ def kernel(content: Row) -> Figure | None:
     axes.set_ylim(-0.7, len(rows) - 0.3)
     axes.set_xlim(left=0)
     axes.legend(fontsize=8.5, frameon=False, loc="lower right")
+    return figure
+
+
+_LOW_PCT, _HIGH_PCT = 0.01, 100.0  # limits of the colours of a heat map
+
+
+def sweep(content: Row) -> Figure | None:
+    """Share of missed messages by payload and rate: one heat map per contender and condition, with
+    p99 in each field."""
+    rows = content.get("sweep")
+    if not rows:
+        return None
+    keys = ("name", "load", "policy", "wait")
+    maps = [*dict.fromkeys(tuple(r[key] for key in keys) for r in rows)]
+    payloads, rates = (sorted({r[key] for r in rows}) for key in ("payload", "khz"))
+    across = min(4, len(maps))
+    down = -(-len(maps) // across)
+    size = (0.9 + (0.8 + 0.62 * len(rates)) * across + 0.9, (1.1 + 0.42 * len(payloads)) * down)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    for axes, which in zip(grid.flat, maps, strict=False):
+        missed = np.full((len(payloads), len(rates)), np.nan)
+        for r in rows:
+            if tuple(r[key] for key in keys) == which and r["missed_pct"] is not None:
+                i, j = payloads.index(r["payload"]), rates.index(r["khz"])
+                missed[i, j] = max(r["missed_pct"], _LOW_PCT)
+                look = {"fontsize": 7, "color": "white" if missed[i, j] > 1.0 else "black"}
+                axes.text(j, i, micro(r["p99_us"]), ha="center", va="center", **look)
+        colours = LogNorm(_LOW_PCT, _HIGH_PCT)
+        image = axes.imshow(missed, cmap="viridis_r", norm=colours, aspect="auto", origin="lower")
+        axes.set_xticks(range(len(rates)), [f"{rate:g}" for rate in rates])
+        axes.set_yticks(range(len(payloads)), [f"{size:,}" for size in payloads])
+        axes.set_title(", ".join(which), fontsize=7.5)
+    for axes in grid.flat[len(maps) :]:
+        axes.axis("off")
+    figure.colorbar(image, ax=grid, label="missed [%]", fraction=0.03)
+    figure.supxlabel("rate [kHz]; in each field p99 [µs]", fontsize=9)
+    figure.supylabel("payload [B]", fontsize=9)
     return figure

@@ -7,6 +7,7 @@ from typing import Any
 
 from gfm_hil.bench.histogram import SHARES
 from gfm_hil.results.table import Table
+from gfm_hil.run.taken import METHODS
 
 Row = dict[str, Any]
 #: a column of a table: the key of what it shows as it is, or a function that makes a cell of a row
@@ -131,7 +132,23 @@ def jitter_tables(content: Row) -> Iterator[Table]:
     if "jitter" in content:
         columns = {"": "policy", "load": "load", "wait": "wait", **_PERCENTILES}
         heading = "A loop that only paces, every 100 µs: late by [µs]"
-        yield _table(heading, content["jitter"], columns | {"ticks lost": _of("lost_pct", percent)})
+        columns |= {"ticks lost": _of("lost_pct", percent), "p50, p99 : nanosleep": _agrees}
+        yield _table(heading, content["jitter"], columns)
+        heading = "Who had the processor in ticks that were late by more than 100 µs"
+        yield from named_tables(heading, content["jitter"], ("policy", "load", "wait"))
+
+
+_NEARLY = 0.1  # relative difference to another program's p50 and p99 that is agreement
+
+
+def _agrees(row: Row) -> str:
+    """Whether another program agrees with our ``nanosleep``."""
+    ratios = row.get("to_ours")
+    if not ratios:
+        return "–"
+    same = all(abs(ratio - 1) <= _NEARLY for ratio in ratios.values())
+    text = ", ".join(f"{ratio:.2f}" for ratio in ratios.values())
+    return f"{text}: {'agree' if same else 'differ'}"
 
 
 def realtime_tables(content: Row) -> Iterator[Table]:
@@ -157,6 +174,24 @@ def realtime_tables(content: Row) -> Iterator[Table]:
     columns |= {c: _cause(c) for c in (rows[0]["causes"] if rows else ())}
     columns["longest burst"] = lambda row: str(max((n for n, _ in row["bursts"]), default=0))
     yield _table("Missed ticks by cause", rows, columns)
+    yield from named_tables("Who had the processor in missed ticks", rows, ("link", "load"))
+
+
+_NAMES = 8  # of a row, in a table
+
+
+def named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Iterator[Table]:
+    """Who took the time of ticks, the most frequent ones of each row."""
+    named = [
+        {**row, "name": name, "count": count}
+        for row in rows
+        for name, count in list(row.get("names", {}).items())[:_NAMES]
+    ]
+    if named:
+        columns: dict[str, Column] = {keys[0]: keys[0], **{key: key for key in keys[1:]}}
+        columns |= {"who": "name", "ticks": _number("count")}
+        by = dict.fromkeys(METHODS[row["method"]] for row in named)
+        yield _table(f"{heading}, {' and '.join(by)}", named, columns)
 
 
 def _cause(cause: str) -> Column:
@@ -212,3 +247,32 @@ def kernel_tables(content: Row) -> Iterator[Table]:
         }
     if by_law:
         yield _table("One step of the kernel [ns]", list(by_law.values()), columns)
+
+
+def sweep_tables(content: Row) -> Iterator[Table]:
+    """Round trips of a sweep with their cost, and the highest rates."""
+    columns: dict[str, Column] = {
+        "": "name", "load": "load", "policy": "policy", "wait": "wait",
+        "B": _number("payload"),
+    }  # fmt: skip
+    if "sweep" not in content:
+        return
+    yield _table(
+        "Round trips from the deadline, by payload and rate [µs]",
+        content["sweep"],
+        columns
+        | {
+            "kHz": _number("khz", "g"),
+            "p50": _PERCENTILES["p50"],
+            "p99": _PERCENTILES["p99"],
+            "missed": _of("missed_pct", percent),
+            "processors": _of("processor_pct", percent),
+            "opened, kB": _number("opened_kb"),
+        },
+    )
+    most = percent(content["highest"][0]["most_missed_pct"]) if content["highest"] else ""
+    yield _table(
+        f"Highest rate at which at most {most} miss",
+        content["highest"],
+        columns | {"kHz": lambda row: f"{row['highest_khz']:g}" if row["highest_khz"] else "none"},
+    )

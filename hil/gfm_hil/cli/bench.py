@@ -63,6 +63,20 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "metavar": "US",
         "help": "CLOCK_TAI follows PTP within so many µs; both sides say so, for one-way delays",
     },
+    "--payloads": {
+        "default": "16,64,504",
+        "help": "bytes of a message, by commas; links of ours carry 504 (default: %(default)s)",
+    },
+    "--rates": {"default": "1,5,10,20", "help": "kHz, by commas (default: %(default)s)"},
+    "--wait": {
+        "default": "both",
+        "help": "how the sender waits, by commas: spin, sleep, or both in turn (%(default)s)",
+    },
+    "--missed": {
+        "type": float,
+        "default": 1.0,
+        "help": "percent of the messages that may miss at the highest rate (default: %(default)s)",
+    },
     "--laws": {"help": "names, by commas (default: all that are stable there)"},
     "--cflags": {"default": "-O3", "help": "for the C compiler (default: %(default)s)"},
     "--seconds": {"type": float, "help": "of a round (default: %(default)s)"},
@@ -87,9 +101,13 @@ _KINDS = {
         "closed loop: ticks a second in lockstep, misses in real time",
         "--links --mode --load --laws --seconds --rounds",
     ),
+    "sweep": (
+        "round trips by payload, rate, load, policy and wait; the highest rate, and the cost",
+        "--links --peers --payloads --rates --load --policy --wait --missed --seconds --rounds",
+    ),
     "all": ("all of it, in three minutes at most", "--links --peers"),
 }
-_SECONDS = {"latency": 0.2, "jitter": 0.3, "loop": 3.0}
+_SECONDS = {"latency": 0.2, "jitter": 0.3, "loop": 3.0, "sweep": 0.1}
 
 
 def add(command: argparse.ArgumentParser) -> None:

@@ -311,6 +311,8 @@ def run_loop(
         timeline.put_off = True
     thread = threading.Thread(target=work, name=f"{role}-loop", daemon=True)
     thread.start()
+    for share in shares:
+        share.part.progress[2] = thread.native_id or 0
     restore_priority()
     try:
         while thread.is_alive():

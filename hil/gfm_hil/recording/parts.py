@@ -37,7 +37,8 @@ _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that link
 class RolePart:
     """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
     ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress`` for
-    observers: ticks done; of the plant the misses, of the controller the reason of SAFE."""
+    observers: ticks done; of the plant the misses, of the controller the reason of SAFE; and the
+    thread of the loop."""
 
     signals: NDArray[np.float64]
     times: NDArray[np.int64]
@@ -69,7 +70,7 @@ class RolePart:
         return RolePart(
             made("signals", "f8", (ticks, len(columns)), np.nan),
             made("times", "i8", (ticks, len(times)), -1),
-            made("progress", "i8", (2,), 0),
+            made("progress", "i8", (3,), 0),
         )
 
     def put(self, first: int, rows: NDArray[np.float64]) -> None:
@@ -95,7 +96,7 @@ class RolePart:
         types = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
         known = signals.ndim == 2 and recorded_in(role, signals.shape[1]) != ()
         widths = known and times.shape[1:] == (len(kept_of(role)),)
-        whole = types and widths and progress.shape == (2,) and len(signals) == len(times)
+        whole = types and widths and progress.shape == (3,) and len(signals) == len(times)
         if not whole or not 0 <= progress[0] <= len(signals):
             raise UserError(f"{files[0]}: is no recording of a {role}, nor are those beside it")
         return RolePart(signals, times, progress)

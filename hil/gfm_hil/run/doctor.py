@@ -17,6 +17,8 @@ from typing import Any, Literal, NamedTuple
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.recording.columns import bytes_per_tick
+from gfm_hil.run.stalls import Watch
+from gfm_hil.run.taken import Taken
 
 Level = Literal["green", "yellow", "red"]
 Facts = dict[str, Any]
@@ -27,6 +29,7 @@ _CAP_SYS_NICE = 23
 #: read without a system call, see Documentation/timers/timekeeping.rst of Linux
 _FAST_CLOCKS = {"tsc", "arch_sys_counter", "riscv_clocksource", "kvm-clock"}
 _FAST_CLOCKS |= {"hyperv_clocksource_tsc_page"}
+_IRQ_US, _IRQ_TIMES = 1000, 100  # of an interrupt in a second on one processor
 _WAKE_US = 20  # of a tick of 100 µs
 _MINUTE_BYTES = 60 * 10_000 * bytes_per_tick()
 _NEEDED = ("numpy", "numba", "pyzmq", "python-can")
@@ -43,10 +46,42 @@ class Finding(NamedTuple):
 
 def examine() -> tuple[Facts, list[Finding]]:
     """The machine's badge and further facts, and the findings; changes nothing."""
-    steal = StealTime()
-    time.sleep(_STEAL_OVER_S)
+    steal, before = StealTime(), interrupt_counts(Path("/"))
+    with Watch() as watch:
+        watch.begin(dict.fromkeys(os.sched_getaffinity(0), -1), 0)
+        time.sleep(_STEAL_OVER_S)
     facts = {**environment(), **look(Path("/")), "steal_pct": steal.percent()}
+    facts["interrupts"] = _busiest(watch.taken, before, interrupt_counts(Path("/")))
     return facts, judge(facts)
+
+
+def interrupt_counts(root: Path) -> dict[tuple[str, int], int]:
+    """How often each device has interrupted each processor, by "irq NUMBER, NAME" and processor."""
+    head, *lines = _text(root / "proc/interrupts").splitlines() or [""]
+    cpus, counts = [int(name.removeprefix("CPU")) for name in head.split()], {}
+    for line in lines:
+        number, *rest = line.split()
+        if number[:-1].isdecimal() and len(rest) > len(cpus):
+            for cpu, count in zip(cpus, rest, strict=False):
+                counts[f"irq {number[:-1]}, {rest[-1]}", cpu] = int(count)
+    return counts
+
+
+def _busiest(
+    taken: Taken | None, before: dict[tuple[str, int], int], now: dict[tuple[str, int], int]
+) -> dict[str, Any] | None:
+    """The device that took most time of a processor, or without a trace the one that interrupted
+    most often; None if none did."""
+    if taken is not None and taken.method == "trace":
+        times = [one for one in taken.totals() if one[0].startswith("irq ")]
+        return (
+            {"name": times[0][0], "processor": times[0][1], "us": times[0][2] / 1e3}
+            if times
+            else None
+        )
+    grown = {key: count - before.get(key, count) for key, count in now.items()}
+    (name, processor), count = max(grown.items(), key=lambda one: one[1], default=(("", 0), 0))
+    return {"name": name, "processor": processor, "times": count} if count else None
 
 
 def verdict() -> dict[str, Any]:
@@ -75,6 +110,7 @@ def look(root: Path) -> Facts:
         "governors": sorted(governors),
         "deepest_idle_us": max(deepest, default=None),
         "smt": _text(cpu / "smt/active") == "1",
+        "interrupts": None,
         "rt_share": int(runtime) / int(period) if runtime and period else None,
         "rt_priority": _allowed_priority(root),
         "shm_minutes": round(shutil.disk_usage(memory).free / _MINUTE_BYTES, 1)
@@ -202,6 +238,7 @@ def _judge_rest(facts: Facts) -> Iterator[_Row]:
         "other work runs on this machine: stop it, or isolate the loops' processors",
     )  # fmt: skip
     yield ("CAN", *_can(facts))
+    yield ("interrupts", *_interrupts(facts.get("interrupts")))
     names = ("python", "gfmhil", *_NEEDED, "libzmq")
     missing = [name for name in _NEEDED if facts[name] is None]
     found = ", ".join(f"{name} {facts[name]}" for name in names if facts[name])
@@ -219,6 +256,21 @@ def _can(facts: Facts) -> tuple[str, Level, str]:
         return f"drivers {', '.join(facts['can_modules'])}", "yellow", advice
     advice = "for the link can: a kernel with CAN; the interface gfmhil-udp does without"
     return "no driver", "yellow", advice
+
+
+def _interrupts(busiest: dict[str, Any] | None) -> tuple[str, Level, str]:
+    """Which device takes most of a processor, and how to move it away."""
+    if busiest is None:
+        return "of no device", "green", ""
+    name, cpu = busiest["name"], busiest["processor"]
+    if "us" in busiest:
+        took, much = f"took {busiest['us']:.0f} µs", busiest["us"] > _IRQ_US
+    else:
+        took, much = f"came {busiest['times']} times", busiest["times"] > _IRQ_TIMES
+    place = f"/proc/irq/{name.split(',')[0].removeprefix('irq ')}/smp_affinity_list"
+    advice = f"move it to a processor without a loop: echo NUMBER > {place}"
+    found = f"{name}, {took} in {_STEAL_OVER_S:g} s on processor {cpu}"
+    return found, "yellow" if much else "green", advice
 
 
 def worst(findings: Iterable[Finding]) -> Level:

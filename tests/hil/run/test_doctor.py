@@ -73,6 +73,18 @@ def test_a_good_machine_is_green_and_has_nothing_to_do():
         ("CAN", "yellow", "gfmhil-can@can0", {"can": {"can0": "down"}}),
         ("CAN", "yellow", "gfmhil-vcan@vcan0", {"can": {}}),
         ("CAN", "yellow", "gfmhil-udp", {"can": {}, "can_modules": []}),
+        (
+            "interrupts",
+            "yellow",
+            "/proc/irq/24/smp_affinity_list",
+            {"interrupts": {"name": "irq 24, virtio", "processor": 1, "us": 5312.0}},
+        ),
+        (
+            "interrupts",
+            "yellow",
+            "/proc/irq/24/smp_affinity_list",
+            {"interrupts": {"name": "irq 24, virtio", "processor": 1, "times": 312}},
+        ),
         ("versions", "red", "pip install pyzmq", {"pyzmq": None}),
     ],
 )
@@ -98,6 +110,7 @@ def test_it_reads_the_kernel_s_files(tmp_path):
         "proc/sys/kernel/sched_rt_runtime_us": "800000",
         "proc/sys/kernel/sched_rt_period_us": "1000000",
         "proc/self/status": "CapEff:\t0000000000800000",
+        "proc/interrupts": " CPU0 CPU2\n 24: 7 312 IO-APIC 5-edge virtio\nNMI: 1 2 Non-maskable",
         "sys/class/net/can0/type": "280",
         "sys/class/net/can0/operstate": "down",
         "sys/class/net/eth0/type": "1",
@@ -113,6 +126,8 @@ def test_it_reads_the_kernel_s_files(tmp_path):
     assert seen["deepest_idle_us"] == 3  # the deeper state is disabled
     assert (seen["smt"], seen["rt_share"], seen["rt_priority"]) == (True, 0.8, 99)
     assert (seen["can"], seen["can_modules"]) == ({"can0": "down"}, ["can-raw", "vcan"])
+    counts = doctor.interrupt_counts(tmp_path)
+    assert counts == {("irq 24, virtio", 0): 7, ("irq 24, virtio", 2): 312}
     assert seen["shm_minutes"] is None  # no such file below that root
 
 

@@ -18,8 +18,10 @@ from typing import Any
 
 from gfm_hil.bench.c_code import NoCompiler, compile_c
 from gfm_hil.bench.pingpong import Messages, PingPong, frames, over_link, plain
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.signals import NY
 
@@ -53,12 +55,15 @@ class Contender:
     options: dict[str, Any] = field(default_factory=dict)  # of the link
     # name of the contender in C that it is compared with; its own name for one in C
     limit: str = ""
+    longest: int = 65507  # bytes of a message
     source: Path | None = None  # C source of a limit
     library: Path | None = None  # ``source``, compiled
 
     def open(self, role: Role, payload: int) -> PingPong:
         """Open one end, for requests of ``payload`` bytes. Raises UserError: it cannot be opened
-        here."""
+        here, or does not carry so many bytes."""
+        if payload > self.longest:
+            raise UserError(f"it carries messages of up to {self.longest} bytes")
         return self.end(self, role, messages(role, payload))
 
 
@@ -97,7 +102,9 @@ def messages(role: Role, payload: int) -> Messages:
 
 def of_link(name: str, link: str, endpoint: str, limit: str, **options: Any) -> Contender:
     """A link of the bench with these options."""
-    return Contender(name, link, endpoint, _open_link, options=options, limit=limit)
+    return Contender(
+        name, link, endpoint, _open_link, options=options, limit=limit, longest=LONGEST
+    )
 
 
 def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
@@ -105,11 +112,14 @@ def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
 
 
 def limit(
-    name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong]
-) -> Contender:
+    name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong],
+    longest: int = 65507,
+) -> Contender:  # fmt: skip
     """A limit in C, of the source beside a Python file; ``end`` opens one by ``pingpong.in_c``."""
     source = Path(file).with_suffix(".c")
-    return Contender(name, source.stem, endpoint, end, "C", limit=name, source=source)
+    return Contender(
+        name, source.stem, endpoint, end, "C", limit=name, source=source, longest=longest
+    )
 
 
 def fresh(link: str, place: Path) -> str:

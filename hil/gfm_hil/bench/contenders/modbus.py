@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gfm_hil.bench.contenders import Contender, free_port, udp
-from gfm_hil.bench.pingpong import LONGEST, Messages, Numbers, PingPong
+from gfm_hil.bench.pingpong import Messages, PingPong, over_link
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.realtime.clock import wait_until
+from gfm_hil.links.port import Port
 
 _MOST = 121  # registers that function 23 may write
 
@@ -27,37 +29,39 @@ def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     """The controller is the server. A request of the plant writes y and reads u at once (function
     23), as registers of 16 bits; both have the size of y."""
-    if not 2 <= (size := own.shape[1]) <= min(2 * _MOST, LONGEST):
+    if not 2 <= own.shape[1] <= 2 * _MOST:
         raise UserError(f"a Modbus message holds 2 to {2 * _MOST} bytes")
     if role == "controller":
         return _server(int(c.endpoint))
-    from pymodbus.client import ModbusTcpClient
+    return over_link(_Client(int(c.endpoint)), own)
 
-    client = ModbusTcpClient("127.0.0.1", port=int(c.endpoint), timeout=1.0, retries=0)
-    if not client.connect():
-        raise UserError(f"no Modbus server at port {c.endpoint}")
-    registers = [row[: size // 2 * 2].view(">u2").tolist() for row in own]
-    n = size // 2
 
-    def ping(stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
-        begin = time.monotonic_ns()
-        end, due, done = begin + duration_ns, begin + period_ns, 0
-        while done < len(took) and begin < end:
-            if period_ns:
-                wait_until(due, 0)
-                begin, due = due, due + period_ns
-            values = registers[done % len(registers)]
-            answer = client.readwrite_registers(
-                read_address=0, read_count=n, write_address=_MOST, values=values
-            )
-            if answer.isError():
-                return -1
-            now = time.monotonic_ns()
-            took[done], begin = now - begin, now
-            done += 1
-        return done
+class _Client:
+    """The plant's end: it sends a request and has the answer before it polls for one."""
 
-    return PingPong(ping, lambda stop: None, client.close, False)
+    port: Port | None = None
+
+    def __init__(self, port: int) -> None:
+        from pymodbus.client import ModbusTcpClient
+
+        self._client = ModbusTcpClient("127.0.0.1", port=port, timeout=1.0, retries=0)
+        if not self._client.connect():
+            raise UserError(f"no Modbus server at port {port}")
+        self.close = self._client.close
+        self._answer: bytes | None = None
+
+    def send(self, message: bytes) -> bool:
+        values = np.frombuffer(message[: len(message) // 2 * 2], ">u2").tolist()
+        answer = self._client.readwrite_registers(
+            read_address=0, read_count=len(values), write_address=_MOST, values=values
+        )
+        good = not answer.isError()
+        self._answer = struct.pack(f">{len(values)}H", *answer.registers) if good else None
+        return good
+
+    def receive(self) -> bytes | None:
+        answer, self._answer = self._answer, None
+        return answer
 
 
 def _server(port: int) -> PingPong:

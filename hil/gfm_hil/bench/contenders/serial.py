@@ -10,6 +10,7 @@ from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 from gfm_hil.links import open_link
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.serial.link import SerialLink
 
 LIMIT = "C serial"
@@ -17,7 +18,7 @@ LIMIT = "C serial"
 
 def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
     if "serial" in links:
-        yield limit(LIMIT, __file__, fresh("serial", place / "c"), _open)
+        yield limit(LIMIT, __file__, fresh("serial", place / "c"), _open, LONGEST)
         yield of_link("serial", "serial", fresh("serial", place), LIMIT)
 
 

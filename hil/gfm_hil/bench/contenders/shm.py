@@ -11,13 +11,14 @@ import numpy as np
 from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
+from gfm_hil.links.base import LONGEST
 
 _SLOTS = 2 * 1024  # bytes, two slot_t
 LIMIT = "C shm"
 
 
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
-    yield limit(LIMIT, __file__, str(place / "slots"), _open)
+    yield limit(LIMIT, __file__, str(place / "slots"), _open, LONGEST)
     if "shm" in names:
         yield of_link("shm", "shm", fresh("shm", place), LIMIT)
 

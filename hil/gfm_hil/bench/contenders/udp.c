@@ -3,7 +3,7 @@
 #include <stdint.h>
 #include <sys/socket.h>
 
-enum { YIELDS = 0, LONGEST = 512 };
+enum { YIELDS = 0, LONGEST = 65536 };
 
 typedef struct {
     int socket;

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gfm_hil.bench.attribution import CAUSES, attribute, bursts, counts, missed_ticks
+from gfm_hil.run.attribution import CAUSES, attribute, bursts, counts, missed_ticks
 
 T = 100_000  # ns
 TICKS = 500
@@ -30,12 +30,12 @@ def good() -> dict[str, np.ndarray]:
 
 
 def found(timing: dict[str, np.ndarray], *events: int) -> list[str]:
-    return [CAUSES[k] for k in attribute(timing, T, events)]
+    return [CAUSES[k] for k in attribute(timing, T, events).causes]
 
 
 def test_a_run_without_misses_has_no_causes():
     assert found(good()) == []
-    assert counts(attribute(good(), T)) == dict.fromkeys(CAUSES, 0)
+    assert counts(attribute(good(), T).causes) == dict.fromkeys(CAUSES, 0)
 
 
 def test_late_wake_up():
@@ -153,7 +153,7 @@ def test_plant_that_is_behind_does_not_blame_its_timer():
 def test_every_miss_has_one_cause_and_is_in_one_burst(ticks):
     timing = good()
     timing["plant_received"][sorted(ticks)] = -1
-    assert sum(counts(attribute(timing, T)).values()) == len(ticks)
+    assert sum(counts(attribute(timing, T).causes).values()) == len(ticks)
     lengths = dict(bursts([missed_ticks(timing)]))
     assert sum(n * c for n, c in lengths.items()) == len(ticks)
     assert sum(lengths.values()) == len(ticks - {k + 1 for k in ticks})

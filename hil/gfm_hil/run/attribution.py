@@ -10,15 +10,22 @@ the part that exceeds its usual time in a met tick by most is the cause:
 - link: the rest of the time between y[k] sent and u[k] received.
 
 If a tick began while a side was still late from the missed tick before it, it has the same cause.
+Where somebody watched the processors (``gfm_hil.run.stalls``), what stood still also gets a name,
+and a tick is not the link's if something else had a processor for most of what it lacked.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gfm_hil.realtime.clock import AHEAD_NS
+from gfm_hil.run.taken import Taken, nobody
 
 CAUSES = ("own work", "link", "late wake-up", "stalled host")
 _OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))
@@ -37,34 +44,69 @@ def missed_ticks(timing: Timing) -> Times:
     return np.flatnonzero(timing["plant_received"] < 0)
 
 
-def attribute(timing: Timing, T_ns: int, events: Iterable[int] = ()) -> Times:
-    """The cause of each missed tick of a run in real time, as an index into ``CAUSES``; shape of
-    ``missed_ticks``. Arrays of ``timing.npz``, each (ticks,), and the sampling time in ns; ticks of
-    events."""
+class Attributed(NamedTuple):
+    """Why each missed tick was missed; arrays of the shape of ``missed_ticks``."""
+
+    causes: Times  # index into ``CAUSES``
+    names: list[str]  # who took the time; "" if it was the run itself, or if nobody watched
+
+
+def attribute(
+    timing: Timing, T_ns: int, events: Iterable[int] = (), taken: Taken | None = None,
+    processors: Collection[int] = (),
+) -> Attributed:  # fmt: skip
+    """Why each tick of a run in real time was missed.
+
+    Args:
+        timing: arrays of ``timing.npz``, each (ticks,), of successive ticks.
+        T_ns: sampling time.
+        events: ticks of events.
+        taken: who had the processors of both sides, if anybody watched.
+        processors: those of both sides.
+    """
     missed = missed_ticks(timing)
+    causes, usual = _by_clocks(timing, T_ns, missed)
+    at_event = {k + after for k in events for after in range(_AFTER_EVENT)}
+    sent, answered = timing["plant_sent"], timing["controller_sent"]
+    follows = [
+        n > 0 and missed[n - 1] == k - 1 and bool(causes[n] == _WAKE or answered[k - 1] > sent[k])
+        for n, k in enumerate(missed)
+    ]
+    names = [""] * len(missed)
+    first = [n for n, behind in enumerate(follows) if not behind]
+    for n, end in pairwise([*first, len(missed)]):
+        k, last = int(missed[n]), int(missed[end - 1])
+        if k in at_event:
+            causes[n] = _OWN
+        elif taken is not None:
+            begin, until = timing["plant_scheduled"][[k, last]]
+            lacked = (end - n) * T_ns - usual
+            who = taken.who(begin - AHEAD_NS, until + 2 * T_ns, lacked, processors)
+            if who != nobody(taken.method):
+                causes[n] = _STALL if causes[n] in (_OWN, _LINK) else causes[n]
+            if causes[n] in (_WAKE, _STALL):
+                names[n:end] = [who] * (end - n)
+        causes[n:end] = causes[n]
+    return Attributed(causes, names)
+
+
+def _by_clocks(timing: Timing, T_ns: int, missed: Times) -> tuple[Times, float]:
+    """The cause of each missed tick by itself; and the usual time from a deadline to the answer,
+    ns."""
     shares = _parts(timing, T_ns)
     there = timing["plant_received"] >= 0
-    excess = np.zeros((len(CAUSES), len(missed)))
+    excess, whole = np.zeros((len(CAUSES), len(missed))), 0.0
     for cause, part in shares.items():
-        usual = np.median(part[there]) if there.any() else 0.0
+        usual = float(np.median(part[there])) if there.any() else 0.0
         excess[cause] = part[missed] - usual
+        whole += usual if cause != _STALL else 0.0
     own = shares[_OWN]
     limit = _INTERRUPTED * (np.quantile(own, 0.99) if len(own) else 0.0)
     interrupted = own[missed] > limit
     excess[_STALL, interrupted] += excess[_OWN, interrupted]
     excess[_OWN, interrupted] = 0.0
     excess[_LINK] -= excess[_STALL].clip(min=0)  # a gap between polls is part of the wait
-    causes = np.argmax(excess, axis=0)
-
-    at_event = {k + after for k in events for after in range(_AFTER_EVENT)}
-    sent, answered = timing["plant_sent"], timing["controller_sent"]
-    for n, k in enumerate(missed):
-        follows = n > 0 and missed[n - 1] == k - 1
-        if follows and (causes[n] == _WAKE or answered[k - 1] > sent[k]):
-            causes[n] = causes[n - 1]
-        elif int(k) in at_event:
-            causes[n] = _OWN
-    return causes
+    return np.argmax(excess, axis=0), whole
 
 
 def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:

@@ -1,0 +1,72 @@
+"""Time on the processors of a real-time loop that others had, and who of them explains a stall."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.realtime.environment import virtual_machine
+
+Method = Literal["trace", "proc"]
+METHODS = {"trace": "by the kernel's trace", "proc": "by /proc"}
+ROWS = np.dtype([("processor", "i4"), ("begin", "i8"), ("end", "i8"), ("ran", "i8"), ("who", "i4")])
+STOPPED = "a signal that stopped it"
+WAITS = "its own wait for memory or a disk"
+_MOST = 0.5  # of a stall, that a name must explain
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Who had the processors, and when.
+
+    Attributes:
+        method: "trace": the kernel's trace, so that begin and end are exact; "proc": two readings
+            of /proc, between which the time ``ran`` lay.
+        why: why there is no trace; "" if there is.
+        rows: of ``ROWS``, times in ns of CLOCK_MONOTONIC; ``who`` is an index into ``names``.
+        lost: how often the kernel overwrote its trace before it was read.
+    """
+
+    method: Method
+    why: str = ""
+    rows: NDArray[Any] = field(default_factory=lambda: np.zeros(0, ROWS))
+    names: Sequence[str] = ()
+    lost: int = 0
+
+    def who(self, begin_ns: int, end_ns: int, stall_ns: float, processors: Collection[int]) -> str:
+        """Who explains most of a stall within this time, on one of these processors.
+
+        If nobody explains half of it, it is ``nobody(method)``.
+        """
+        rows = self.rows[np.isin(self.rows["processor"], list(processors))]
+        shared = np.minimum(rows["end"], end_ns) - np.maximum(rows["begin"], begin_ns)
+        share = np.minimum(shared, rows["ran"]).clip(min=0)
+        each = np.bincount(rows["who"], share, max(1, len(self.names)))
+        best = int(np.argmax(each))
+        return self.names[best] if each[best] >= _MOST * stall_ns else nobody(self.method)
+
+    def totals(self) -> list[tuple[str, int, int]]:
+        """(name, processor, ns) of all, the longest first."""
+        sums: dict[tuple[str, int], int] = {}
+        for row in self.rows:
+            key = self.names[row["who"]], int(row["processor"])
+            sums[key] = sums.get(key, 0) + int(row["ran"])
+        return sorted(((*key, ns) for key, ns in sums.items()), key=lambda one: -one[2])
+
+
+def nobody(method: Method) -> str:
+    """What took the time if nobody did whom the kernel knows."""
+    if method == "proc":
+        return "not known from /proc"
+    return "the host" if virtual_machine() != "no" else "firmware"
+
+
+def collected(method: Method, rows: Iterable[tuple[int, int, int, int, str]], **more: Any) -> Taken:
+    """From rows with names in place of their numbers."""
+    names: dict[str, int] = {}
+    listed = [(*row[:4], names.setdefault(row[4], len(names))) for row in rows]
+    return Taken(method, rows=np.array(listed, ROWS), names=[*names], **more)

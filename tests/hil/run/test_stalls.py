@@ -1,0 +1,153 @@
+"""Stalls that a test provokes get the right name; what is named is never the link's."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gfm_hil.realtime.environment import may_sched_fifo
+from gfm_hil.run.attribution import CAUSES, attribute, missed_ticks
+from gfm_hil.run.kernel_trace import tracefs
+from gfm_hil.run.proc_watch import ProcWatch
+from gfm_hil.run.runner import run_scenario
+from gfm_hil.run.stalls import Watch, loops_of
+from gfm_hil.run.taken import STOPPED, nobody
+from gfm_hil.scenario import check_scenario
+
+pytestmark = [pytest.mark.processes, pytest.mark.alone]
+
+T_NS = 100_000
+STALLS = 100
+NAMES = {"fifo": "thread stall-fifo", "busy": "thread stall-busy", "stop": STOPPED}
+#: provokes stalls of 2 to 5 ms of threads in turn, and prints (kind, begin, end) of each
+PROVOKE = """
+import json, os, signal, sys, time
+loops, n = json.loads(sys.argv[1]), int(sys.argv[2])
+done = []
+for k in range(n):
+    cpu, thread = list(loops.items())[k % len(loops)]
+    kind = ("fifo", "busy", "stop")[k % 3]
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    time.sleep(0.08 + 0.0137 * (k % 7))
+    open("/proc/self/comm", "w").write("stall-" + kind)
+    os.sched_setaffinity(0, set(range(os.cpu_count())) if kind == "stop" else {int(cpu)})
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80 if kind == "fifo" else 60))
+    begin = time.monotonic_ns()
+    if not os.path.exists(f"/proc/{thread}"):  # the run is over, on a machine that is too busy
+        break
+    if kind == "stop":
+        os.kill(thread, signal.SIGSTOP)
+        time.sleep(0.002)
+        os.kill(thread, signal.SIGCONT)
+    while kind != "stop" and time.monotonic_ns() < begin + (2 if kind == "fifo" else 5) * 10**6:
+        pass
+    done.append((kind, begin, time.monotonic_ns()))
+print(json.dumps(done))
+"""
+
+
+@pytest.fixture
+def trace(tmp_path, monkeypatch):
+    """The kernel's trace; it mounts tracefs if need be."""
+    if os.geteuid() or not may_sched_fifo():
+        pytest.skip("needs root, and the right to SCHED_FIFO")
+    mounted = None
+    if isinstance(tracefs(), str):
+        if subprocess.run(
+            ["mount", "-t", "tracefs", "nodev", str(tmp_path)], check=False
+        ).returncode:
+            pytest.skip("this kernel has no tracefs")
+        mounted = tmp_path
+    yield
+    if mounted:
+        subprocess.run(["umount", str(mounted)], check=True)
+
+
+def provoked(tmp_path: Path, stalls_wanted: int):
+    """A run in real time with stalls; (kind, names of its missed ticks, their causes) of each."""
+    content = {
+        "title": "stalls", "duration": 0.2 * stalls_wanted + 4.0, "T_s": 1e-4, "mode": "realtime",
+        "law": "mimo-gfm", "link": {"type": "shm", "peer_timeout_s": 5.0},
+        "late_policy": {"hold": 10**9},
+    }  # fmt: skip
+    folder, children = tmp_path / "run", []
+    with Watch() as watch:
+
+        def progress(ticks, misses):
+            if ticks > 5_000 and not children:
+                watch.begin(loops_of(folder))
+                loops = json.dumps(watch.loops)
+                command = [sys.executable, "-c", PROVOKE, loops, str(stalls_wanted)]
+                children.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+
+        run = run_scenario(check_scenario(content, "test"), folder, progress)
+    assert run.status == "completed"
+    made = json.loads(children[0].communicate(timeout=60)[0])
+    timing = {name: np.array(column[:]) for name, column in run.timing.items()}
+    why = attribute(timing, T_NS, (), watch.taken, [*watch.loops])
+    at = timing["plant_scheduled"][missed_ticks(timing)]
+    for kind, begin, end in made:
+        here = np.flatnonzero((at >= begin - T_NS) & (at <= end))
+        yield kind, [why.names[k] for k in here], {CAUSES[why.causes[k]] for k in here}
+
+
+def test_a_provoked_stall_has_its_name_in_95_of_100(tmp_path, trace):
+    right, wrong = 0, Counter[tuple[str, str]]()
+    for kind, names, causes in provoked(tmp_path, STALLS):
+        assert "link" not in causes
+        most = Counter(names).most_common(1)
+        named = most[0][0] if most else "no miss"
+        if named.startswith(NAMES[kind]):
+            right += 1
+        else:
+            wrong[kind, named] += 1
+    done = right + wrong.total()
+    assert done > STALLS / 2
+    assert right >= 0.95 * done, wrong
+
+
+def test_proc_shows_the_thread_that_a_loop_waited_for():
+    """Two threads of equal priority on one processor: each waits for the other."""
+    spin = [sys.executable, "-c", "open('/proc/self/comm', 'w').write('rival')\nwhile True: pass"]
+    loop, rival = (subprocess.Popen(spin, stdin=subprocess.DEVNULL) for _ in range(2))
+    try:
+        cpu = min(os.sched_getaffinity(0))
+        for process in (loop, rival):
+            os.sched_setaffinity(process.pid, {cpu})
+        time.sleep(0.2)
+        watch = ProcWatch({cpu: loop.pid}, "no trace")
+        time.sleep(1.0)
+        loop.send_signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        taken = watch.stop()
+    finally:
+        for process in (loop, rival):
+            process.kill()
+            process.wait()
+    names = [name for name, *_ in taken.totals()]
+    assert any(name.startswith("thread ") for name in names)
+    assert STOPPED in names
+    assert (taken.method, taken.why) == ("proc", "no trace")
+    begin, end = int(taken.rows["begin"].min()), int(taken.rows["end"].max())
+    assert taken.who(begin, end, 1.0, [cpu]) in names
+    assert taken.who(begin, end, 1e12, [cpu]) == nobody("proc")
+
+
+def test_nothing_of_the_trace_is_left_after_a_kill(trace):
+    program = (
+        "import os, signal; from gfm_hil.run.kernel_trace import KernelTrace, tracefs\n"
+        "KernelTrace(tracefs(), {0: -1}, 0); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    killed = subprocess.Popen([sys.executable, "-c", program])
+    assert killed.wait() == -signal.SIGKILL
+    deadline = time.monotonic() + 10
+    while left := list((tracefs() / "instances").glob(f"gfmhil-{killed.pid}-*")):
+        assert time.monotonic() < deadline, left
+        time.sleep(0.05)
