@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -72,6 +74,9 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             time.sleep(REST * seconds)
             return took, sum(after[s][0] - before[s][0] for s in after) / lasted
 
+        def missed(cell: _Cell, khz: float) -> float | None:
+            return _missed(one_round(cell, khz, options.seconds)[0], khz)
+
         for cell in cells:
             one_round(cell, options.rates[0], _FIRST_S)
         every = list(product(cells, options.rates))
@@ -83,10 +88,7 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
         content["highest"] = []
         for k, cell in enumerate(cells):
             show(f"highest rate, {cell.contender.name}, {cell.load}", k / len(cells))
-            found = _highest(
-                lambda khz, cell=cell: _missed(one_round(cell, khz, options.seconds)[0], khz),
-                options.rates, options.most_missed_pct,
-            )  # fmt: skip
+            found = highest(partial(missed, cell), options.rates, options.most_missed_pct)
             row = {"highest_khz": found, "most_missed_pct": options.most_missed_pct}
             content["highest"].append(_keys(cell) | row)
     makers = {kind: program(kind) for kind in options.loads if kind not in ("idle", "busy")}
@@ -126,7 +128,9 @@ def _missed(took: Times, khz: float) -> float | None:
     return 100 * float(np.mean(took > 1e6 / khz)) if len(took) else None
 
 
-def _highest(missed: Any, rates: Any, most_pct: float) -> float | None:
+def highest(
+    missed: Callable[[float], float | None], rates: Sequence[float], most_pct: float
+) -> float | None:
     """The highest rate, kHz, of which no more is ``missed``; None if the lowest one is too fast."""
     low, high = min(rates), max(rates)
 

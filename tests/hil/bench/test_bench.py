@@ -8,14 +8,18 @@ import subprocess
 import sys
 import time
 import uuid
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gfm_hil.bench import outside
 from gfm_hil.bench.c_code import compile_twin
 from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
+from gfm_hil.bench.jitter import WAITS, WATCHED
 from gfm_hil.bench.kernel import compare
+from gfm_hil.bench.sweep import highest
 from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
@@ -119,11 +123,51 @@ def test_kernel_without_a_compiler(tmp_path, capsys, monkeypatch):
 def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
     options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
     rows = bench(tmp_path, capsys, *options)["jitter"]
-    assert {r["wait"] for r in rows} == {"sleep+spin", "spin", "nanosleep"}
+    others = {name for name in outside.PROGRAMS if not outside.missing(name)}
+    assert {r["wait"] for r in rows} == {*WAITS, *others}
     for row in rows:
+        if row["wait"] in others:
+            assert row["n"] > 0
+            assert row["to_ours"].keys() == {"p50", "p99"}
+            continue
+        assert (row["method"] is not None) == (row["wait"] == WATCHED)
         assert row["n"] == 2 * row["ticks"] == 2 * 2 * 200  # processors, rounds
         assert row["lost"] == sum(length * count for length, count in row["bursts"])
         assert row["lost_pct"] == pytest.approx(100 * row["lost"] / row["ticks"], abs=1e-3)
+
+
+def test_sweep_has_every_payload_rate_load_and_wait(tmp_path, capsys):
+    short = ("--seconds", "0.02", "--policy", "other", "--links", "shm", *NONE)
+    axes = (
+        "--payloads",
+        "16,505",
+        "--rates",
+        "1,5",
+        "--load",
+        "idle,network",
+        "--wait",
+        "both,sleep",
+    )
+    found = bench(tmp_path, capsys, "sweep", *short, *axes)
+    rows = [row for row in found["sweep"] if row["peer"] == "ours"]
+    keys = [(r["payload"], r["khz"], r["load"], r["wait"]) for r in rows]
+    wanted = list(product((16,), (1.0, 5.0), ("idle", "network"), ("both", "sleep")))
+    assert sorted(keys) == sorted(wanted)
+    assert "shm, 505 B: not measured: it carries messages of up to 504 bytes" in found["remarks"]
+    for row in rows:
+        assert row["n"] > 0
+        assert 0 <= row["missed_pct"] <= 100
+        assert row["processor_pct"] > 0
+    for row in found["highest"]:
+        assert row["highest_khz"] is None or 1 <= row["highest_khz"] <= 5
+
+
+@pytest.mark.parametrize(
+    ("bears_to", "found"), [(30.0, 20.0), (0.5, None), (5.0, 5.0)], ids=["all", "none", "some"]
+)
+def test_the_highest_rate_is_found_by_bisection(bears_to, found):
+    rate = highest(lambda khz: 0.0 if khz <= bears_to else 50.0, [1.0, 20.0], 1.0)
+    assert rate is found or (rate == pytest.approx(found, rel=0.1) and rate <= found)
 
 
 def test_loop_runs_the_product_over_a_link(tmp_path, capsys):

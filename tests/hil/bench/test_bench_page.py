@@ -56,6 +56,7 @@ def content() -> dict[str, Any]:
                 {"link": "shm", "load": "idle", "ticks": 9000, "missed": 9, "missed_pct": 0.1,
                  "host_pct": 0.05, "beyond_host_pct": 0.05, "bursts": [(1, 4), (5, 1)],
                  "by_work_or_link_pct": 0.0333,
+                 "names": {"irq 24, virtio": 4, "the host": 2}, "method": "trace",
                  "causes": {"own work": 1, "link": 2, "late wake-up": 3, "stalled host": 3},
                  **times(2.0, 3)},
             ],
@@ -68,6 +69,16 @@ def content() -> dict[str, Any]:
                  "recording_ns": ns, "times_real_time": ns, "allocations_per_tick": 0.0},
             ],
         },
+        "sweep": [
+            {"name": "shm", "peer": "ours", "payload": payload, "policy": "fifo", "load": "idle",
+             "wait": "both", "khz": khz, "missed_pct": missed, "processor_pct": 98.0,
+             "opened_kb": 100, **times(3.0, 4)}
+            for payload in (16, 504) for khz, missed in ((1.0, 0.0), (20.0, 12.0))
+        ],
+        "highest": [
+            {"name": "shm", "payload": 16, "policy": "fifo", "load": "idle", "wait": "both",
+             "highest_khz": 5.2, "most_missed_pct": 1.0}
+        ],
         "kernel": [
             {"law": "mimo-gfm", "real": real, "states": 3, "numba_ns": ns, "c_ns": c, "ratio": c}
             for real, c in (("float64", ns), ("float32", None))
@@ -106,11 +117,11 @@ def read(content: dict[str, Any], folder: Path) -> Outline:
 def test_page_holds_every_table_and_figure(content, tmp_path):
     page = read(content, tmp_path)
     drawn = [table for _, table in all_tables(content)]
-    assert page.tables == len(drawn) == 10
+    assert page.tables == len(drawn) == 13
     for table in drawn:
         assert table.title in page.text
         assert all(cell in page.text for row in table.rows for cell in row)
-    assert len(page.links) == len(figures(content)) == 5
+    assert len(page.links) == len(figures(content)) == 6
     assert content["remarks"][0] in page.text
     assert all(caveat in page.text for caveat in content["caveats"])
     assert content["environment"]["cpu"] in page.text

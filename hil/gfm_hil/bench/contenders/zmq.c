@@ -3,7 +3,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-enum { YIELDS = 1, LONGEST = 65536, DONTWAIT = 1 /* ZMQ_DONTWAIT */ };
+enum { YIELDS = 1, LONGEST = 512, DONTWAIT = 1 /* ZMQ_DONTWAIT */ };
 
 typedef struct {
     void *socket;

@@ -11,14 +11,15 @@ from gfm_hil.bench.contenders import Contender, free_port, fresh, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
+from gfm_hil.links.base import LONGEST
 
 IPC, TCP = "C zmq ipc", "C zmq tcp"
 
 
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     ipc, tcp = fresh("zmq", place), "tcp://127.0.0.1"
-    yield limit(IPC, __file__, f"{ipc}-c", _open)
-    yield limit(TCP, __file__, f"{tcp}:{free_port()}", _open)
+    yield limit(IPC, __file__, f"{ipc}-c", _open, LONGEST)
+    yield limit(TCP, __file__, f"{tcp}:{free_port()}", _open, LONGEST)
     if "zmq" in names:
         yield of_link("zmq ipc", "zmq", ipc, IPC)
         yield of_link("zmq ipc, portable", "zmq", f"{ipc}-portable", IPC, portable=True)
