@@ -35,6 +35,10 @@ run short.toml --seed -1 | seed
 run short.toml --mode realtime | lockstep only
 run short.toml --link zmq --endpoint x | tcp://host:port
 run short.toml --out short.toml/x | not a folder
+run wrong.toml --out out | wrong.toml: duration: must be a valid number
+compare wrong.toml --laws vsg-2 --out out | wrong.toml: duration: must be a valid number
+plant wrong.toml --endpoint ipc://x --out out | wrong.toml: duration: must be a valid number
+run wrong-plant.toml --out out | factors.L_f = -1.0: must be
 plant short.toml | a side alone needs a link
 plant short.toml --link zmq | link.endpoint: not set
 laws show vsg-99 | vsg-99
@@ -207,6 +211,9 @@ def place(tmp_path_factory) -> Path:
     (folder / "two.toml").write_text(toml_text(TWO))
     law = 'name="a"\ntitle=""\nsource=""\nphi.22={type="P", k=0, typ=1}'
     (folder / "bad.toml").write_text(law)
+    (folder / "wrong.toml").write_text(toml_text({**SHORT, "duration": "3"}))
+    plant = {"factors": {"L_f": -1.0}}
+    (folder / "wrong-plant.toml").write_text(toml_text({**SHORT, "plant": plant}))
     (folder / "own.so").touch()
     for name in ("over/summary.json", "broken/scenario.toml"):
         (folder / name).parent.mkdir()

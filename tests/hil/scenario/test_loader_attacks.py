@@ -80,6 +80,7 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
     "3,000 tables in line": (b"x = " + b"{a=" * 3000 + b"1" + b"}" * 3000, "nested more than 32"),
     "an integer of 5,000 digits": (b"x = " + b"9" * 5000, "not TOML"),
     "a key twice": (b"x = 1\nx = 2\n", "not TOML"),
+    "a key without a value": (b"x = ", "not TOML"),
     "Latin-1": (b'# fine\nx = "\xe9"\n', "line 2 is not UTF-8"),
     "UTF-16": ("x = 1\n".encode("utf-16"), "line 1 is not UTF-8"),
     "a control character": (b"x = 1\x00\n", "not TOML"),
