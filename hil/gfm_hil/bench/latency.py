@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +16,14 @@ from numpy.typing import NDArray
 from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
 from gfm_hil.bench.cpu_load import Load, cpu_load
 from gfm_hil.bench.histogram import summary
+from gfm_hil.bench.night import Block, Blocks, lines_of, night_of
 from gfm_hil.bench.one_way import ways
 from gfm_hil.bench.options import BenchOptions, Mode
-from gfm_hil.bench.pair import pair
+from gfm_hil.bench.pair import Pair, pair, waited_ns
 from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import Role
+from gfm_hil.realtime.environment import caveats
 
 PERIOD_NS = 100_000
 _FIRST_S = 0.02  # length of the warm-up round
@@ -79,6 +84,10 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
 
         for cell in cells:  # compile and warm up
             one_round(cell, _FIRST_S, 0.0)
+        content["remarks"] += remarks
+        if options.for_s:
+            _measure_night(options, cells, one_round, two, content)
+            return
         for number, share, cell in in_turn(cells, options.rounds, options.until):
             times = one_round(cell, options.seconds, share)
             if len(times):
@@ -89,7 +98,55 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     content["results"] += [
         _row(c, by_key.get((c.contender.limit, c.mode, c.load)), options) for c in cells
     ]
-    content["remarks"] += remarks
+
+
+OneRound = Callable[[_RoundTrips, float, float], NDArray[np.int64]]
+
+
+def _measure_night(
+    options: BenchOptions, cells: list[_RoundTrips], one_round: OneRound, two: Pair,
+    content: dict[str, Any],
+) -> None:  # fmt: skip
+    """Measure block after block, in turn, and put what the folder then holds into the content."""
+    folder, done_s = options.folder, 0.0
+    by_name = {cell.contender.name: cell for cell in cells}
+    settings = {
+        "names": [*by_name], "modes": [*options.modes], "loads": [*options.loads],
+        "policy": options.policies[0], "payload": options.payload,
+    }  # fmt: skip
+    about = {
+        "contenders": {name: _about(cell) for name, cell in by_name.items()},
+        "environment": content["environment"], "caveats": caveats(content["environment"]),
+    }  # fmt: skip
+    blocks = Blocks(folder, settings, about, options.resume)
+    if options.resume:
+        done_s = sum(block["s"] for block in lines_of(folder))
+    cell_after_cell = itertools.cycle(cells)
+    while done_s < options.for_s:
+        cell = next(cell_after_cell)
+        block = Block(time.time(), PERIOD_NS if cell.mode == "realtime" else 0)
+        while block.seconds < options.block_s:
+            before, at = two.both(waited_ns), time.time()
+            times = one_round(cell, options.seconds, done_s / options.for_s)
+            after = two.both(waited_ns)
+            if len(times):
+                cause = _cause(times, {role: after[role] - before[role] for role in after})
+                block.add(times, at, options.seconds, cause)
+            else:
+                block.seconds += options.seconds
+        blocks.append((cell.contender.name, cell.mode, cell.load), block)
+        done_s += block.seconds
+    blocks.close()
+    content["results"] += night_of(folder)["results"]
+
+
+def _cause(times: NDArray[np.int64], waited: dict[Role, int]) -> str:
+    """What may have cost the longest time of a round, as far as the kernel counts it."""
+    excess = int(times.max()) - float(np.median(times))
+    role = max(waited, key=lambda one: waited[one])
+    if waited[role] < excess / 2:
+        return "link, or a processor that the host took: the kernel counted no wait"
+    return f"another thread had the processor of the {role} for {waited[role] / 1e3:.0f} µs"
 
 
 def _peer(options: BenchOptions, place: Path) -> Contender:
@@ -100,6 +157,12 @@ def _peer(options: BenchOptions, place: Path) -> Contender:
     return peer_of(to, name, dict(options.option), options.ports, options.ptp_us, place)
 
 
+def _about(cell: _RoundTrips) -> dict[str, Any]:
+    c = cell.contender
+    code = "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python")
+    return {"link": c.link, "peer": c.peer, "code": code, "bench_us": cell.bench_us}
+
+
 def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) -> dict[str, Any]:
     c, of_limit = cell.contender, limit.rounds if limit else {}
     ratios = [
@@ -107,8 +170,7 @@ def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) ->
         for k in sorted(cell.rounds.keys() & of_limit.keys())
     ]
     return {
-        "name": c.name, "link": c.link, "peer": c.peer,
-        "code": "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python"),
+        "name": c.name, **_about(cell),
         "mode": cell.mode, "load": cell.load, "policy": options.policies[0],
         "payload": options.payload,
         **summary(list(cell.rounds.values())),
@@ -116,6 +178,5 @@ def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) ->
         "ratio_to_baseline_p50": round(float(np.median(ratios)), 4) if ratios else None,
         "rounds_ratio": [round(ratio, 4) for ratio in ratios],
         "silent_rounds": cell.silent,
-        "bench_us": cell.bench_us,
         **(ways(cell.sides) if cell.sides else {}),
     }  # fmt: skip

@@ -56,6 +56,10 @@ class BenchOptions:
     to: tuple[str, str | None] | None = None  # who answers elsewhere, and its name in the tables
     option: Sequence[tuple[str, Any]] = ()  # of the link to it
     ports: Path | None = None  # map of a controller's ports
+    for_s: float = 0.0  # a night: so long, in blocks of block_s, to a folder; 0: rounds
+    block_s: float = 10.0
+    folder: Path = Path()
+    resume: bool = False
     ptp_us: float = 0.0  # how far CLOCK_TAI may be off here; 0: nobody says
 
 
@@ -111,6 +115,10 @@ def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
         to=(options["to"], of("as_name")) if "to" in options else None,
         option=of("option", ()),
         ports=of("map"),
+        for_s=_within("--for", of("for_s", 0.0), 0.0, 1e7),
+        block_s=_within("--block", of("block", 10.0), 0.1, 3600.0),
+        folder=of("folder", Path()),
+        resume=of("resume", False),
         ptp_us=_within("--ptp", of("ptp", 0.0), 0.0, 1e6),
     )
 

@@ -25,6 +25,7 @@ _BADGE = {
 #: tables and figure of each section of the page, of which there may be nothing in a result
 _SECTIONS = {
     "latency": (tables.latency_tables, plots.latency),
+    "night": (tables.night_tables, plots.night),
     "misses": (tables.realtime_tables, plots.misses),
     "jitter": (tables.jitter_tables, plots.jitter),
     "lockstep": (tables.lockstep_tables, plots.lockstep),

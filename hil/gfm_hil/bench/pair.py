@@ -165,6 +165,14 @@ def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
     return _took[:n]
 
 
+def waited_ns() -> int:
+    """How long this thread, in a process of the pair, was ready and did not run, ns; 0 where the
+    kernel does not count it."""
+    with suppress(OSError):
+        return int(Path("/proc/thread-self/schedstat").read_text("ascii").split()[1])
+    return 0
+
+
 def _sides(name: str) -> dict[str, Any]:
     return _ends[name].sides()
 

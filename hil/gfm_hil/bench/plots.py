@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from gfm_hil.bench.histogram import dense, lower_ends
+from gfm_hil.bench.night import PER_ROW
 from gfm_hil.bench.tables import lockstep_name, micro
 from gfm_hil.links import link_names
 from gfm_hil.results.figures import COLOURS, dress
@@ -96,6 +97,38 @@ def latency(content: Row) -> Figure | None:
         )  # fmt: skip
 
     return _panels(rows, ["mode", "load"], "round trip [µs]", draw) if rows else None
+
+
+def night(content: Row) -> Figure | None:
+    """How often each time was measured in the course of a night, a panel for each cell."""
+    rows = [row for row in content["results"] if "night" in row and row["n"]]
+    if not rows:
+        return None
+    figure = Figure(figsize=(9.2, 0.5 + 1.9 * len(rows)), layout="constrained")
+    ends = lower_ends()[::PER_ROW] / 1e3
+    for axes, row in zip(figure.subplots(len(rows), squeeze=False)[:, 0], rows, strict=True):
+        heat = row["night"]["heat"]
+        at = np.array([*heat["at"], 2 * heat["at"][-1] - heat["at"][0] if len(heat["at"]) < 2 else
+                       2 * heat["at"][-1] - heat["at"][-2]])  # fmt: skip
+        hours = (at - at[0]) / 3600 if len(heat["at"]) > 1 else np.array([0.0, 1 / 360])
+        counts = np.zeros((len(ends) - 1, len(heat["counts"])))
+        for column, pairs in enumerate(heat["counts"]):
+            for k, n in pairs:
+                counts[k, column] = n
+        shares = counts / counts.sum(axis=0)
+        seen = np.flatnonzero(counts.sum(axis=1))
+        drawn = axes.pcolormesh(
+            hours, np.maximum(ends, 1e-3), np.where(shares > 0, shares, np.nan),
+            norm=LogNorm(1e-7, 1.0), cmap="viridis", rasterized=True,
+        )  # fmt: skip
+        axes.set_yscale("log")
+        axes.set_ylim(ends[seen[0]] or 0.01, 1.3 * ends[seen[-1] + 1])
+        axes.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
+        axes.yaxis.set_minor_formatter(lambda x, _: "")
+        dress(axes, f"{row['name']}, {row['mode']}, {row['load']}: round trip [µs]")
+        figure.colorbar(drawn, ax=axes, label="share")
+    axes.set_xlabel("hours since the start", fontsize=9)
+    return figure
 
 
 def jitter(content: Row) -> Figure | None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from gfm_hil.bench.histogram import SHARES
-from gfm_hil.results.table import Table
+from gfm_hil.results.table import Table, shown
 from gfm_hil.run.taken import METHODS
 
 Row = dict[str, Any]
@@ -125,6 +126,60 @@ def latency_verdicts(content: Row) -> Iterator[str]:
             )
             text += f"; {most} within a tick of {_TICK_US:g} µs"
         yield text
+
+
+def night_tables(content: Row) -> Iterator[Table]:
+    """Of a night: how sure its percentiles are, what lies beyond them, bursts, and the worst."""
+    rows = [row for row in content["results"] if "night" in row]
+    if not rows:
+        return
+    named: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
+    sure = {
+        name.replace("_", "."): _of(f"{name}_us_95", _interval) for name in SHARES if name != "max"
+    }
+    yield _table("Percentiles of all times, with 95 % between [µs]", rows, named | sure)
+    yield _table(
+        "Beyond the data: estimates by a generalised Pareto distribution [µs]",
+        rows,
+        named
+        | {
+            "above": lambda row: micro((row["night"]["beyond"] or {}).get("threshold_us")),
+            "shape": lambda row: shown((row["night"]["beyond"] or {}).get("shape")),
+            "fitted to": lambda row: shown((row["night"]["beyond"] or {}).get("fitted")),
+            "one in …: longer than": _estimates,
+            "longest burst": lambda row: shown(
+                max((n for n, _ in row["night"]["bursts"]), default=0)
+            ),
+        },
+    )
+    worst = sorted(
+        ([us, at, row, why] for row in rows for at, us, why in row["night"]["worst"]),
+        key=lambda one: -one[0],
+    )[:_WORST]
+    cells = [
+        [row["name"], row["mode"], row["load"], _clock_time(at), micro(us), why]
+        for us, at, row, why in worst
+    ]
+    heads = ("", "mode", "load", "UTC", "µs", "what may have cost it")
+    yield Table(heads, cells, "The ten worst times", text=None)
+
+
+_WORST = 10
+
+
+def _interval(ends: list[float | None]) -> str:
+    return "–".join("?" if end is None else micro(end) for end in ends)
+
+
+def _estimates(row: Row) -> str:
+    return "; ".join(
+        f"{times:,}: {micro(us)}"
+        for times, us in (row["night"]["beyond"] or {"estimates": []})["estimates"]
+    )
+
+
+def _clock_time(at: float) -> str:
+    return time.strftime("%m-%d %H:%M:%S", time.gmtime(at)) + f"{at % 1:.4f}"[1:]
 
 
 def jitter_tables(content: Row) -> Iterator[Table]:

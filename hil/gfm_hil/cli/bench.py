@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, TaskProgressColumn
 
 from gfm_hil.bench.contenders import PEERS
+from gfm_hil.bench.export import FORMATS
 from gfm_hil.cli.common import add_map, link_option, new_folder, progress
 from gfm_hil.controllers import FORMS
 from gfm_hil.core.terminal import terminal
@@ -19,6 +20,17 @@ from gfm_hil.links import link_names
 from gfm_hil.run.run_folder import check_free
 
 _WIDTH = 100  # columns: a table cut short is no use in a file
+
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def _duration(text: str) -> float:
+    """A time such as 12h, 90m or 30s, in s."""
+    try:
+        return float(text[:-1]) * _UNITS[text[-1:]]
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be as 12h, 90m or 30s") from None
+
 
 #: options of several kinds of benchmark, as argparse takes them
 _OPTIONS: dict[str, dict[str, Any]] = {
@@ -77,6 +89,15 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "default": 1.0,
         "help": "percent of the messages that may miss at the highest rate (default: %(default)s)",
     },
+    "--for": {
+        "dest": "for_s",
+        "metavar": "TIME",
+        "type": _duration,
+        "help": "a night instead of rounds: so long, as 12h, 90m or 30s, in blocks that stay on"
+        " disk; gfmhil bench page makes its page at any time",
+    },
+    "--block": {"type": float, "metavar": "S", "help": "of a night's block (default: 10)"},
+    "--resume": {"action": "store_true", "help": "go on with the night in the folder of --out"},
     "--laws": {"help": "names, by commas (default: all that are stable there)"},
     "--cflags": {"default": "-O3", "help": "for the C compiler (default: %(default)s)"},
     "--seconds": {"type": float, "help": "of a round (default: %(default)s)"},
@@ -90,7 +111,7 @@ _KINDS = {
     "latency": (
         "round trip of every link, of what one would pick instead, and of the limit in C",
         "--links --peers --to --as --option --ptp --mode --load --policy --payload --seconds"
-        " --rounds",
+        " --rounds --for --block --resume",
     ),
     "jitter": (
         "how late a loop that only paces begins its ticks",
@@ -121,6 +142,45 @@ def add(command: argparse.ArgumentParser) -> None:
         kind.set_defaults(seconds=_SECONDS.get(name))
     _add_compare(kinds)
     _add_answer(kinds)
+    _add_page(kinds)
+
+
+def _add_page(kinds: Any) -> None:
+    page = kinds.add_parser("page", help="make the page of a result, or of a night so far")
+    export = kinds.add_parser("export", help="write a result for other tools")
+    export.add_argument("format", choices=FORMATS, help="; ".join(map(": ".join, FORMATS.items())))
+    for command, call in ((page, page_call), (export, export_call)):
+        command.add_argument("result", type=Path, help="folder of a result or of a night")
+        command.set_defaults(call=call)
+    export.add_argument("-o", "--out", type=Path, required=True, help="the file to write")
+
+
+def page_call(options: argparse.Namespace) -> int:
+    """Make the page; returns the exit code."""
+    from gfm_hil.bench.page import write_page
+    from gfm_hil.bench.result import write_result
+
+    content = _result(options.result)
+    write_result(content, options.result / "bench.json")
+    write_page(content, options.result / "bench.html")
+    print(options.result / "bench.html")
+    return 0
+
+
+def export_call(options: argparse.Namespace) -> int:
+    """Write the file; returns the exit code."""
+    from gfm_hil.bench.export import export
+
+    export(_result(options.result), options.format, options.out)
+    print(options.out)
+    return 0
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    from gfm_hil.bench.night import holds_night, night_of
+    from gfm_hil.bench.result import read_result
+
+    return night_of(folder) if holds_night(folder) else read_result(folder)
 
 
 def _add_answer(kinds: Any) -> None:
@@ -178,9 +238,10 @@ def call(options: argparse.Namespace) -> int:
     from gfm_hil.bench.result import new_result, write_result
     from gfm_hil.bench.tables import latency_verdicts
 
+    options.folder = folder = new_folder(options.out, f"bench-{options.kind}")
     parts = measurements(options)
-    folder = new_folder(options.out, f"bench-{options.kind}")
-    check_free(folder, 0)
+    if not getattr(options, "resume", False):
+        check_free(folder, 0)
     with new_result(options.kind) as content, _bar(options.quiet) as show:
         for measure in parts:
             measure(content, show)

@@ -1,0 +1,236 @@
+"""A night of round trips: blocks on disk, of which a page can be made at any time.
+
+``blocks.jsonl`` has a line for each block, that of one contender in one mode under one load: its
+histogram, its worst times with their causes, and its bursts. A kill costs at most the block that
+was being measured: a line that is cut off counts for nothing, and goes when the night goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.bench.histogram import BUCKETS, SHARES, Counts, dense, histogram, quantiles, sparse
+from gfm_hil.bench.tail import beyond, confidence
+from gfm_hil.core.errors import UserError
+
+WORST = 10
+COLUMNS = 360  # of the heat map, at most
+PER_ROW = 16  # buckets of a histogram to a row of the heat map
+ROWS = BUCKETS // PER_ROW
+_FILE, _SETTINGS = "blocks.jsonl", "night.json"
+Cell = tuple[str, str, str]  # contender, mode, load
+
+
+@dataclass
+class Block:
+    """What is measured of a cell between two lines of the file.
+
+    Attributes:
+        at: when it began, s since 1970.
+        limit_ns: a time that counts as late: of real time the period; 0: none does.
+    """
+
+    at: float
+    limit_ns: int = 0
+    counts: Counts = field(default_factory=lambda: np.zeros(BUCKETS, np.int64))
+    worst: list[tuple[float, float, str]] = field(default_factory=list)  # (at, µs, cause)
+    bursts: Counter[int] = field(default_factory=Counter)
+    seconds: float = 0.0
+
+    def add(self, times_ns: NDArray[np.int64], at: float, seconds: float, cause: str) -> None:
+        """Take a round in: its times, when it began, how long it was, and what cost its worst."""
+        self.counts += histogram(times_ns)
+        self.seconds += seconds
+        late = np.flatnonzero(times_ns > self.limit_ns) if self.limit_ns else times_ns[:0]
+        if len(late):
+            ends = np.flatnonzero(np.diff(late, append=-1) != 1)
+            self.bursts.update(np.diff(ends, prepend=-1).tolist())
+        top = np.argpartition(times_ns, -min(WORST, len(times_ns)))[-WORST:]
+        places = at + np.cumsum(times_ns)[top] * 1e-9 if not self.limit_ns else (
+            at + top * self.limit_ns * 1e-9
+        )  # fmt: skip
+        found = zip(places.tolist(), (times_ns[top] / 1e3).tolist(), strict=True)
+        self.worst += [(place, us, cause) for place, us in found]
+        self.worst = sorted(self.worst, key=lambda one: -one[1])[:WORST]
+
+    def line(self, cell: Cell) -> str:
+        """For the file."""
+        content = {
+            "cell": cell, "at": round(self.at, 3), "s": round(self.seconds, 3),
+            "histogram": sparse(self.counts), "bursts": sorted(self.bursts.items()),
+            "worst": [(round(at, 4), round(us, 3), cause) for at, us, cause in self.worst],
+        }  # fmt: skip
+        return json.dumps(content, separators=(",", ":")) + "\n"
+
+
+class Blocks:
+    """The file of a night.
+
+    Args:
+        folder: of the result.
+        settings: what is measured; a night that goes on must have the same.
+        about: what its page says besides, see ``night_of``.
+        resume: go on with what is there.
+
+    Raises:
+        UserError: there is no night to go on with, or it has other settings.
+    """
+
+    def __init__(
+        self, folder: Path, settings: dict[str, Any], about: dict[str, Any], resume: bool
+    ) -> None:
+        self._path, place = folder / _FILE, folder / _SETTINGS
+        if resume:
+            known = settings_of(folder)
+            for key, value in settings.items():
+                if known.get(key) != value:
+                    raise UserError(f"--resume: {key} was {known.get(key)!r}, and is {value!r} now")
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            place.write_text(json.dumps(settings | about, indent=1) + "\n", encoding="utf-8")
+            self._path.touch()
+        whole = _whole(self._path)
+        self._file = self._path.open("r+b")
+        self._file.truncate(whole)
+        self._file.seek(whole)
+
+    def append(self, cell: Cell, block: Block) -> None:
+        """Write a block; it is on the disk when this returns."""
+        self._file.write(block.line(cell).encode())
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def settings_of(folder: Path) -> dict[str, Any]:
+    """What a night measures. Raises UserError: the folder holds none."""
+    try:
+        return dict(json.loads((folder / _SETTINGS).read_text(encoding="utf-8")))
+    except (OSError, ValueError) as problem:
+        raise UserError(f"{folder}: holds no night: {problem}") from None
+
+
+def holds_night(folder: Path) -> bool:
+    """Whether a folder is that of a night."""
+    return (folder / _SETTINGS).exists()
+
+
+def _whole(path: Path) -> int:
+    """Bytes up to the last whole line."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        while end:
+            begin = max(0, end - (1 << 16))
+            file.seek(begin)
+            at = file.read(end - begin).rfind(b"\n")
+            if at >= 0:
+                return begin + at + 1
+            end = begin
+    return 0
+
+
+def lines_of(folder: Path) -> Iterator[dict[str, Any]]:
+    """The blocks of a night, one after the other. Raises UserError: the file is damaged."""
+    path = folder / _FILE
+    with path.open("rb") as file:
+        left = _whole(path)
+        for number, line in enumerate(file, 1):
+            left -= len(line)
+            if left < 0:
+                return
+            try:
+                yield json.loads(line)
+            except ValueError as problem:
+                raise UserError(f"{path}, line {number}: {problem}") from None
+
+
+class CellNight:
+    """One cell's night, however long, in bounded memory."""
+
+    def __init__(self) -> None:
+        self.counts = np.zeros(BUCKETS, np.int64)
+        self.each: list[list[float]] = []  # p50, p90, p99 of each block, µs
+        self.worst: list[list[Any]] = []
+        self.bursts: Counter[int] = Counter()
+        self.measured_s = 0.0
+        self._heat: list[tuple[float, NDArray[np.int64]]] = []
+        self._together = 1  # blocks of a column
+
+    def add(self, block: dict[str, Any]) -> None:
+        """Take a block in, as ``lines_of`` gives it."""
+        counts = dense(block["histogram"])
+        self.counts += counts
+        self.each.append([x / 1e3 for x in quantiles(counts, [0.5, 0.9, 0.99])])
+        self.worst = sorted([*self.worst, *block["worst"]], key=lambda one: -one[1])[:WORST]
+        self.bursts.update({int(k): int(n) for k, n in block["bursts"]})
+        self.measured_s += block["s"]
+        column = counts.reshape(ROWS, PER_ROW).sum(axis=1)
+        if (len(self.each) - 1) % self._together:
+            self._heat[-1][1][:] += column
+            return
+        if len(self._heat) == COLUMNS:
+            pairs = zip(self._heat[::2], self._heat[1::2], strict=True)
+            self._heat = [(at, a + b) for (at, a), (_, b) in pairs]
+            self._together *= 2
+        self._heat.append((block["at"], column))
+
+    def row(self, cell: Cell) -> dict[str, Any]:
+        """The row of a result, with ``night``: what a short measurement has not."""
+        name, mode, load = cell
+        whole = np.array(quantiles(self.counts, list(SHARES.values()))) / 1e3
+        values = {f"{key}_us": round(float(x), 3) for key, x in zip(SHARES, whole, strict=True)}
+        for key, x in zip(("p50", "p90", "p99"), np.median(self.each, axis=0), strict=True):
+            values[f"{key}_us"] = round(float(x), 3)
+        return {
+            "name": name, "mode": mode, "load": load, **values, **confidence(self.counts),
+            "n": int(self.counts.sum()), "histogram": sparse(self.counts),
+            "rounds_p50_us": [round(one[0], 4) for one in self.each],
+            "night": {
+                "worst": self.worst, "bursts": sorted(self.bursts.items()),
+                "beyond": beyond(self.counts), "measured_s": round(self.measured_s, 1),
+                "heat": {
+                    "at": [at for at, _ in self._heat],
+                    "counts": [sparse_column(column) for _, column in self._heat],
+                },
+            },
+        }  # fmt: skip
+
+
+def sparse_column(column: NDArray[np.int64]) -> list[list[int]]:
+    """[row, count] of a column of the heat map."""
+    return [[int(k), int(column[k])] for k in np.flatnonzero(column)]
+
+
+def night_of(folder: Path) -> dict[str, Any]:
+    """The result of a night as it stands, also while it is measured. Raises UserError: there is
+    none."""
+    settings = settings_of(folder)
+    cells: dict[Cell, CellNight] = {}
+    for block in lines_of(folder):
+        name, mode, load = block["cell"]
+        cells.setdefault((name, mode, load), CellNight()).add(block)
+    about = settings.pop("contenders", {})
+    rows = [
+        {
+            "policy": settings["policy"], "payload": settings["payload"], "baseline": None,
+            "ratio_to_baseline_p50": None, "rounds_ratio": [], "silent_rounds": 0,
+            **about[cell[0]], **one.row(cell),
+        }
+        for cell, one in cells.items()
+    ]  # fmt: skip
+    return {
+        "format": 1, "bench": "latency", "results": rows, "remarks": [],
+        "environment": settings["environment"], "caveats": settings["caveats"],
+        "seconds": round(sum(one.measured_s for one in cells.values()), 1),
+    }  # fmt: skip
