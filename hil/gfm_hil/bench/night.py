@@ -51,14 +51,18 @@ class Block:
         self.counts += histogram(times_ns)
         self.seconds += seconds
         late = np.flatnonzero(times_ns > self.limit_ns) if self.limit_ns else times_ns[:0]
+        events = times_ns
         if len(late):
-            ends = np.flatnonzero(np.diff(late, append=-1) != 1)
-            self.bursts.update(np.diff(ends, prepend=-1).tolist())
-        top = np.argpartition(times_ns, -min(WORST, len(times_ns)))[-WORST:]
-        places = at + np.cumsum(times_ns)[top] * 1e-9 if not self.limit_ns else (
-            at + top * self.limit_ns * 1e-9
-        )  # fmt: skip
-        found = zip(places.tolist(), (times_ns[top] / 1e3).tolist(), strict=True)
+            last = np.flatnonzero(np.diff(late, append=-1) != 1)
+            self.bursts.update(np.diff(last, prepend=-1).tolist())
+            # a burst is one event, as bad as its worst
+            starts = np.concatenate([[0], last[:-1] + 1])
+            events = times_ns.copy()
+            events[late] = 0
+            events[late[starts]] = np.maximum.reduceat(times_ns[late], starts)
+        top = np.argpartition(events, -min(WORST, len(events)))[-WORST:]
+        since = self.limit_ns * top if self.limit_ns else np.cumsum(times_ns)[top]
+        found = zip((at + 1e-9 * since).tolist(), (events[top] / 1e3).tolist(), strict=True)
         self.worst += [(place, us, cause) for place, us in found]
         self.worst = sorted(self.worst, key=lambda one: -one[1])[:WORST]
 
