@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,7 @@ def _pytest(content: Row, rows: list[Row]) -> str:
         {
             "group": f"{row['mode']}, {row['load']}", "name": _name(row), "fullname": _name(row),
             "params": None, "param": None, "extra_info": {}, "options": {},
-            "stats": dict(_statistics(row)),
+            "stats": _statistics(row),
         }
         for row in rows
     ]  # fmt: skip
@@ -96,20 +96,20 @@ def _pytest(content: Row, rows: list[Row]) -> str:
     }, indent=1) + "\n"  # fmt: skip
 
 
-def _statistics(row: Row) -> Iterator[tuple[str, float]]:
+def _statistics(row: Row) -> dict[str, Any]:
     """In s, from the histogram."""
     at, counts = _middles(row)
     at = at * 1e-9
     mean = float(np.average(at, weights=counts))
     share = np.cumsum(counts) / counts.sum()
     q1, median, q3 = (float(at[np.searchsorted(share, q)]) for q in (0.25, 0.5, 0.75))
-    yield from {
+    return {
         "min": float(at[0]), "max": float(at[-1]), "mean": mean,
         "stddev": float(np.sqrt(np.average((at - mean) ** 2, weights=counts))),
         "rounds": int(counts.sum()), "median": median, "iqr": q3 - q1, "q1": q1, "q3": q3,
         "iqr_outliers": 0, "stddev_outliers": 0, "outliers": "0;0", "ld15iqr": float(at[0]),
         "hd15iqr": float(at[-1]), "ops": 1 / mean, "total": float(at @ counts), "iterations": 1,
-    }.items()  # fmt: skip
+    }  # fmt: skip
 
 
 def _prometheus(content: Row, rows: list[Row]) -> str:

@@ -137,7 +137,7 @@ def _end_with_parent(place: Path) -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])
-    _stop[:] = 1
+    _stop[0] = 1
     time.sleep(_END_S)  # the loops end by themselves
     with suppress(Exception):
         _close()
