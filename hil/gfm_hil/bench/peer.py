@@ -27,18 +27,19 @@ from gfm_hil.controllers import FORMS
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.drive import send_last
+from gfm_hil.engine.drive import part_from, send_last
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import Link, link_kind, link_names
 from gfm_hil.links.base import LinkKind
-from gfm_hil.links.frame import FrameWriter
+from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.links.pump import ported
 from gfm_hil.realtime.priority import ask_for_real_time, own_processor, restore_priority
 from gfm_hil.run.runner import controller_program
 from gfm_hil.scenario import Scenario, check_scenario, write_scenario
 from gfm_plant import plant_sample
 from gfm_runtime.children import end_now, guarded
+from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import STOPPED
 
 ANSWERER = "gfmhil bench answer"
@@ -235,11 +236,12 @@ class _Caller:
         return delays(ours, False, 1e3 * self._ptp_us + error_ns)
 
     def close(self) -> None:
-        """Say goodbye."""
+        """Say goodbye, and wait for the other side's."""
         getattr(self.link, "stop", lambda: None)()
-        writer = FrameWriter("y", len(self._values) > 5)
+        writer = FrameWriter("y", len(self._values) > NY)
         writer.sequence[:] = self._y.sequence
-        send_last(self._good, writer, self._tick, STOPPED, 0, self._values)
+        reader = FrameReader("u", len(self._values) > NY)
+        part_from(self._good, writer, reader, self._tick, STOPPED, 0, self._values)
         self._good.close()
 
 
@@ -327,6 +329,8 @@ def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) 
         thread.join(_LOOK_S)
         stop[0] = interrupt.came
     getattr(link, "stop", lambda: None)()
+    if why[0] == LEFT:  # the bench waits for our last frame
+        send_last(link, FrameWriter("u"), 0, STOPPED, 0, np.zeros(NU))
     return {
         LEFT: "the bench has ended", GONE: "the link is gone", OTHER: "another bench begins",
         SILENT: f"the bench has said nothing for {_SILENCE_NS * 1e-9:g} s", 0: "stopped",

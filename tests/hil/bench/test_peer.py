@@ -60,6 +60,52 @@ def test_both_ways_over_every_link(link, tmp_path, capsys):
         assert row["between"]["n"] == row["n"]
 
 
+_RELAY = """
+import heapq, random, select, socket, sys, time
+port, to = int(sys.argv[1]), int(sys.argv[2])
+near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+near.bind(("127.0.0.1", port)); far.connect(("127.0.0.1", to))
+draw, waiting, home = random.Random(1), [], None
+while True:
+    wait = max(0.0, waiting[0][0] - time.monotonic()) if waiting else 0.5
+    for source in select.select([near, far], [], [], wait)[0]:
+        try:
+            message, sender = source.recvfrom(1000)
+        except OSError:
+            continue
+        now, there = time.monotonic(), source is near
+        home = sender if there else home
+        if len(message) == 64 and draw.random() < 0.01:
+            continue
+        late = (1e-3 if there else 2e-4) + draw.random() * 5e-5
+        heapq.heappush(waiting, (now + late, draw.random(), there, message))
+    while waiting and waiting[0][0] <= time.monotonic():
+        *_, there, message = heapq.heappop(waiting)
+        try:
+            far.send(message) if there else near.sendto(message, home)
+        except OSError:
+            pass
+"""
+
+
+def test_ways_that_differ_through_a_relay(tmp_path, capsys):
+    """1 ms there and 0.2 ms back, 0.05 ms of jitter, 1 % lost."""
+    near, far = free_port(), free_port()
+    with (
+        other_side(sys.executable, "-c", _RELAY, str(near), str(far)),
+        other_side(*GFMHIL, "bench", "answer", f"udp://127.0.0.1:{far}"),
+    ):
+        found = bench(
+            tmp_path, capsys, "latency", "--to", f"udp://127.0.0.1:{near}", "--mode", "lockstep",
+            "--load", "idle", "--seconds", "2",
+        )  # fmt: skip
+    (row,) = [row for row in found["results"] if row["peer"] == "to"]
+    assert row["clock"] == "one clock"
+    assert row["there"]["p50_us"] >= 1000 and row["back"]["p50_us"] >= 200
+    low, high = row["lost_pct_95"]
+    assert low <= 1.0 <= 2 * high  # the relay's draws are the same each time
+
+
 def test_a_program_of_docs_own_controller(tmp_path, capsys):
     endpoint = f"ipc://{tmp_path}/own"
     write_scenario(tmp_path, scenario_of())
