@@ -22,7 +22,7 @@ from gfm_plant.dc_link import discharge
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.period import limit_voltage, take_command
-from gfm_plant.records import N_GATES, PlantRecords
+from gfm_plant.records import COMPARE, N_GATES, PlantRecords
 from gfm_plant.series import (
     DC,
     LARGEST,
@@ -109,6 +109,12 @@ def _count(r: Any, share: float) -> int:
 
 
 @inlined
+def _taken(r: Any, s: Any, x: int) -> int:
+    """Return the compare value of leg x that came with the command that acts."""
+    return int(min(max(s.u_now[COMPARE + x], 0.0), 1.0 * r.counts * (r.levels - 1)))
+
+
+@inlined
 def _along(x: int, z: complex) -> float:
     """Return the part of a space vector along the axis of leg x."""
     return _A[x].real * z.real + _A[x].imag * z.imag
@@ -161,6 +167,8 @@ def _load(plant: PlantRecords, k: int, unit: int) -> None:
     half = turned(0.5 * n.omega_b * s.u_now[1] * n.unit_s)
     E = complex(s.E[0], s.E[1]) * s.ahead * half
     counts = modulate(r, s, E, s.x[V_DC])
+    if not s.u_now[COMPARE] < 0.0:  # those of the controller
+        counts = _taken(r, s, 0), _taken(r, s, 1), _taken(r, s, 2)
     down = n.updates == 2 and unit % 2 == 1  # the second half of the carrier's period
     for x in range(3):
         base = min(counts[x] // r.counts, r.levels - 2)

@@ -20,9 +20,9 @@ from gfm_plant.layout import Record, make_net_and_now
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
-from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Plant, Protection
+from gfm_plant.options import COMMANDS, MEASURED, PHASES, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
-from gfm_plant.records import N_RING, converter_par_dtype, converter_state_dtype
+from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
 from gfm_plant.wiring import ConverterCircuit, Wiring
 from gfm_runtime.signals import SPACE_VECTOR
 
@@ -125,7 +125,7 @@ def _make(
     for k, (name, (options, node)) in enumerate(converters.items()):
         one = par[k : k + 1]
         units.append(_pack_converter_circuit(one, name, node, options, first))
-        _pack_measurement(one, options)
+        _pack_measurement(one, options, T_s)
         one["T_s"], one["delay"] = T_s, options.delay.samples
         one["fraction"] = options.delay.fraction
         _pack_protection(one, options.protection, T_s)
@@ -161,6 +161,8 @@ def _make(
     st["x"][:, V_DC] = 1.0
     now["unit"] = now["sequence"][:, 0] = 1.0
     st["sensed"][:, 0] = 1.0
+    st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
+    st["phase_seen"] = math.nan
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"] = grid_node is not None
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
@@ -316,9 +318,12 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
         ValueError: its times or its timer do not fit.
     """
     bridge, where = options.bridge, f"{where}.bridge"
+    bases = load_converter(options.converter).bases
+    par["leg"] = math.sqrt(2 / 3) * bases.V_dcref / bases.V_n
+    carriers = 1.0 if bridge.carrier_hz is None else bridge.carrier_hz * T_s
+    par["counts"] = max(1, round(bridge.timer_hz * T_s / max(1, round(carriers)) / 2))
     if bridge.kind == "average":
         return
-    carriers = 1.0 if bridge.carrier_hz is None else bridge.carrier_hz * T_s
     if min(abs(carriers - 1), abs(carriers - 2)) > 1e-9:
         raise ValueError(
             f"{where}.carrier_hz = {bridge.carrier_hz:g}: must be {1 / T_s:g} or {2 / T_s:g} Hz, so"
@@ -348,12 +353,10 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
             f"plant.delay.fraction = {options.delay.fraction:g}: compare values are loaded"
             f" {units} times a period, so it must be a multiple of {1 / units:g}"
         )
-    bases = load_converter(options.converter).bases
     par["levels"], par["off"] = LEVELS[bridge.kind]
     par["counts"], par["count_s"] = round(counts), 1 / bridge.timer_hz
     par["dead"] = bridge.dead_time_s
     par["least"] = round(bridge.min_pulse_s / 2 * bridge.timer_hz)
-    par["leg"] = math.sqrt(2 / 3) * bases.V_dcref / bases.V_n
     V, R = bases.V_dcref, bases.base_of("R")
     drops = bridge.V_switch / V, bridge.V_diode / V, bridge.R_switch / R, bridge.R_diode / R
     par["band"] = found = bands(bridge.kind, drops)
@@ -387,7 +390,7 @@ def _pack_units(net: Record, cuts: Sequence[float]) -> None:
     net["unit_part"] = np.searchsorted(cuts, begins + 1e-9, "right") - 1
 
 
-def _pack_measurement(par: Record, options: Plant) -> None:
+def _pack_measurement(par: Record, options: Plant, T_s: float) -> None:
     sensors = options.sensors
     par["filtered"] = sensors.bandwidth_hz is not None
     par["omega_s"] = 2 * math.pi * (sensors.bandwidth_hz or 0.0)
@@ -396,8 +399,31 @@ def _pack_measurement(par: Record, options: Plant) -> None:
     par["noise_std"] = [sensors.noise_std.get(name, 0.0) for name in MEASURED]
     par["noisy"] = any(par["noise_std"][0] > 0.0)
     par["seed"] = sensors.seed
+    _pack_phases(par, options.phases, T_s)
     _pack_converter(par, "adc", options.adc.bits, options.adc.range, MEASURED)
     _pack_converter(par, "dac", options.dac.bits, options.dac.range, COMMANDS)
+
+
+def _pack_phases(par: Record, phases: Phases, T_s: float) -> None:
+    for name, values, default in (
+        ("gain", phases.gain, 1.0), ("offset", phases.offset, 0.0),
+        ("noise", phases.noise_std, 0.0), ("skew", phases.skew_s, 0.0),
+    ):  # fmt: skip
+        par[f"phase_{name}"] = [values.get(channel, default) for channel in PHASES]
+    ends = [phases.ends(channel) for channel in PHASES]
+    par["phase_lo"] = [low for low, _ in ends]
+    par["phase_lsb"] = [(high - low) / 2**phases.bits for low, high in ends]
+    par["phase_top"] = 2**phases.bits - 1
+    par["phase_weights"] = 0.0, 0.0, 1.0
+    if phases.bandwidth_hz is not None:
+        x = 2 * math.pi * phases.bandwidth_hz * T_s
+        mean = -math.expm1(-x) / x
+        par["phase_weights"] = math.exp(-x), mean - math.exp(-x), 1.0 - mean
+    for name, skew in phases.skew_s.items():
+        if not skew < T_s:
+            raise ValueError(
+                f"plant.phases.skew_s.{name} = {skew:g}: must be less than {T_s:g} s, a period"
+            )
 
 
 def _pack_protection(par: Record, protection: Protection, T_s: float) -> None:

@@ -22,7 +22,7 @@ from gfm_plant.period import go_back, keep, length, stretch
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
-from gfm_plant.records import MAX_DELAY, N_COMMANDS, PlantRecords
+from gfm_plant.records import COMPARE, MAX_DELAY, N_COMMANDS, PlantRecords
 from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled, inlined
@@ -223,7 +223,7 @@ def synchronise(plant: PlantRecords, k: int) -> None:
     s.x[V_DC] = s.sensed[0] = 1.0
     s.i_reg = s.i_source = 0.0
     for j in range(N_COMMANDS):
-        s.u_now[j] = 0.0
+        s.u_now[j] = -1.0 if j >= COMPARE else 0.0
     s.u_now[1], s.u_now[2] = s.omega_seen, size
     for age in range(MAX_DELAY + 2):
         for j in range(N_COMMANDS):

@@ -17,7 +17,7 @@ from gfm_plant.components.part import Dynamic, Fed, emf
 from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
-from gfm_plant.records import N_COMMANDS, N_OWN, PlantRecords
+from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, PlantRecords
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
@@ -96,7 +96,8 @@ class Network:
                 its island, p.u.; none if they have no unknowns and turn with the first converter.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
-        u = np.pad(u, ((0, 0), (0, N_COMMANDS - u.shape[1])))
+        u = np.pad(u[:, :COMPARE], ((0, 0), (0, COMPARE - u[:, :COMPARE].shape[1])))
+        told = np.pad(u, ((0, 0), (0, N_COMMANDS - COMPARE)), constant_values=-1.0)
         now, N, wiring = self.now[0], len(self.par), self.wiring
         turn = np.exp(1j * x[:, DELTA])
         now["unit"][:N] = turn
@@ -137,7 +138,7 @@ class Network:
             current = float(self.par[k]["current"])
             w[N_OWN * k : N_OWN * (k + 1)] = i_f / current, v, i_o / current
         now["w"][: len(order)] = w
-        plant_start(self.records, x, u)
+        plant_start(self.records, x, told)
 
     def rewire(self, wiring: Wiring) -> None:
         """Go on from the present state with another wiring.

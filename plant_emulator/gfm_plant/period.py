@@ -20,7 +20,8 @@ from gfm_plant.components import (
 from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
-from gfm_plant.records import N_COMMANDS, PlantRecords
+from gfm_plant.phases import apply_counts
+from gfm_plant.records import COMPARE, N_COMMANDS, PlantRecords
 from gfm_plant.solution import (
     I_F,
     I_O,
@@ -165,6 +166,11 @@ def take_command(plant: PlantRecords, k: int, part: int) -> None:
     if s.trip == 0:
         for j in range(N_COMMANDS):
             s.u_now[j] = s.u[field(n, "age")[part, k], j]
+        if n.n_units == 0 and not s.u_now[COMPARE] < 0.0:
+            begin = 0.0
+            for before in range(part):
+                begin += field(n, "stretch")[before]
+            apply_counts(plant, k, begin, field(n, "stretch")[part])
     else:
         s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`
 

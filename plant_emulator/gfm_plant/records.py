@@ -17,7 +17,9 @@ from gfm_plant.layout import Record as Record
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o
-N_MEASURED, N_COMMANDS = 10, 4  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
+N_MEASURED, N_COMMANDS = 10, 7  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
+COMPARE = 4  # place of the compare values in a command, below 0: it has none
+N_PHASES = 10  # channels of the A/D at the phases, in the order of the group ``adc``
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_GATES = 6  # states of the gates of a leg, at most, see `bridge`
@@ -100,6 +102,17 @@ converter_par_dtype = np.dtype(
         ("adc_lo", "f8", (N_MEASURED,)),
         ("adc_hi", "f8", (N_MEASURED,)),
         ("adc_lsb", "f8", (N_MEASURED,)),
+        # sensors and A/D at the phases, see `phases`, one entry a channel: s by which it samples
+        # before the tick; value of the lowest code and of a step; the highest code; weights of the
+        # sensor's low-pass in a period
+        ("phase_gain", "f8", (N_PHASES,)),
+        ("phase_offset", "f8", (N_PHASES,)),
+        ("phase_noise", "f8", (N_PHASES,)),
+        ("phase_skew", "f8", (N_PHASES,)),
+        ("phase_lo", "f8", (N_PHASES,)),
+        ("phase_lsb", "f8", (N_PHASES,)),
+        ("phase_top", "f8"),
+        ("phase_weights", "f8", (3,)),
         # D/A, one entry a command
         ("dac_lo", "f8", (N_COMMANDS,)),
         ("dac_hi", "f8", (N_COMMANDS,)),
@@ -135,6 +148,8 @@ converter_state_dtype = np.dtype(
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
+        # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
+        ("phase_seen", "f8", (2, N_PHASES)),
         # in a piece of time: power that the bridge draws, and what the sensors see, at its
         # beginning, middle and end; the command's voltage and the largest that v_dc gives
         ("drawn", "f8", (3,)),

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussians
+from gfm_plant.phases import sample_phases
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecords
 from gfm_runtime.compiled import compiled, inlined
-from gfm_runtime.signals import NY
+from gfm_runtime.signals import NY, NY_INNER
 
 
 @inlined
@@ -21,7 +22,8 @@ def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
     p.u. of the converter.
 
     omega_u is the command that acts at this instant, without error. A y of (11,) gets the currents
-    and voltages of an inner stage besides, (i_d, i_q, v_d, v_q, i_od, i_oq), which pass no filter.
+    and voltages of an inner stage besides, (i_d, i_q, v_d, v_q, i_od, i_oq), which pass no filter;
+    one of (21,) the counts of the A/D at the phases too.
     """
     r, s = plant.par[k], plant.st[k]
     if r.filtered:
@@ -45,6 +47,8 @@ def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
                 n_0, n_1 = gaussians(r.seed, s.tick, 2 + j // 2)
             y[NY + j] = _measure(r, 4 + j, s.x[j], n_0)
             y[NY + j + 1] = _measure(r, 5 + j, s.x[j + 1], n_1)
+    if len(y) > NY_INNER:
+        sample_phases(plant, k, y, NY_INNER)
 
 
 @compiled

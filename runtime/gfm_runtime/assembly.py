@@ -19,11 +19,23 @@ from gfm_runtime.controller import (
     missed,
     set_reference,
 )
+from gfm_runtime.counts import begin_counts
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
 from gfm_runtime.inner import settle
 from gfm_runtime.kernel import pack_law, state_dtype
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, REF_NAMES
+from gfm_runtime.signals import (
+    COUNTS,
+    INNER,
+    NU,
+    NU_COUNTS,
+    NU_INNER,
+    NY,
+    NY_COUNTS,
+    NY_INNER,
+    PLAIN,
+    REF_NAMES,
+)
 from gfm_runtime.states import OK, READY, RUNNING, STATES
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
@@ -39,8 +51,9 @@ class Controller:
 
     ``asked`` is what the law that was requested last is asked for by, and ``gains`` are its gains
     that differ from its file. ``names`` and ``changed`` are the same for every entry of ``laws``;
-    ``labels`` are their names in reports, ``titles`` those of ``sets``. ``inner`` says whether one
-    of the laws has an inner stage; y and u then have its signals too, whichever law is active.
+    ``labels`` are their names in reports, ``titles`` those of ``sets``. ``inner`` says what y and u
+    have besides, whichever law is active: ``PLAIN`` nothing, ``INNER`` the signals of an inner
+    stage, ``COUNTS`` also those of laws that measure and modulate.
 
     Args:
         sets: the laws that may become active, each asked for by its ``asked``; the first starts.
@@ -51,7 +64,8 @@ class Controller:
         omega_b: base frequency of the converter, rad/s, for the estimate of the grid's reactance.
 
     Raises:
-        LawError: a law that does not discretise at T_s.
+        LawError: a law that does not discretise at T_s, or some of the laws, but not all, measure
+            and modulate.
     """
 
     def __init__(
@@ -85,7 +99,14 @@ class Controller:
         self.labels += [f"other gains {k + 1}" for k in range(SPARE)]
         self.laws = np.concatenate([pack_law(d, real, omega_b) for d in self.discrete])
         self.states = np.zeros(len(self.laws), state_dtype(real))
-        self.inner = any(d.law.inner is not None for d in self.discrete)
+        self.inner = INNER if any(d.law.inner is not None for d in self.discrete) else PLAIN
+        counts = [d.law.counts is not None for d in self.discrete]
+        if all(counts):
+            self.inner = COUNTS
+        elif any(counts):
+            without = self.labels[counts.index(False)]
+            why = "has no [measure] and [modulate], which others have; give the scenario counts"
+            raise LawError(f"law {without}", why)
         self.ctl = make_controller(hold)
         self.ctl["ref"] = self.ctl["ref_target"] = np.asarray(references, dtype=float)
         self.est = make_impedance(T_s, 1.0, omega_b)
@@ -167,12 +188,14 @@ class Controller:
         u: NDArray[Any],
         y: NDArray[Any] | None = None,
         e: complex | None = None,
+        angle: complex = 1.0,
     ) -> None:
         """Go from READY to RUNNING, at rest.
 
         Args:
             x_law, u: the active law's state (n,) and output (3,), p.u.
             y, e: with an inner stage: measurements (11,) and the bridge's voltage e_d + j e_q, p.u.
+            angle: for a law that measures itself: the unit phasor of its frame.
 
         Raises:
             LawError: the controller is not READY; SAFE is latched until ``reset``.
@@ -188,6 +211,7 @@ class Controller:
         if y is not None and e is not None:
             settle(self.laws[k : k + 1], self.states[k : k + 1], np.asarray(u), y, e.real, e.imag)
             self.ctl["out"] = [u[0], u[1], e.real, e.imag]
+            begin_counts(self.states[k], y, angle)
         self.ctl["state"] = RUNNING
 
     def reset(self) -> None:
@@ -197,7 +221,7 @@ class Controller:
 
     def step(self, y: NDArray[np.float64], u: NDArray[np.float64]) -> None:
         """One tick from Python: y (5,) in, u (3,) in and out, p.u.; (11,) and (4,) with an inner
-        stage."""
+        stage, (21,) and (7,) with counts."""
         control(self.ctl, self.laws, self.states, self.est, y, u)
 
 
@@ -206,7 +230,8 @@ def warm_up(controller: Controller) -> None:
     ctl, states = controller.ctl.copy(), controller.states.copy()
     ctl["state"], ctl["request"] = RUNNING, ctl["active"]
     follow_plant(ctl, False)
-    for n_y, n_u in ((NY, NU), (NY_INNER, NU_INNER))[: 1 + controller.inner]:
+    sizes = (NY, NU), (NY_INNER, NU_INNER), (NY_COUNTS, NU_COUNTS)
+    for n_y, n_u in sizes[: 1 + controller.inner]:
         y, u = np.ones(n_y), np.ones(n_u)
         control(ctl, controller.laws, states, controller.est.copy(), y, u)
     missed(ctl)

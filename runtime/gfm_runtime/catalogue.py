@@ -10,11 +10,12 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
+from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import LawError, meant
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import BuiltLaw
@@ -31,6 +32,7 @@ class LawSet:
     schedule: Schedule | None = None  #: None, or the limits of the stages
     #: the inner stage that replaces the law file's own, by name or path; None: its own
     inner: str | None = None
+    counts: str | None = None  #: likewise, measurement and modulation
     asked: str = ""  #: the name or path by which it is asked for; its name if empty
 
 
@@ -107,11 +109,14 @@ def law_file(name: str) -> LawFile:
     raise LawError(f"law {name!r}", f"unknown{close or ';'} use a .toml file or {known}")
 
 
-def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
+def load_law(
+    name: str, inner: str | None = None, counts: str | None = None, **changed: float
+) -> LawSet:
     """A law by catalogue name or path, with parameters changed by name if wanted.
 
     Args:
         inner: an inner stage in place of the file's own: a shipped name, a file, or ``none``.
+        counts: measurement and modulation in place of the file's own, likewise.
         changed: values of parameters.
 
     Raises:
@@ -126,9 +131,11 @@ def load_law(name: str, inner: str | None = None, **changed: float) -> LawSet:
         laws = tuple(build_law(file, parameters) for parameters in sets)
     except LawError as problem:
         raise problem.within(f"law {'file ' * name.endswith('.toml')}{name}") from None
-    return LawSet(file.name, laws, file.schedule, inner, name)
+    if counts is not None:
+        laws = tuple(replace(law, counts=named_counts(counts)) for law in laws)
+    return LawSet(file.name, laws, file.schedule, inner, counts, name)
 
 
 def get_law(name: str, **changed: float) -> BuiltLaw:
     """A single law; of a gain-scheduled one, the first stage."""
-    return load_law(name, None, **changed).laws[0]
+    return load_law(name, None, None, **changed).laws[0]

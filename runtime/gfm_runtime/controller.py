@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.counts import align, go_on_with, measure, modulate
 from gfm_runtime.impedance import estimate
 from gfm_runtime.inner import settle_inner, take_measurements
 from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
-from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
+from gfm_runtime.signals import N_LEGS, NU, NU_INNER, NY, NY_INNER, group
+from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
 from gfm_runtime.switchover import change_law, settle_into
 
 MAX_STAGES = 8
@@ -31,11 +32,13 @@ controller_dtype = np.dtype(
     [
         ("state", "i8"),
         ("reason", "i8"),
-        ("channel", "i8"),  # which y or u was bad
+        ("channel", "i8"),  # which y, u or sensor was bad
         ("active", "i8"),  # index into the laws
         ("request", "i8"),  # index to change to at the next tick, or -1
         ("changes", "i8"),
         ("joins", "i8"),  # the first tick in RUNNING begins with what is measured, see ``measured``
+        # likewise, with laws that measure: their frame takes its angle from the measured voltage
+        ("aligns", "i8"),
         ("bump", "f8"),  # of the last change, p.u.
         ("stale", "i8"),  # ticks in a row without a fresh y
         ("hold", "i8"),  # how many of them are allowed
@@ -206,13 +209,29 @@ def control(ctl, laws, states, est, y, u):
     Args:
         ctl, est: one-element arrays of ``controller_dtype`` and ``impedance_dtype``.
         laws, states: arrays of ``law_dtype`` and ``state_dtype``, one element a law.
-        y: measurements, shape (5,), or (11,) with an inner stage, p.u.
-        u: output, u[k], shape (3,), or (4,) with an inner stage, p.u. Unchanged in SAFE.
+        y: measurements, shape (5,), or (11,) with an inner stage, p.u.; (21,) for laws that measure
+            themselves, from the counts at its end.
+        u: output, u[k], shape (3,), or (4,) with an inner stage, p.u.; (7,) for laws that modulate
+            too, with compare counts at its end. Unchanged in SAFE.
     """
     c = ctl[0]
-    if c.state != RUNNING or not accept(c, y):
+    if c.state != RUNNING:
         return
-    inner = len(y) > NY
+    inner, counts = len(y) > NY, len(y) > NY_INNER
+    if counts:
+        if c.aligns:
+            c.aligns = 0
+            if c.joins:
+                states[c.active].sensed[7], states[c.active].sensed[8] = 1.0, 0.0
+            align(laws[c.active], states[c.active], y, NY_INNER)
+        measure(laws[c.active], states[c.active], y, NY_INNER)
+        if states[c.active].suspect >= 0:
+            _go_safe(c, BAD_SENSOR, states[c.active].suspect)
+            return
+        if not accept(c, states[c.active].sensed):
+            return
+    elif not accept(c, y):
+        return
     if c.joins:
         c.joins = 0
         _join(laws[c.active], states[c.active], c, inner)
@@ -222,6 +241,8 @@ def control(ctl, laws, states, est, y, u):
         if inner:
             take_measurements(states[k], c.y)
             settle_inner(laws[k], states[k], c.out[2], c.out[3])
+        if counts:
+            go_on_with(states[k], states[c.active])
         c.active, c.changes = k, c.changes + 1
     if inner:
         look_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
@@ -234,6 +255,10 @@ def control(ctl, laws, states, est, y, u):
             c.u[i] = states[c.active].u[i]  # the law's own
         for i in range(NU_INNER):
             u[i] = c.out[i]
+        if counts:
+            modulate(laws[c.active], states[c.active])
+            for x in range(N_LEGS):
+                u[NU_INNER + x] = int(states[c.active].compare[x])
         return
     look(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.compiled import inlined
+from gfm_runtime.counts import COUNTS_NUMBERS, counts_fields, counts_state_fields, pack_counts
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.errors import LawError
 from gfm_runtime.inner import (
@@ -44,6 +45,7 @@ def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("error_map", "i8"),
             ("row", "i8", (N_MAX,)),  # of u that each state belongs to
             *INNER_NUMBERS,
+            *COUNTS_NUMBERS,
             ("error_parameters", f, (2,)),
             ("A", f, (N_MAX, N_MAX)),
             ("B_r", f, (N_MAX, NY)),
@@ -64,6 +66,7 @@ def law_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("F", f, (N_MAX, NU)),
             ("G", f, (N_MAX, NU)),
             *inner_fields(f),
+            *counts_fields(f),
         ],
         align=True,
     )
@@ -86,6 +89,7 @@ def state_dtype(real: DTypeLike = np.float64) -> np.dtype[Any]:
             ("trend", f, (NU,)),  # filtered u[k] - u[k-1]
             ("ref", f, (NY,)),  # references of this tick as given, for a u_0 that follows one
             *inner_state_fields(f),
+            *counts_state_fields(f),
         ],
         align=True,
     )
@@ -98,10 +102,11 @@ def pack_law(
     """A discrete law as a one-element array of ``law_dtype``.
 
     Args:
-        omega_b: base frequency of the converter, rad/s, for the inner stage.
+        omega_b: base frequency of the converter, rad/s, for the inner stage and for counts.
 
     Raises:
-        LawError: more states than the kernel holds, a number that overflows ``real``.
+        LawError: more states than the kernel holds, a number that overflows ``real``, or a timer
+            that does not fit T_s.
     """
     n, law = discrete.order, discrete.law
     if n > N_MAX:
@@ -119,6 +124,7 @@ def pack_law(
     rec["low"], rec["high"] = law.limits.low, law.limits.high
     rec["row"][:n] = discrete.rows
     pack_inner(law.inner, rec, discrete.T_s, omega_b)
+    pack_counts(law.counts, rec, discrete.T_s, omega_b)
     rec["decay"] = np.exp(-discrete.T_s / law.limits.T_off)
     rec["follow"] = -np.expm1(-discrete.T_s / TREND_TIME)
     for name in ("A", "B_r", "B_y", "C", "D_r", "D_y", "u_0", "W", "E_r", "E_y", "F", "G"):

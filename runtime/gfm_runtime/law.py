@@ -17,6 +17,7 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
+from gfm_runtime.counts import Counts
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element
 from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.inner import InnerStage
@@ -108,6 +109,8 @@ class BuiltLaw:
     home_grid: HomeGrid = field(default_factory=HomeGrid)  #: grid on which the defaults are stable
     #: the inner stage between the law and the bridge; None: the bridge produces E_u
     inner: InnerStage | None = None
+    #: how it measures and modulates; None: its y and u are in p.u.
+    counts: Counts | None = None
 
     def __post_init__(self) -> None:
         mistakes = Mistakes()

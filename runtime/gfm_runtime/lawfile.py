@@ -12,9 +12,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from gfm_runtime import elements
+from gfm_runtime.counts import Counts, Measure, Modulate
 from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, WITH_IMPEDANCE
 from gfm_runtime.errors import LawError, Mistakes, allowed, meant
@@ -115,6 +116,20 @@ def _base_or_whole(schema: dict[str, Any]) -> None:
 class LawFile(TomlTable):
     """The whole file; ``parse_law`` has put the content of its ``base`` into it."""
 
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> LawFile:
+        if (self.measure is None) != (self.modulate is None):
+            lacks = "measure" if self.measure is None else "modulate"
+            raise ValueError(f"{lacks}: missing; [measure] and [modulate] go together")
+        return self
+
+    @property
+    def counts(self) -> Counts | None:
+        """Both of them, if it has them."""
+        if self.measure is None or self.modulate is None:
+            return None
+        return Counts(measure=self.measure, modulate=self.modulate)
+
     model_config = ConfigDict(json_schema_extra=_base_or_whole)
 
     base: str | None = Field(
@@ -141,6 +156,12 @@ class LawFile(TomlTable):
     )
     limits: Limits = Field(Limits(), description="clamps of u, anti-windup")
     home_grid: HomeGrid = Field(HomeGrid(), description="where the defaults are meant to be used")
+    measure: Measure | None = Field(
+        None, description="from counts of an A/D to y; goes with modulate"
+    )
+    modulate: Modulate | None = Field(
+        None, description="from u to compare counts; goes with measure"
+    )
     inner: Annotated[
         Inner | None, BeforeValidator(_stage, json_schema_input_type=Inner | str | None)
     ] = Field(
@@ -242,6 +263,7 @@ def build_law(file: LawFile, changed: Mapping[str, float] | None = None) -> Buil
             parameters=parameters,
             home_grid=file.home_grid,
             inner=inner,
+            counts=file.counts,
         )
     mistakes.check()
     assert law is not None

@@ -8,7 +8,10 @@ within a group is the order of the vectors everywhere:
 * ``ref`` = (V_dcref, P_ref, omega_g, Q_ref, V_ref), the references Y_ref (Eq. (17)),
 * ``d``   = (omega_g, V_g), the grid seen as disturbance (Eq. (15)),
 * ``y_inner`` and ``u_inner``: what a run with an inner stage (``gfm_runtime.inner``) measures and
-  commands besides, at the end of y and u; E_u is then the d component of the bridge's voltage.
+  commands besides, at the end of y and u; E_u is then the d component of the bridge's voltage,
+* ``adc`` and ``compare``: what the pins of a processor see besides, at the end of y and u of a run
+  whose laws measure and modulate themselves (``gfm_runtime.counts``). Such a law computes its own
+  y from the counts; what y has before them is for the recording alone.
 
 Add signals at the end of a group only; anything else is a new ``TABLE_VERSION``, which both
 sides of a link compare before they start.
@@ -21,9 +24,9 @@ import math
 from dataclasses import astuple, dataclass, replace
 from typing import Literal
 
-TABLE_VERSION = 2
+TABLE_VERSION = 3
 
-Group = Literal["y", "u", "y_inner", "u_inner", "ref", "d"]
+Group = Literal["y", "u", "y_inner", "u_inner", "adc", "compare", "ref", "d"]
 Vector = Literal["y", "u"]
 
 
@@ -71,6 +74,22 @@ SIGNALS: tuple[Signal, ...] = (
            "current of the line, q"),
     Signal("u_inner", "E_q", "E_q", "p.u.", "V_n", 1e-4, -3.0, 3.0, 0.0,
            "q component of the bridge's voltage"),
+    *(
+        Signal("adc", f"adc_{name}", f"n_{{{name}}}", "counts", "1", 1.0, 0.0, 65535.0, 0.0,
+               f"A/D's reading of {what}")
+        for name, what in {
+            "v_dc": "the DC voltage",
+            **{f"{x}_{leg}": f"{what}, phase {leg}" for x, what in {
+                "i": "the current of L_f", "v": "the voltage of C_f",
+                "i_o": "the current of the line",
+            }.items() for leg in "abc"},
+        }.items()
+    ),
+    *(
+        Signal("compare", f"cmp_{leg}", f"m_{leg}", "counts", "1", 1.0, 0.0, 65535.0, 0.0,
+               f"compare value of leg {leg}: how long it is above, of half a carrier")
+        for leg in "abc"
+    ),
 )  # fmt: skip
 
 SPACE_VECTOR = 1 / math.sqrt(2)
@@ -80,6 +99,11 @@ line-to-line RMS is sqrt(3/2) times the phase amplitude."""
 
 NY, NU = 5, 3  # of Phi
 NY_INNER, NU_INNER = 11, 4  # of a run with an inner stage
+N_ADC, N_LEGS = 10, 3
+NY_COUNTS, NU_COUNTS = NY_INNER + N_ADC, NU_INNER + N_LEGS  # of one that measures and modulates
+
+#: what a run exchanges beside y and u of Phi: nothing, the signals of an inner stage, and counts
+PLAIN, INNER, COUNTS = range(3)
 
 
 def group(name: Group) -> tuple[Signal, ...]:
@@ -95,20 +119,21 @@ def names(name: Group) -> tuple[str, ...]:
 Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), names("d")
 
 
-def carried_rows(vector: Vector, inner: bool) -> tuple[Signal, ...]:
-    """What a run exchanges: y or u, and with an inner stage its signals after them."""
-    more: Group = "y_inner" if vector == "y" else "u_inner"
-    return group(vector) + (group(more) if inner else ())
+def carried_rows(vector: Vector, inner: int) -> tuple[Signal, ...]:
+    """What a run exchanges: y or u, and after them the signals of an inner stage and counts;
+    ``inner``: ``PLAIN``, ``INNER`` or ``COUNTS``."""
+    more: tuple[Group, Group] = ("y_inner", "adc") if vector == "y" else ("u_inner", "compare")
+    return group(vector) + tuple(row for name in more[:inner] for row in group(name))
 
 
-def carried(vector: Vector, inner: bool) -> tuple[str, ...]:
+def carried(vector: Vector, inner: int) -> tuple[str, ...]:
     """The names of ``carried_rows``."""
     return tuple(s.name for s in carried_rows(vector, inner))
 
 
-def command_rows(inner: bool) -> tuple[Signal, ...]:
+def command_rows(inner: int) -> tuple[Signal, ...]:
     """u as firmware and models have it: with an inner stage the third is the bridge's e_d."""
-    i_u, omega_u, E, *E_q = carried_rows("u", inner)
+    i_u, omega_u, E, *E_q = carried_rows("u", min(inner, INNER))
     if E_q:
         text = E_q[0].description.replace("q component", "d component")
         E = replace(E_q[0], name="E_d", symbol="E_d", default=E.default, description=text)

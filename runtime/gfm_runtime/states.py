@@ -5,7 +5,7 @@ from __future__ import annotations
 INIT, READY, RUNNING, SAFE, STOPPED = range(5)
 STATES = ("INIT", "READY", "RUNNING", "SAFE", "STOPPED")
 
-OK, BAD_Y, BAD_U, STALE, LOST_PEER, PLANT_TRIP, OPERATOR = range(7)
+OK, BAD_Y, BAD_U, STALE, LOST_PEER, PLANT_TRIP, OPERATOR, BAD_SENSOR = range(8)
 REASONS = (
     "",
     "a measurement is not finite or out of range",
@@ -14,4 +14,5 @@ REASONS = (
     "the plant's process is gone",
     "the plant's protection tripped",
     "stopped by the operator",
+    "a sensor is not plausible",
 )

@@ -263,7 +263,7 @@ def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -
     """Run scenarios of different laws, each in a folder; an interruption ends all."""
     first = next(iter(scenarios.values()))
     run_folder.check_free(
-        folder, first.ticks * len(scenarios), first.has_inner, first.optional_signals
+        folder, first.ticks * len(scenarios), first.carries, first.optional_signals
     )
     runs: dict[str, Run] = {}
     for name, one in scenarios.items():

@@ -42,6 +42,7 @@ OPTIONS = {
     "seed": "--seed",
     "law": "--law",
     "inner": "--inner",
+    "counts": "--counts",
     "waveforms": "--waveforms",
 }
 
@@ -62,6 +63,7 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument("--duration", type=float, metavar="S", help="override duration, s")
     add_inner(command)
+    add_counts(command)
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
 
 
@@ -69,6 +71,12 @@ def add_inner(command: argparse.ArgumentParser) -> None:
     """The option that gives every law an inner stage."""
     said = "inner stage: a shipped name (gfmhil laws), a file, or none; by default each law's own"
     command.add_argument("--inner", metavar="NAME", help=said)
+
+
+def add_counts(command: argparse.ArgumentParser) -> None:
+    """The option that has every law measure and modulate."""
+    said = "measurement and modulation of every law: a shipped name (rig), a file, or none"
+    command.add_argument("--counts", metavar="NAME", help=said)
 
 
 def add_map(command: argparse.ArgumentParser, option: str) -> None:
@@ -141,6 +149,7 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
         duration=options.duration,
         seed=options.seed,
         inner=options.inner,
+        counts=options.counts,
         **{f"link__options__{key}": value for key, value in options.option},
         **more,
     )

@@ -43,7 +43,7 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _budgets(T_s: float, inner: bool) -> Table:
+def _budgets(T_s: float, inner: int) -> Table:
     """Longest frames of y and u by bit rate, and the exchange that fits; ``inner``: in a run with
     an inner stage."""
     from gfm_hil.links.can import CanOptions

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
@@ -102,6 +102,7 @@ def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
+    add_counts(command)
     _add_how(command, reals)
 
 
@@ -118,7 +119,7 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
 
 
 def call_export(options: argparse.Namespace) -> int:
-    sets = _sets(options.laws, options.inner)
+    sets = _sets(options.laws, options.inner, options.counts)
     scheduled = [one for one in sets if one.schedule is not None]
     if ALL in options.laws and options.real == FIXED and scheduled:
         sets = [one for one in sets if one.schedule is None]
@@ -181,7 +182,7 @@ def call_a2l(options: argparse.Namespace) -> int:
 
 
 def call_golden(options: argparse.Namespace) -> int:
-    laws, omega_b = _laws(_sets(options.laws, options.inner)), _omega_b(options.f_n)
+    laws, omega_b = _laws(_sets(options.laws, options.inner, options.counts)), _omega_b(options.f_n)
     modules = make_modules(laws, options.T_s, options.real, omega_b)
     text = golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
@@ -219,10 +220,11 @@ def call_check(options: argparse.Namespace) -> int:
     return EXIT_OTHERWISE if any(result.differ for result in results) else 0
 
 
-def _sets(names: Sequence[str], inner: str | None) -> list[LawSet]:
-    """The laws of these names, with an inner stage in place of their own."""
+def _sets(names: Sequence[str], inner: str | None, counts: str | None) -> list[LawSet]:
+    """The laws of these names, with an inner stage, and measurement and modulation, in place of
+    their own."""
     given = (name for one in names for name in (law_names() if one == ALL else [one]))
-    return [load_law(name, inner) for name in given]
+    return [load_law(name, inner, counts) for name in given]
 
 
 def _laws(sets: Sequence[LawSet]) -> dict[str, BuiltLaw]:

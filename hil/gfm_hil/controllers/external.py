@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gfm_hil.controllers.ports import PortWiring, Vector
 from gfm_hil.core.errors import UserError
 from gfm_plant import Bases
+from gfm_runtime.signals import COUNTS
 
 if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
@@ -34,7 +35,7 @@ class BenchContext:
     """
 
     T_s: float = 1e-4
-    inner: bool = False
+    inner: int = False
     bases: Bases = field(default_factory=Bases)
     delay: float = 0.0
 
@@ -120,10 +121,15 @@ def refuse_source(text: str) -> None:
         )
 
 
-def check_currents(text: str, inner: bool) -> None:
-    """Check that a run, with an inner stage or without, carries what a library in C measures.
-    Raises UserError: ``text`` is ``c:FILE``, and the run has no inner stage."""
+def check_currents(text: str, inner: int) -> None:
+    """Check that a run carries what a controller takes, see ``Scenario.carries``. Raises UserError:
+    the run has counts; or ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
+    if inner == COUNTS:
+        raise UserError(
+            f"controller {text}: takes y in p.u., and the scenario's laws measure and modulate"
+            " themselves; set counts = 'none'"
+        )
     if text.startswith("c:") and not inner:
         raise UserError(
             f"controller {text}: measures currents, which only a run with an inner stage carries: "

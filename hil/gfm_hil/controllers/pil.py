@@ -85,7 +85,7 @@ class PilController(ExternalController):
         #: law of the program by its numbers
         self._places = {_numbers(record): k for k, (_, record) in enumerate(ready)}
         modules = [
-            Module(f"{k} {discrete.law.name}", discrete.law, record, controller.inner)
+            Module(f"{k} {discrete.law.name}", discrete.law, record, controller.inner > 0)
             for k, (discrete, record) in enumerate(ready)
         ]
         try:

@@ -110,7 +110,7 @@ class PortWiring(NamedTuple):
 
 
 def wire(
-    where: str, ports: PortMap, inputs: Sequence[str], outputs: Sequence[str], inner: bool
+    where: str, ports: PortMap, inputs: Sequence[str], outputs: Sequence[str], inner: int
 ) -> PortWiring:
     """Map a controller's ports, which are in its order, to the signals of a run. Raises UserError:
     a port or a signal that is not there, a port without a signal, or a signal of u that comes from

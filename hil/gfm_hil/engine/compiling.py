@@ -79,7 +79,7 @@ def compiled_benches(
     else:
         sets += [_role(role, found) for role in roles]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
-        sets += [_link(link.type, link.options, scenario.has_inner) for link in links.values()]
+        sets += [_link(link.type, link.options, scenario.carries) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
             sets.append(("the link's impairment", impaired.warm_up))
         if scenario.mode == "realtime":
@@ -151,7 +151,7 @@ def _role(role: Role, found: list[Bench], which: str = "") -> Set:
     return f"the {role}{which}", compile_it
 
 
-def _link(name: str, options: dict[str, Any], inner: bool = False) -> Set:
+def _link(name: str, options: dict[str, Any], inner: int = False) -> Set:
     kind = link_kind(name)
     checked = kind.options.model_validate(options).of_run(inner)
     return f"the link {name}", lambda: kind.warm_up(checked)

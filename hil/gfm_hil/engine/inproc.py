@@ -184,7 +184,7 @@ def run_inproc(
 
 
 def rows(
-    converters: int, ticks: int, inner: bool, options: tuple[str, ...]
+    converters: int, ticks: int, inner: int, options: tuple[str, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Room for what the loop records: of the plant and of the controllers, each of shape
     (converters, ticks, columns)."""

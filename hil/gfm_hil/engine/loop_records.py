@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gfm_hil.core.roles import Role
 from gfm_hil.links.frame import LAST_TIMES, LONGEST_JUMP, FrameReader
 from gfm_hil.scenario import Scenario
-from gfm_runtime.signals import NU_INNER, NY_INNER
+from gfm_runtime.signals import NU_COUNTS, NY_COUNTS
 from gfm_runtime.states import RUNNING, STOPPED
 
 
@@ -47,7 +47,7 @@ loop_dtype = np.dtype(
         ("left", "i8"),  # controller, every > 1: the plant has left after tick ``received``
         ("ahead", "i8"),  # plant, every > 1: tick of the newest u, -1 before the first
         ("acting", "i8"),  # plant, every > 1: tick of the u that acts, -1 before the first
-        ("u_ahead", "f8", (NU_INNER,)),
+        ("u_ahead", "f8", (NU_COUNTS,)),
         ("t0", "i8"),  # of tick 0, ns
         ("T", "i8"),  # sampling time, ns
         ("patience", "i8"),  # silence after which the other side is gone, ns
@@ -69,8 +69,8 @@ loop_dtype = np.dtype(
         ("unseen", "i8"),  # plant: the tick whose u arrives at the next reading of the clock
         ("lost", "f8"),  # plant: the trip after which it waits for the controller no more, or 0
         ("seen", "i8"),  # controller: the state with which it last returned
-        ("u_last", "f8", (NU_INNER,)),  # the two newest u that came in time
-        ("u_before", "f8", (NU_INNER,)),
+        ("u_last", "f8", (NU_COUNTS,)),  # the two newest u that came in time
+        ("u_before", "f8", (NU_COUNTS,)),
         ("phase", "f8"),  # controller: earliest arrivals of frames after t0 + k T, ns
     ],
     align=True,
@@ -104,7 +104,7 @@ class Records(NamedTuple):
         loop: one element of ``loop_dtype``.
         flags: shape (FLAGS,), int64, written by other threads.
         y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
-            stage, p.u.
+            stage, (21,) and (7,) with counts; p.u. and counts.
         rows, times, progress: of the recording's part.
         plan, kept: of the trace that is replayed, see ``gfm_hil.engine.replay``.
     """
@@ -146,7 +146,7 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int, hold: int, every: int =
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
     loop["survives_trip"], loop["others"] = scenario.survives_trips, scenario.network is not None
-    loop["every"], loop["at_once"] = every, NY_INNER if every == 1 else 0
+    loop["every"], loop["at_once"] = every, NY_COUNTS if every == 1 else 0
     loop["received"], loop["ahead"], loop["acting"] = tick, -1, -1
     loop["seen"], loop["unseen"] = RUNNING, -1
     loop["hold"], loop["extrapolate"] = hold, scenario.late_policy.extrapolate
@@ -185,4 +185,4 @@ def limited_reader(role: Role, scenario: Scenario, hold: int = 0, every: int = 1
         limits["behind"] = hold + (2 * every - 1 if every > 1 else 0)
     if scenario.survives_trips:
         limits["leaving"] = STOPPED
-    return FrameReader("u" if plant else "y", scenario.has_inner, **limits)
+    return FrameReader("u" if plant else "y", scenario.carries, **limits)

@@ -18,10 +18,11 @@ from gfm_hil.engine.replay import Trace, no_trace, trace_of
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
+from gfm_plant.model import DELTA
 from gfm_plant.names import MAY_START
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import NY, NY_INNER, REF_NAMES, carried
+from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
 ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
@@ -52,8 +53,8 @@ class Bench:
     trace: Trace = field(default_factory=no_trace)
 
     @property
-    def inner(self) -> bool:
-        """Whether frames and recording carry the signals of an inner stage."""
+    def inner(self) -> int:
+        """What frames and recording carry, see ``Scenario.carries``."""
         return self.controller.inner
 
     @property
@@ -72,7 +73,7 @@ class Bench:
     def restore_plant(self, tick: int) -> None:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
         self.plant.restore(self._plant)
-        self.plant.st["tick"], self.u[:] = tick, self.start.commands[: len(self.u)]
+        self.plant.st["tick"], self.u[:] = tick, _commands(self.start, self.inner)
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -88,7 +89,16 @@ class Bench:
         c.asked, c.gains = self._asked, {}
         c.ctl["state"], c.ctl["changes"] = READY, changes
         c.ctl["joins"] = self.plant.net["joins"]
-        self.u[:] = self.start.commands[: len(self.u)]
+        c.ctl["aligns"] = self.inner == COUNTS
+        self.u[:] = _commands(self.start, self.inner)
+
+
+def _commands(start: OperatingPoint, inner: int) -> NDArray[np.float64]:
+    """u at rest; without compare values, so that the plant's own modulator gives them until the
+    controller does."""
+    u = np.full(len(carried("u", inner)), -1.0)
+    u[:NU_INNER] = start.commands[: len(u)]
+    return u
 
 
 def follow_trips(plant: Network) -> list[int]:
@@ -143,17 +153,18 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    inner = scenario.has_inner
+    inner = scenario.carries
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
         controller.inner = inner
         y = np.zeros(len(carried("y", inner)))
         if inner:
-            y[:NY], y[NY:] = start.y, start.x[: NY_INNER - NY]
-            controller.start(start.x_law, start.u, y, start.e)
+            own = np.concatenate([start.y, start.x[: NY_INNER - NY]])
+            angle = np.exp(1j * start.x[DELTA])
+            controller.start(start.x_law, start.u, own, start.e, angle)
         else:
             controller.start(start.x_law, start.u)
-        told = start.commands[: len(carried("u", inner))].copy()
+        told = _commands(start, inner)
         trace = trace_of(one, told)
         bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told, trace=trace)
         bench.keep()
@@ -163,10 +174,10 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
 
 
 def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:
-    names, inner = tuple(scenario.laws()), scenario.inner
-    files = [name for name in (*names, inner or "") if name.endswith(".toml")]
+    names, inner, counts = tuple(scenario.laws()), scenario.inner, scenario.counts
+    files = [name for name in (*names, inner or "", counts or "") if name.endswith(".toml")]
     made = _ready(
-        names, inner, scenario.T_s, scenario.late_policy.hold, real, plant.wiring.omega_b,
+        names, inner, counts, scenario.T_s, scenario.late_policy.hold, real, plant.wiring.omega_b,
         tuple(map(_text, files)),
     )  # fmt: skip
     return made.anew(scenario.references.vector())
@@ -176,6 +187,7 @@ def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:
 def _ready(
     names: tuple[str, ...],
     inner: str | None,
+    counts: str | None,
     T_s: float,
     hold: int,
     real: str,
@@ -188,7 +200,7 @@ def _ready(
         contents: of the files among names and inner stage.
     """
     titles = law_titles(names)
-    sets = [replace(load_law(name, inner), name=titles[name]) for name in names]
+    sets = [replace(load_law(name, inner, counts), name=titles[name]) for name in names]
     return Controller(sets, T_s, [0.0] * len(REF_NAMES), hold, real, omega_b)
 
 

@@ -23,8 +23,8 @@ from gfm_hil.recording.log import Outcome, Status
 from gfm_hil.scenario.events.base import Event, PlantEvent, nominal_hz
 from gfm_plant import Network, SynchroCheckResult, finish_check, trip_reason, wait_reason
 from gfm_plant.names import CONTROLLER, NOT_ASKED
-from gfm_runtime.signals import carried
-from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
+from gfm_runtime.signals import carried, names
+from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 
 _ROOM = 1 << 16  # bytes kept beside the log for its last lines
 
@@ -274,5 +274,5 @@ class TimelineInMemory(Timeline):
 def safe_reason(ctl: Any) -> str:
     """The reason for which the controller is in SAFE, in words."""
     reason, channel = int(ctl["reason"][0]), int(ctl["channel"][0])
-    names = {BAD_Y: carried("y", True), BAD_U: carried("u", True)}.get(reason)
-    return REASONS[reason] + (f": {names[channel]}" if names else "")
+    of = {BAD_Y: carried("y", True), BAD_U: carried("u", True), BAD_SENSOR: names("adc")}
+    return REASONS[reason] + (f": {of[reason][channel]}" if reason in of else "")

@@ -52,16 +52,16 @@ class LinkOptions(BaseModel):
     """Base class of a link's own options, the table ``link.options`` of a scenario."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-    _inner: bool = PrivateAttr(False)
+    _inner: int = PrivateAttr(False)
 
     @property
-    def inner(self) -> bool:
-        """Whether the run has an inner stage, whose signals the frames carry too. Its laws say
-        so, not the user."""
+    def inner(self) -> int:
+        """What the frames carry, see ``Scenario.carries``. The laws of the run say so, not the
+        user."""
         return self._inner
 
-    def of_run(self, inner: bool) -> Self:
-        """The same options in a run with an inner stage or without."""
+    def of_run(self, inner: int) -> Self:
+        """The same options in a run that carries what ``inner`` says."""
         options = self.model_copy()
         options._inner = inner
         return options
@@ -99,7 +99,7 @@ class LinkKind:
     exact: bool = True
 
     def checked(
-        self, endpoint: str | None, options: dict[str, Any], inner: bool = False
+        self, endpoint: str | None, options: dict[str, Any], inner: int = False
     ) -> LinkOptions:
         """The options as a model, if endpoint (None: a fresh one) and options may be used.
 

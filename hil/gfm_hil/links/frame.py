@@ -227,7 +227,7 @@ class FrameError(ValueError):
         self.fault = fault
 
 
-def frame_dtype(group: Vector, inner: bool = False) -> np.dtype:
+def frame_dtype(group: Vector, inner: int = False) -> np.dtype:
     """The layout as a NumPy record with one field per signal, for tools that read recordings."""
     wire = wire_dtype(len(carried(group, inner)))
     fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
@@ -242,7 +242,7 @@ class FrameWriter:
         inner: the run has an inner stage, whose signals follow in the frame.
     """
 
-    def __init__(self, group: Vector, inner: bool = False) -> None:
+    def __init__(self, group: Vector, inner: int = False) -> None:
         self.sequence = np.zeros(1, np.int64)
         self.frame, self.message = buffer(len(carried(group, inner)), DATA_IDS[group])
 
@@ -267,7 +267,7 @@ class FrameReader:
             the gap.
     """
 
-    def __init__(self, group: Vector, inner: bool = False, **limits: int) -> None:
+    def __init__(self, group: Vector, inner: int = False, **limits: int) -> None:
         self.group = group
         self.record = make_reader()
         for name, limit in limits.items():

@@ -51,7 +51,7 @@ def link_kind(name: str) -> LinkKind:
 
 
 def open_link(
-    name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None, inner: bool = False
+    name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None, inner: int = False
 ) -> Link:
     """Open one end of the link of that name; ``inner``: for a run with an inner stage.
 

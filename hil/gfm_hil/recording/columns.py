@@ -18,7 +18,17 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_plant import BATTERY, CONNECTION, TRUTH
 from gfm_plant.names import TRIP_REASONS
-from gfm_runtime.signals import REF_NAMES, SIGNALS, U_NAMES, Y_NAMES, names
+from gfm_runtime.signals import (
+    COUNTS,
+    INNER,
+    PLAIN,
+    REF_NAMES,
+    SIGNALS,
+    U_NAMES,
+    Y_NAMES,
+    carried,
+    names,
+)
 from gfm_runtime.states import STATES
 
 PLANT_COLUMNS = (
@@ -32,6 +42,10 @@ PLANT_INNER = (*(f"y_{n}" for n in names("y_inner")), *(f"u_{n}" for n in names(
 PLANT_OPTIONS = tuple(f"true_{n}" for n in (*CONNECTION, *BATTERY))
 I_REF = ("i_ref_d", "i_ref_q")
 CONTROLLER_INNER = ("E_law", *I_REF, "limited")
+#: a run with counts records these after those of an inner stage: what the A/D reads and the bridge
+#: gets, and y as the law has measured it
+PLANT_COUNTS = (*(f"y_{n}" for n in names("adc")), *(f"u_{n}" for n in names("compare")))
+CONTROLLER_COUNTS = tuple(f"m_{n}" for n in carried("y", INNER))
 CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 # ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
 # that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
@@ -44,20 +58,22 @@ TIMES_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_TIMES, "controller": CON
 #: that runs on a processor in the loop, -1: not counted
 COUNTS_OF: dict[Role, tuple[str, ...]] = {"plant": ("acts",), "controller": ("instructions",)}
 ACTS, INSTRUCTIONS = "plant_acts", "controller_instructions"
-_INNER_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_INNER, "controller": CONTROLLER_INNER}
+_MORE_OF: dict[Role, tuple[tuple[str, ...], ...]] = {
+    "plant": (PLANT_INNER, PLANT_COUNTS), "controller": (CONTROLLER_INNER, CONTROLLER_COUNTS)
+}  # fmt: skip
 
 
-def signals_of(role: Role, inner: bool, options: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """The columns that a role records, without times; ``inner``: the run has an inner stage;
+def signals_of(role: Role, inner: int, options: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """The columns that a role records, without times; ``inner``: see ``Scenario.carries``;
     ``options``: what its plant has by options, see ``Scenario.optional_signals``."""
-    found = SIGNALS_OF[role] + (_INNER_OF[role] if inner else ())
+    found = SIGNALS_OF[role] + tuple(n for more in _MORE_OF[role][:inner] for n in more)
     return found + (tuple(f"true_{n}" for n in options) if role == "plant" else ())
 
 
 def recorded_in(role: Role, width: int) -> tuple[str, ...]:
     """The columns of a recording of so many of them; empty if no run records so many."""
     options = ((), CONNECTION, BATTERY, CONNECTION + BATTERY)
-    each = (signals_of(role, *which) for which in product((False, True), options))
+    each = (signals_of(role, *which) for which in product((PLAIN, INNER, COUNTS), options))
     return {len(names): names for names in each}.get(width, ())
 
 
@@ -66,7 +82,7 @@ def kept_of(role: Role) -> tuple[str, ...]:
     return TIMES_OF[role] + COUNTS_OF[role]
 
 
-def bytes_per_tick(inner: bool = False, options: tuple[str, ...] = ()) -> int:
+def bytes_per_tick(inner: int = PLAIN, options: tuple[str, ...] = ()) -> int:
     """What a tick takes in the parts of a run."""
     signals = [signals_of(role, inner, options) for role in SIGNALS_OF]
     return 8 * sum(map(len, [*signals, *map(kept_of, SIGNALS_OF)]))
@@ -224,13 +240,16 @@ def _table() -> dict[str, Described]:
         ),
         Described("limited", "", "", "whether the inner stage limits the current", "",
                   ((0, "no"), (1, "yes"))),
+        *_signals("y", ("adc",), "at the sample"),
+        *_signals("u", ("compare",), _COMMAND),
+        *_signals("m", ("y", "y_inner"), "as the law measures it"),
         *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
         Described(ACTS, "", "", "tick whose u the D/A gets, -1: that of the start"),
         Described(INSTRUCTIONS, "", "", "instructions of a step on a processor in the loop"),
     ]  # fmt: skip
     found = {row.name: row for row in rows}
     times = [f"{role}_{name}" for role in TIMES_OF for name in kept_of(role)]
-    inner = (*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER)
+    inner = (*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER, *PLANT_COUNTS, *CONTROLLER_COUNTS)
     return {n: found[n] for n in ("tick", "t", *PLANT_COLUMNS, *CONTROLLER_COLUMNS, *inner, *times)}
 
 

@@ -46,7 +46,7 @@ class RolePart:
 
     @staticmethod
     def create(
-        folder: Path, role: Role, ticks: int, inner: bool = False, options: tuple[str, ...] = ()
+        folder: Path, role: Role, ticks: int, inner: int = False, options: tuple[str, ...] = ()
     ) -> RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
@@ -145,7 +145,7 @@ class Kept:
         self,
         role: Role,
         ticks: int,
-        inner: bool = False,
+        inner: int = False,
         options: tuple[str, ...] = (),
         only: Collection[str] | None = None,
     ) -> None:
@@ -167,7 +167,7 @@ def keep_in_memory(
     folder: Path,
     ticks: int,
     notice: Callable[[str], None] = lambda text: None,
-    inner: bool = False,
+    inner: int = False,
     options: tuple[str, ...] = (),
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.

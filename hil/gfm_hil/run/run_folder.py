@@ -42,9 +42,7 @@ _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 
 
-def check_free(
-    folder: Path, ticks: int, inner: bool = False, options: tuple[str, ...] = ()
-) -> None:
+def check_free(folder: Path, ticks: int, inner: int = False, options: tuple[str, ...] = ()) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
 
     ``inner``, ``options``: what the run records besides, see ``signals_of``. Raises UserError:

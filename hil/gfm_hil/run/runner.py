@@ -103,7 +103,7 @@ def controller_program(
         controller_file(controller, FORMS)
     places = None if ports is None else Path(ports)
     read_map(places)
-    check_currents(controller, scenario.has_inner)
+    check_currents(controller, scenario.carries)
     compile_external(scenario, notice, real)
     return external_command(controller, places)
 
@@ -190,7 +190,7 @@ def _recorded(
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
-    check_free(folder, scenario.ticks * len(places), scenario.has_inner, scenario.optional_signals)
+    check_free(folder, scenario.ticks * len(places), scenario.carries, scenario.optional_signals)
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:

@@ -60,10 +60,10 @@ def origin(scenario: Scenario, began: float) -> dict[str, Any]:
 def stages(scenario: Scenario) -> dict[str, Any]:
     """The kind of the inner stage of each law, under the key ``inner``; empty if no law of the run
     has one."""
-    if not scenario.has_inner:
+    if not scenario.carries:
         return {}
     laws = {
-        title: load_law(name, scenario.inner).laws[0]
+        title: load_law(name, scenario.inner, scenario.counts).laws[0]
         for name, title in law_titles(scenario.laws()).items()
     }
     kinds = {name: law.inner.kind if law.inner else NO_INNER for name, law in laws.items()}

@@ -15,9 +15,11 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario.events.base import PlantEvent
 from gfm_hil.scenario.schema import INPROC, Scenario
 from gfm_plant import ConverterParameters, Network, load_converter, make_network, make_plant
-from gfm_runtime import LawError, discretise, load_law
+from gfm_runtime import BuiltLaw, LawError, discretise, load_law
+from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import allowed, meant, printable
 from gfm_runtime.inner_file import named_inner
+from gfm_runtime.signals import COUNTS
 from gfm_runtime.toml_file import read_toml
 
 SCENARIO_FOLDERS = (
@@ -238,6 +240,12 @@ def check_scenario(
     if stage := _stage_mistakes(scenario.inner):
         ours = "" if ("inner",) in overrides else f"{where}: "
         raise UserError("\n".join(ours + line for line in stage))
+    try:
+        if scenario.counts is not None:
+            named_counts(scenario.counts)
+    except LawError as problem:
+        ours = "" if ("counts",) in overrides else f"{where}: "
+        raise UserError("\n".join(ours + line for line in problem.lines)) from None
     for member in [scenario.of(name) for name in scenario.converters]:
         key = "inner" if _stage_mistakes(member.inner) else "law"
         at = f"{where}: network.converters.{member.converter}.{key}: "
@@ -267,15 +275,35 @@ def _stage_mistakes(name: str | None) -> Sequence[str]:
 def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
     """What is wrong with a law, read or at the scenario's sampling time."""
     try:
-        stages = load_law(law, scenario.inner).laws
+        stages = load_law(law, scenario.inner, scenario.counts).laws
     except LawError as problem:
         return problem.lines
     try:
         for stage in stages:
             discretise(stage, scenario.T_s)
+            _check_counts(stage, scenario)
     except LawError as problem:
         return problem.within(f"law {law}").lines
     return ()
+
+
+def _check_counts(law: BuiltLaw, scenario: Scenario) -> None:
+    """Raise LawError if a law's timer does not fit the sampling time, or is not the plant's."""
+    if scenario.carries != COUNTS:
+        return
+    if law.counts is None:
+        why = "missing, and other laws of the scenario have them; give the scenario counts"
+        raise LawError("measure, modulate", why)
+    top, bridge = law.counts.modulate.top(scenario.T_s), scenario.plant.bridge
+    carriers = 1.0 if bridge.carrier_hz is None else bridge.carrier_hz * scenario.T_s
+    theirs = bridge.timer_hz * scenario.T_s / max(1, round(carriers)) / 2
+    fits = bridge.kind == "average" or carriers in (1.0, 2.0)  # else the plant refuses it
+    if fits and top != round(theirs):
+        raise LawError(
+            "modulate",
+            f"{top} counts in half a period of the carrier; plant.bridge has {theirs:g}:"
+            " timer_hz and carriers must be those of the bridge",
+        )
 
 
 def plant_of(scenario: Scenario) -> Network:

@@ -20,14 +20,16 @@ from gfm_hil.scenario.events.reference import check_reference, reference_field
 from gfm_hil.scenario.expectation import check_expectation
 from gfm_plant import BATTERY, CONNECTION, NetworkParts, Plant, load_converter
 from gfm_runtime import LawError, law_file
+from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import meant
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.regular import read_regular
-from gfm_runtime.signals import REF_NAMES, table_hash
+from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, table_hash
 
 #: ``link.peer_timeout_s`` by mode where none is given: real time cannot wait; in lockstep no time
 #: passes meanwhile, and a busy machine may keep a side for seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
+_WITH_COUNTS = ("shm", "zmq")  # links
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
 
@@ -72,12 +74,13 @@ def file_hash(file: str) -> str:
     return hashlib.sha256(read_regular(file, LARGEST_FILE)).hexdigest()[:16]
 
 
-def laws_digest(laws: Iterable[str], inner: str | None) -> str:
-    """Hash of the content of laws, by name or path, with their bases, and of the inner stage that
-    replaces theirs unless it is None."""
-    spec = None if inner is None else named_inner(inner)
-    stage = [inner is not None, spec and spec.model_dump()]
-    return _hash([stage, *(law_file(name).model_dump() for name in laws)])
+def laws_digest(laws: Iterable[str], inner: str | None, counts: str | None = None) -> str:
+    """Hash of the content of laws, by name or path, with their bases, and of the inner stage and of
+    measurement and modulation that replace theirs unless they are None."""
+    own = (None if inner is None else named_inner(inner)), counts and named_counts(counts)
+    others = [[name is not None, one and one.model_dump()]
+              for name, one in zip((inner, counts), own, strict=True)]  # fmt: skip
+    return _hash([others, *(law_file(name).model_dump() for name in laws)])
 
 
 def _hash(content: Any) -> str:
@@ -169,6 +172,11 @@ class Scenario(StrictSchema):
     inner: str | None = Field(
         None,
         description="inner stage of every law, in place of its own: a shipped name (gfmhil laws), "
+        "the path of a file, or none",
+    )
+    counts: str | None = Field(
+        None,
+        description="measurement and modulation of every law, in place of its own: a shipped name, "
         "the path of a file, or none",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="of the sensors' noise")
@@ -265,7 +273,7 @@ class Scenario(StrictSchema):
         own["network"] = self.network.model_copy(update={"converters": members})
         events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
         copy = self.model_copy(update={**own, "events": events, "converter": name})
-        copy.__dict__.pop("has_inner", None)
+        copy.__dict__.pop("carries", None)
         return copy
 
     @property
@@ -309,7 +317,9 @@ class Scenario(StrictSchema):
         the law and converter files, wherever each machine keeps them."""
         about = {"link", "title", "description", "compare", "waveforms"}
         about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
-        content = self.model_dump(exclude={*about, "law", "inner", "events", "ready_laws"})
+        content = self.model_dump(
+            exclude={*about, "law", "inner", "counts", "events", "ready_laws"}
+        )
         if self.network is not None:
             members = content["network"]["converters"]
             for name, member in members.items():
@@ -334,18 +344,20 @@ class Scenario(StrictSchema):
 
     def laws_digest(self) -> str:
         """Hash of the content of every law that the run uses."""
-        return laws_digest(self.laws(), self.inner)
+        return laws_digest(self.laws(), self.inner, self.counts)
 
     @cached_property
-    def has_inner(self) -> bool:
-        """Whether a law of the run has an inner stage; frames and recording then carry its
-        signals."""
+    def carries(self) -> int:
+        """What frames and recording have beside y and u of Phi: with an inner stage in one of the
+        laws its signals (``INNER``), and with laws that measure and modulate also counts
+        (``COUNTS``); else nothing (``PLAIN``)."""
         each = [self.of(name) for name in self.converters] or [self]
-        return any(
-            (law_file(name).inner if one.inner is None else named_inner(one.inner)) is not None
-            for one in each
-            for name in one.laws()
-        )
+        files = [(one, law_file(name)) for one in each for name in one.laws()]
+        counts = named_counts(self.counts) if self.counts is not None else None
+        if any(counts if self.counts is not None else file.counts for _, file in files):
+            return COUNTS
+        inner = (file.inner if one.inner is None else named_inner(one.inner) for one, file in files)
+        return INNER if any(stage is not None for stage in inner) else PLAIN
 
     @property
     def optional_signals(self) -> tuple[str, ...]:
@@ -380,7 +392,14 @@ class Scenario(StrictSchema):
             options = kind.options.model_validate(link.options)
             where = f"network.converters.{name}.link" if name else "link"
             try:
-                kind.check(options.of_run(self.has_inner), self.T_s)
+                if self.carries == COUNTS and link.type not in _WITH_COUNTS:
+                    problems.append(
+                        f"{where}.type = {link.type!r}: carries no counts, which laws with"
+                        f" [measure] and [modulate] exchange; use {', '.join(_WITH_COUNTS)} or"
+                        f" {INPROC}"
+                    )
+                    continue
+                kind.check(options.of_run(self.carries), self.T_s)
             except LawError:
                 pass  # ``check_scenario`` says what is wrong with the laws
             except ValueError as problem:

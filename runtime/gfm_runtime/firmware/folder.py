@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from gfm_runtime.catalogue import LawSet
+from gfm_runtime.counts import COUNTS_STATE
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import written
 from gfm_runtime.firmware.check import script
@@ -16,7 +17,7 @@ from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.tick import SIZE
 from gfm_runtime.law import BuiltLaw
-from gfm_runtime.signals import NU, carried
+from gfm_runtime.signals import COUNTS, N_ADC, NU, carried
 from gfm_runtime.states import BAD_U
 
 _PROVE = """
@@ -76,10 +77,12 @@ def export(
 def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
     adapters, table, own = [], [], style == "unrolled"
-    parts = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
+    parts: tuple[str, ...] = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
+    parts += ("go_on",) * modules[0].counts
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
-    choices = {"stages": stages, "fixed": fixed}
+    counts = modules[0].counts
+    choices = {"stages": stages, "fixed": fixed, "counts": counts}
     e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
         keys = {
@@ -98,12 +101,18 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         **C_TYPES[precision],
         "LAWS": str(len(modules)),
         "NX": str(states),
-        "NY": str(len(carried("y", stages))),
-        "NU": str(len(carried("u", stages))),
+        "NY": str(N_ADC if counts else len(carried("y", stages))),
+        "NU": str(len(carried("u", COUNTS if counts else stages))),
+        "N_COUNTS": str(sum(size for _, size, _ in COUNTS_STATE)),
+        "SENSED": str(
+            columns(0, True, counts=True).index("sensed_0")
+            - columns(0, True, counts=True).index("angle_0")
+        ),
         "STAGE": str(SIZE),
+        "MEASURED": "sensed" if counts else "y",
         "E_AT": str(columns(0, True).index("e_d") - columns(0, True).index("i_ref_d")),
         "BAD_U": str(BAD_U),
-        "WORDS": str(len(columns(states, stages, fixed))),
+        "WORDS": str(len(columns(states, stages, fixed, counts))),
         **e,
         "LAW_INCLUDES": "\n".join(f'#include "{m.prefix}.h"' for m in modules),
         "ADAPTERS": "".join(adapters).rstrip("\n") + "\n",

@@ -22,12 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
+from gfm_runtime.counts import COUNTS_STATE, go_on_with, measure, modulate
 from gfm_runtime.firmware.fixed import REFS, YS, Instance, bump_of, refusal, to_integers
-from gfm_runtime.firmware.module import BAD_REF, Module
+from gfm_runtime.firmware.module import BAD_REF, Module, at_rest
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
 from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner, state_dtype
 from gfm_runtime.signals import (
+    COUNTS,
+    N_ADC,
+    N_LEGS,
     NU,
+    NU_COUNTS,
     NU_INNER,
     NY,
     NY_INNER,
@@ -37,7 +42,7 @@ from gfm_runtime.signals import (
     group,
     names,
 )
-from gfm_runtime.states import BAD_U, BAD_Y, OK
+from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
 #: what a row does before its step: nothing, init, a bumpless change to the row's law, reset and
@@ -57,8 +62,9 @@ class Golden:
 
     words: NDArray[Any]  #: shape (rows, columns), uint32 or uint64
     #: their names: op, law, result, ref_*, y_*, u_*, bump, x_*, offset_*, last_* (the law's u of
-    #: the last tick), trend_*; with an inner stage its variables, and limited; in fixed point the
-    #: rests, 31 lower bits and what is above
+    #: the last tick), trend_*; with an inner stage its variables, and limited; with counts
+    #: adc_* and cmp_*, and their variables; in fixed point the rests, 31 lower bits and what is
+    #: above
     columns: tuple[str, ...]
 
     def csv(self) -> str:
@@ -67,22 +73,27 @@ class Golden:
         return "".join(",".join(row) + "\n" for row in rows)
 
 
-def columns(states: int, stages: bool, fixed: bool = False) -> tuple[str, ...]:
-    """The columns of golden rows whose laws have up to ``states`` states, and inner stages."""
+def columns(
+    states: int, stages: bool, fixed: bool = False, counts: bool = False
+) -> tuple[str, ...]:
+    """The columns of golden rows whose laws have up to ``states`` states, inner stages, counts."""
     y, u, ref = carried("y", stages), command_rows(stages), names("ref")
+    if counts:
+        y, u = names("adc"), (*u, *group("compare"))
     own = names("u")
     variables = [
         f"{name}{end}"
         for name, size, _ in INNER_STATE
         for end in (("_d", "_q") if size > 1 else ("",))
     ]
+    kept = [f"{name}_{k}" for name, size, _ in COUNTS_STATE for k in range(size)]
     return (
         "op", "law", "result",
         *(f"ref_{name}" for name in ref), *(f"y_{name}" for name in y),
         *(f"u_{s.name}" for s in u), "bump",
         *(f"x_{i}" for i in range(states)), *(f"offset_{name}" for name in own),
         *(f"last_{name}" for name in own), *(f"trend_{name}" for name in own),
-        *([*variables, "limited"] if stages else ()),
+        *([*variables, "limited"] if stages else ()), *(kept if counts else ()),
         *(f"rest_{i}_{end}" for i in range(fixed * (2 * NU + states)) for end in ("low", "high")),
     )  # fmt: skip
 
@@ -94,7 +105,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     """
     if modules[0].fixed:
         return _fixed_rows(modules, ticks)
-    real, stages = modules[0].real, modules[0].stages
+    real, stages, counts = modules[0].real, modules[0].stages, modules[0].counts
     states = max([1, *(m.n for m in modules)])
     word = np.dtype(f"u{real.itemsize}")
     laws = np.array([m.record for m in modules])
@@ -104,12 +115,17 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     fresh: NDArray[Any] = np.zeros(1, instances.dtype)  # an instance after its init
     fresh["u"] = _, omega, E = [s.default for s in group("u")]
     fresh["omega_pll"], fresh["pll"], fresh["e"] = omega, (1.0, 0.0), (E, 0.0)
+    fresh["angle"], fresh["sensed"], fresh["speed"] = (1.0, 0.0), at_rest(), omega
     now, io = np.zeros(3, np.int64), np.zeros(1, _io_dtype(real))
     parts = []
     for k, module in enumerate(modules):
-        op, refs, ys = inputs(zlib.crc32(module.prefix.encode()), ticks, real, stages)
+        seed = zlib.crc32(module.prefix.encode())
+        op, refs, ys = inputs(seed, ticks, real, stages)
+        if counts:
+            op, ys = _adc(op, seed, module.record)
         op[0] = INIT if k == 0 else SWITCH
-        result, u = np.zeros(ticks, np.int64), np.zeros((ticks, len(carried("u", stages))), real)
+        n_u = len(carried("u", COUNTS if counts else stages))
+        result, u = np.zeros(ticks, np.int64), np.zeros((ticks, n_u), real)
         bump = np.zeros(ticks, real)
         after: NDArray[Any] = np.zeros(ticks, instances.dtype)
         own = now, io, result, u, bump, after
@@ -122,8 +138,11 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         columns_of = [np.column_stack(integers).astype(word), np.column_stack(numbers).view(word)]
         if stages:
             columns_of.append(after["limited"][:, None].astype(word))
+        if counts:
+            kept = [after[name] for name, *_ in COUNTS_STATE]
+            columns_of.append(np.column_stack(kept).view(word))
         parts.append(np.hstack(columns_of))
-    return Golden(np.vstack(parts), columns(states, stages))
+    return Golden(np.vstack(parts), columns(states, stages, counts=counts))
 
 
 def _fixed_rows(modules: Sequence[Module], ticks: int) -> Golden:
@@ -168,8 +187,8 @@ def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
     """What goes into and out of a step, as ``gfm_runtime.controller`` has it; and the u in use."""
     return np.dtype(
         [
-            ("ref", real, (NY,)), ("y", real, (NY_INNER,)),
-            ("u", real, (NU,)), ("out", real, (NU_INNER,)), ("held", real, (NU_INNER,)),
+            ("ref", real, (NY,)), ("y", real, (NY_INNER,)), ("adc", real, (N_ADC,)),
+            ("u", real, (NU,)), ("out", real, (NU_INNER,)), ("held", real, (NU_COUNTS,)),
             ("zero", real, (NU,)), ("bump", real),
         ],
         align=True,
@@ -184,18 +203,28 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
     go on from call to call. ``result``, ``u``, ``bump`` and ``after`` are what the rows say.
     """
     c = io[0]
-    n_y, n_u = ys.shape[1], u.shape[1]
-    inner = n_y > NY
+    n_y, n_u = min(ys.shape[1], NY_INNER), u.shape[1]
+    inner, counts = n_y > NY, n_u > NU_INNER
+    if counts:
+        n_y, n_u = NY_INNER, NU_INNER
     for i in range(len(op)):
         for j in range(NY):
             c.ref[j] = refs[i, j]
-        for j in range(n_y):
-            c.y[j] = ys[i, j]
+        if counts:
+            for j in range(N_ADC):
+                c.adc[j] = ys[i, j]
+            if op[i] == RESET:
+                go_on_with(instances[now[0], now[1]], fresh[0])
+            for j in range(NY_INNER):
+                c.y[j] = instances[now[0], now[1]].sensed[j]
+        else:
+            for j in range(n_y):
+                c.y[j] = ys[i, j]
         if op[i] == INIT:
             now[0], now[1], now[2] = k, 0, OK
             instances[k, 0] = fresh[0]
             c.bump = 0
-            for j in range(n_u):
+            for j in range(NU_COUNTS):
                 c.held[j] = 0
         elif op[i] == SWITCH:
             old = now[0]
@@ -204,6 +233,8 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             if inner:
                 take_measurements(new_state, c.y)
                 settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
+            if counts:
+                go_on_with(new_state, old_state)
             now[0], now[1] = k, 1 - now[1]
         elif op[i] == RESET:
             now[2] = OK
@@ -220,6 +251,12 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             state.offset[1] = math.nan
         elif op[i] == SPOIL_STAGE:
             state.away[0] = math.nan
+        if counts and now[2] == OK:
+            measure(law, state, c.adc, 0)
+            for j in range(NY_INNER):
+                c.y[j] = state.sensed[j]
+            if state.suspect >= 0:
+                now[2] = BAD_SENSOR
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)
         if now[2] == OK:
@@ -239,8 +276,12 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
                 advance(law, state)
             for j in range(n_u):
                 c.held[j] = c.out[j]
+            if counts:
+                modulate(law, state)
+                for x in range(N_LEGS):
+                    c.held[NU_INNER + x] = int(state.compare[x])
         result[i], bump[i] = now[2], c.bump
-        for j in range(n_u):
+        for j in range(u.shape[1]):
             u[i, j] = c.held[j]
         after[i] = state
 
@@ -344,6 +385,40 @@ def _filter_signals(ys: NDArray[Any], seed: int, tiny: float) -> NDArray[np.floa
             out[at, 2], out[at, 3] = turned.real, turned.imag
             out[at, :2] *= 2.0 + uniform(1)
     return out
+
+
+def _adc(op: NDArray[np.int64], seed: int, law: np.void) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    """What is done before each step, and counts of the A/D (ticks, 10).
+
+    Three-phase quantities with noise; ones that grow until the A/D is at its ends, while v_dc falls
+    and the modulator has not enough; any counts; ones that stay; no current; a phase that stays;
+    and ones that turn against the frame. What has led to the safe state is reset.
+    """
+    uniform, ticks, top = _uniform(seed + 2), len(op), float(law["adc_top"])
+    half, out = 0.5 * (top + 1), np.zeros((len(op), N_ADC))
+    op = np.where(op == RESET, STEP, op)
+    for k, start in enumerate(range(0, ticks, SEGMENT)):
+        at, kind = slice(start, min(start + SEGMENT, ticks)), k % KINDS
+        n = at.stop - at.start
+        along = np.arange(1, n + 1) / SEGMENT
+        size = 1.0 + 5.0 * along * (kind == 1)
+        turn = np.exp((-1j if kind == 6 else 1j) * 2 * np.pi * (0.6 * along + uniform(1)))
+        for first, of in ((1, 0.13), (4, 0.5), (7, 0.13)):
+            vector = of * size * turn * np.exp(0.2j * (first != 4)) * (kind != 4 or first == 4)
+            for x in range(N_LEGS):
+                out[at, first + x] = (vector * np.exp(-2j * np.pi * x / 3)).real
+        out[at, 0] = 1.0 / size - 1.0
+        out[at] = (1 + out[at]) * half + 4 * uniform(n, N_ADC)
+        if kind == 2:
+            out[at] = (top + 1) * uniform(n, N_ADC)
+        elif kind == 3:
+            out[at] = (top + 1) * uniform(N_ADC)
+        elif kind == 5:
+            out[at, 1 + k // KINDS % 9] = half
+            out[at, 0] *= k // KINDS % 4 > 0
+            op[start + 15 : at.stop : 8] = RESET
+        op[start] = RESET
+    return op, np.clip(np.floor(out), 0.0, top).astype(law["u_0"].dtype)
 
 
 def _uniform(seed: int) -> Callable[..., NDArray[np.float64]]:

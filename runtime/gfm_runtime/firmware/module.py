@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from gfm_runtime.counts import COUNTS_CONSTANTS, COUNTS_NUMBERS, COUNTS_STATE
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE, LINEAR
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, written
@@ -27,6 +28,7 @@ from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import BuiltLaw
 from gfm_runtime.signals import (
+    INNER,
     NU,
     NY,
     TABLE_VERSION,
@@ -36,7 +38,7 @@ from gfm_runtime.signals import (
     group,
     table_hash,
 )
-from gfm_runtime.states import BAD_U, BAD_Y, OK, REASONS
+from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK, REASONS
 from gfm_runtime.tustin import discretise
 
 MADE = "Made by gfmhil firmware export; do not edit."
@@ -51,6 +53,7 @@ RESULTS = {
     "OK": (OK, "runs"),
     "BAD_Y": (BAD_Y, REASONS[BAD_Y]),
     "BAD_U": (BAD_U, REASONS[BAD_U]),
+    "BAD_SENSOR": (BAD_SENSOR, REASONS[BAD_SENSOR]),
     "BAD_REF": (BAD_REF, "a reference is not finite or out of range"),
 }
 RESULT_TEXT = "0, or why the bridge must be blocked: " + "; ".join(
@@ -72,13 +75,22 @@ NUMBERS = (
 STAGE_INTEGERS = ("inner", "priority", "freeze", "row")
 
 
-def fields(stages: bool, fixed: bool = False) -> tuple[tuple[str, ...], tuple[str, ...]]:
+#: of measurement and modulation, in a folder whose laws have them
+COUNTS_INTEGERS = tuple(name for name, _ in COUNTS_NUMBERS if name != "counts")
+
+
+def fields(
+    stages: bool, fixed: bool = False, counts: bool = False
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The fields of a law's record that are integers, and those in its precision."""
     if fixed:
         return (*INTEGERS, "row"), NUMBERS
     if not stages:
         return INTEGERS, NUMBERS
-    return INTEGERS + STAGE_INTEGERS, NUMBERS + INNER_CONSTANTS
+    integers, numbers = INTEGERS + STAGE_INTEGERS, NUMBERS + INNER_CONSTANTS
+    if counts:
+        return integers + COUNTS_INTEGERS, numbers + tuple(COUNTS_CONSTANTS)
+    return integers, numbers
 
 
 @dataclass(frozen=True)
@@ -90,6 +102,7 @@ class Module:
     record: np.void  #: the law as ``pack_law`` gives it
     #: whether a law of its folder has an inner stage: y has 11 signals then, and u 4
     stages: bool = False
+    counts: bool = False  #: whether the laws of its folder measure and modulate
     fixed: FixedLaw | None = None  #: the law in fixed point; None in a floating-point precision
 
     @property
@@ -108,6 +121,7 @@ class Module:
         code, fixed = int(self.record["error_map"]), self.fixed is not None
         return {
             "stages": self.stages,
+            "counts": self.counts,
             "fixed": fixed,
             "own": not fixed,
             "mapped": code != LINEAR,
@@ -118,7 +132,7 @@ class Module:
     @cached_property
     def tick(self) -> Tick:
         """The functions of its step in floating point."""
-        return Tick(self.record, self.real, max(1, self.n), self.stages)
+        return Tick(self.record, self.real, max(1, self.n), self.stages, counts=self.counts)
 
     @cached_property
     def fixed_tick(self) -> FixedTick:
@@ -157,11 +171,19 @@ def make_modules(
             if law.inner is not None:
                 why = "has an inner stage, which fixed point has not; use float32 or --inner none"
                 raise LawError(f"law {name!r}", why)
+            if law.counts is not None:
+                why = "measures and modulates, which fixed point does not; use float32"
+                raise LawError(f"law {name!r}", why)
         plain_ones = make_modules(laws, T_s, np.float64, omega_b)
         return [replace(m, fixed=make_fixed(m.name, m.record)) for m in plain_ones]
-    stages = any(law.inner is not None for law in laws.values())
+    counts = any(law.counts is not None for law in laws.values())
+    for name, law in laws.items():
+        if counts and law.counts is None:
+            why = "has no [measure] and [modulate], which others have; give --counts"
+            raise LawError(f"law {name!r}", why)
+    stages = counts or any(law.inner is not None for law in laws.values())
     modules = [
-        Module(name, law, pack_law(discretise(law, T_s), real, omega_b)[0], stages)
+        Module(name, law, pack_law(discretise(law, T_s), real, omega_b)[0], stages, counts)
         for name, law in laws.items()
     ]
     check_modules(modules)
@@ -189,7 +211,7 @@ def check_modules(modules: Sequence[Module]) -> None:
                 raise LawError(where, f"{field} = {module.record[field]} is not possible")
         if module.stages and module.record["inner"] != NONE and not module.record["k_c"] > 0:
             raise LawError(where, f"k_c = {module.record['k_c']} is not possible")
-        for field in fields(module.stages)[1]:
+        for field in fields(module.stages, counts=module.counts)[1]:
             if not np.isfinite(module.record[field]).all():
                 raise LawError(where, f"{field} must be finite in {module.real}")
         if module.prefix == "gfm_":
@@ -208,7 +230,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
             text = written("interface.h", keys, m.choices)
             out[f"{m.prefix}.h"] = about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
-            out[f"{m.prefix}.c"] = written("shell.c", keys | tick.keys(m.prefix), m.choices)
+            out[f"{m.prefix}.c"] = _shell(keys | tick.keys(m.prefix), m.choices)
             if m.fixed:
                 keys["HINTS"] = m.fixed_tick.hints()
                 proofs[f"proof/{m.prefix}.c"] = written("proof.c", keys)
@@ -216,9 +238,16 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
     choices = {**modules[0].choices, "own": False}
-    common = _keys("gfm", real, states, stages) | {"LAW": "const gfm_law_t *law, ", "law": "law, "}
+    counts = modules[0].counts
+    common = _keys("gfm", real, states, stages, counts) | {
+        "LAW": "const gfm_law_t *law, ",
+        "law": "law, ",
+    }
     names = [name for name in INNER_CONSTANTS if name not in SHARED]
+    if counts:
+        names += [f"{name}[{n}]" if n > 1 else name for name, n in COUNTS_CONSTANTS.items()]
     types = common | {
+        "COUNTS_INTEGERS": ", ".join(COUNTS_INTEGERS),
         "KINDS": "; ".join(
             ", ".join(f"{code} {name}" for name, code in codes.items())
             for codes in (KINDS, PRIORITIES)
@@ -226,11 +255,11 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         "CONSTANTS": "\n        ".join(textwrap.wrap(", ".join(names), 80)),
     }
     common["TYPES"] = written("records.h", types, choices).rstrip("\n")
-    generic = Tick(None, real, states, stages)
+    generic = Tick(None, real, states, stages, counts=counts)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
         + written("interface.h", common, choices),
-        "gfm.c": written("shell.c", common | generic.keys("gfm"), choices),
+        "gfm.c": _shell(common | generic.keys("gfm"), choices),
     }
     for m in modules:
         guard = f"{m.prefix.upper()}_H"
@@ -242,6 +271,12 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
         )
     return out
+
+
+def _shell(keys: Mapping[str, str], choices: Choices) -> str:
+    """The source of a module; with the whole interrupt if its law measures and modulates."""
+    text = written("shell.c", keys, choices)
+    return text + (written("isr.c", keys, choices) if choices["counts"] else "")
 
 
 def about(m: Module, T_s: float) -> str:
@@ -281,14 +316,26 @@ def about(m: Module, T_s: float) -> str:
     return "/* " + "\n".join(f" * {line}".rstrip() for line in out)[3:] + "\n */"
 
 
-def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, str]:
+def _variables(prefix: str, members: Sequence[tuple[str, int, str]]) -> str:
+    """Members of a structure in the law's precision: name, size, what it is."""
+    return "\n".join(
+        f"    {prefix}_real {name}{f'[{size}]' * (size > 1)};{f' /* {text} */' * bool(text)}"
+        for name, size, text in members
+    )
+
+
+def _keys(
+    prefix: str, real: np.dtype[Any], n: int, stages: bool, counts: bool = False
+) -> dict[str, str]:
     """What the templates of a module ask for."""
     y, u, ref = carried_rows("y", stages), command_rows(stages), group("ref")
     guard = prefix.upper()
     rows = []
-    for letter, signals in (("REF", ref), ("Y", y), ("U", u)):
+    pins = (("ADC", group("adc")), ("CMP", group("compare"))) if counts else ()
+    for letter, signals in (("REF", ref), ("Y", y), ("U", u), *pins):
         members = [
-            f"    {guard}_{letter}_{s.name.upper()}, /* {s.description}, {s.unit} of {s.base}, "
+            f"    {guard}_{letter}_{s.name.upper().removeprefix(f'{letter}_')}, "
+            f"/* {s.description}, {s.unit} of {s.base}, "
             f"{s.low:g} to {s.high:g} */"
             for s in signals
         ]
@@ -318,10 +365,9 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
         "N": str(n),
         "N_ROWS": phi[0],
         "N_COLUMNS": phi[1],
-        "STAGE": "\n".join(
-            f"    {prefix}_real {name}{f'[{size}]' * (size > 1)};{f' /* {text} */' * bool(text)}"
-            for name, size, text in INNER_STATE
-        ),
+        "STAGE": _variables(prefix, INNER_STATE),
+        "COUNTS": _variables(prefix, COUNTS_STATE),
+        "AT_REST": literals(at_rest(), real),
         "E": ", const real e[]" * stages,
         "e": ", e" * stages,
         "E_OF": f", const {prefix}_real e[]" * stages,
@@ -331,9 +377,18 @@ def _keys(prefix: str, real: np.dtype[Any], n: int, stages: bool) -> dict[str, s
     }
 
 
+def at_rest() -> list[float]:
+    """y (11,) with which a law that measures begins: by default, along the voltage."""
+    V = next(s.default for s in group("y") if s.name == "V")
+    return [s.default + V * (s.name == "v_d") for s in carried_rows("y", INNER)]
+
+
 def keys_of(m: Module) -> dict[str, str]:
     """What the templates of an unrolled law ask for."""
-    keys = _keys(m.prefix, m.real, m.n, m.stages) | {"MADE": MADE, "LAW_NAME": plain(m.name)}
+    keys = _keys(m.prefix, m.real, m.n, m.stages, m.counts) | {
+        "MADE": MADE,
+        "LAW_NAME": plain(m.name),
+    }
     if m.fixed:
         formats = "\n".join(m.fixed_tick.formats(m.prefix.upper()))
         keys |= {
@@ -361,7 +416,7 @@ def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, An
 
 def _record(m: Module, states: int) -> str:
     """A law's record as an initialiser, for a generic step with room for ``states``."""
-    integers, numbers = fields(m.stages)
+    integers, numbers = fields(m.stages, counts=m.counts)
     room: dict[str, tuple[int, ...]] = {"A": (states, states), "C": (NU, states)}
     room |= dict.fromkeys(("B_r", "B_y", "W", "E_r", "E_y", "F", "G", "row"), (states,))
     lines = ["{"]

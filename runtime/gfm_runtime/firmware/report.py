@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfm_runtime.counts import COUNTS_CONSTANTS, COUNTS_STATE
 from gfm_runtime.error_maps import DVOC
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal
@@ -63,13 +64,16 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "states": m.n,
             "bytes": sizes(m, style),
             "operations": operations(m, style),
-            "record": {n: _hex(m.record[n]) for part in fields(m.stages, fixed) for n in part},
+            "record": {
+                n: _hex(m.record[n]) for part in fields(m.stages, fixed, m.counts) for n in part
+            },
             **({"deviation": _deviations(m.fixed, m.record, T_s)} if m.fixed else {}),
         }
         for m in modules
     ]
     real, stages = modules[0].precision, modules[0].stages
-    whole = {"format": FORMAT, "signal_table": table_hash(), "stages": stages, "T_s": T_s,
+    whole = {"format": FORMAT, "signal_table": table_hash(), "stages": stages,
+             "counts": modules[0].counts, "T_s": T_s,
              "real": real, "style": style, "laws": laws}  # fmt: skip
     return {
         "report.json": json.dumps(whole, indent=1, ensure_ascii=False) + "\n",
@@ -113,9 +117,10 @@ def _exported(whole: Any) -> Exported:
             raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
     fixed = whole["real"] == FIXED
     dtype = law_dtype("float64" if fixed else whole["real"])
-    stages = bool(whole.get("stages")) and not fixed
+    stages, counts = (bool(whole.get(key)) and not fixed for key in ("stages", "counts"))
+    named = fields(stages, fixed, counts)
     modules = [
-        Module(str(law["name"]), None, _record(law["record"], dtype, fields(stages, fixed)), stages)
+        Module(str(law["name"]), None, _record(law["record"], dtype, named), stages, counts)
         for law in whole["laws"]
     ]
     if not modules:
@@ -159,6 +164,7 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
     measures what came of it.
     """
     state = max(1, m.n) + 3 * NU + SIZE * m.stages
+    state += sum(size for _, size, _ in COUNTS_STATE) * m.counts
     if m.fixed:
         rests = 2 * NU + m.n
         constants = 4 * operations(m, style)["multiplications"]
@@ -167,6 +173,7 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
         n, of = m.n, 2 * NY + NU
         constants = 2 + n * n + n * (of + of + NU) + NU * (n + 3 * NY + 3) + 3
         constants += (len(INNER_CONSTANTS) - len(SHARED)) * m.stages
+        constants += sum(COUNTS_CONSTANTS.values()) * m.counts
     else:
         constants = m.tick.constants()
     return {"state": state * m.real.itemsize, "constants": constants * m.real.itemsize}
@@ -175,7 +182,7 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
 def operations(m: Module, style: Style) -> dict[str, int]:
     """Operations of a step in which all limits clamp, the refusal included; without shifts."""
     generic = style == "records"  # it has the zeros too
-    tick = Tick(m.record, m.real, max(1, m.n), m.stages, True) if generic else m.tick
+    tick = Tick(m.record, m.real, max(1, m.n), m.stages, True, m.counts) if generic else m.tick
     count = m.fixed_tick.operations() if m.fixed else tick.operations()
     carried = (*carried_rows("y", m.stages), *group("ref"))
     ranges = sum(1 if s.low == -s.high and not m.fixed else 2 for s in carried)

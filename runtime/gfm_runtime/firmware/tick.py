@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_runtime.counts import COUNTS_NUMBERS, COUNTS_STATE, align, measure, modulate
 from gfm_runtime.firmware import fixed
 from gfm_runtime.firmware.translate import (
     Algebra,
@@ -37,7 +38,7 @@ from gfm_runtime.kernel import (
     look_with_inner,
     state_dtype,
 )
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
+from gfm_runtime.signals import N_ADC, N_LEGS, NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.switchover import settle_into, settle_with_inner
 
 #: numbers of an inner stage in an instance
@@ -49,9 +50,10 @@ INTEGERS = (
     "error_map",
     "row",
     "limited",
+    "suspect",
     "age",
     "since",
-    *(name for name, _ in INNER_NUMBERS),
+    *(name for name, _ in (*INNER_NUMBERS, *COUNTS_NUMBERS)),
 )
 #: variables of one tick only: by the name in ``state_dtype``, the name in C and what it is
 _OF_A_TICK = {
@@ -65,6 +67,11 @@ _OF_A_TICK = {
     "omega": ("omega", "omega_u after the power limiter"),
     "drop": ("drop", "voltage over the threshold impedance"),
     "e_now": ("e", "the bridge's voltage"),
+    "suspect": ("suspect", "channel of the A/D that is not plausible, or -1"),
+    "phases": ("phases", "what the A/D has read, p.u."),
+    "legs": ("legs", "along the axes of the legs"),
+    "edges": ("edges", "ripple of the currents at their legs' edges down"),
+    "compare": ("compare", "compare values, and a half"),
 }
 _PLACES = ("V_DC", "P", "OMEGA", "I_D", "I_Q", "V_D", "V_Q", "I_OD", "I_OQ")
 assert [getattr(stage, name) for name in _PLACES] == list(range(len(_PLACES)))
@@ -78,12 +85,13 @@ def place(name: str, shape: tuple[int, ...], at: str) -> Expr | Array:
 
 def _state(real: np.dtype[Any], n: int) -> Struct:
     of = state_dtype(real)
-    inside = {name for name, *_ in INNER_STATE}
+    inside = {name: "stage" for name, *_ in INNER_STATE}
+    inside |= {name: "counts" for name, *_ in COUNTS_STATE}
     fields = {}
     for name in of.names or ():
         shape = of[name].shape if not name.startswith("x_n") else (n,)
         own = f"t->{_OF_A_TICK[name][0]}" if name in _OF_A_TICK else f"s->{name}"
-        fields[name] = place(name, shape, f"s->stage.{name}" if name in inside else own)
+        fields[name] = place(name, shape, f"s->{inside[name]}.{name}" if name in inside else own)
     return Struct(fields)
 
 
@@ -95,6 +103,7 @@ class Tick:
         real: float32 or float64.
         n: states that an instance has room for.
         stages: whether it has an inner stage's variables.
+        counts: whether it measures and modulates.
         all_terms: count zeros too, as the generic step does.
     """
 
@@ -105,6 +114,7 @@ class Tick:
         n: int,
         stages: bool,
         all_terms: bool = False,
+        counts: bool = False,
     ) -> None:
         self._n, own = n, record is not None
         of = law_dtype(real)  # the constants as members of a record in C
@@ -130,7 +140,16 @@ class Tick:
         self.settle = translate.function(
             settle_with_inner if stages else settle_into, [*records, ref, y, u, trend, *e]
         )
-        self._functions = reached([self.output, self.advance, self.look, self.settle])
+        self._counts = []
+        if counts:
+            adc = [*records, Array("adc", (N_ADC,)), number(0)]
+            self._counts = [
+                translate.function(measure, adc),
+                translate.function(modulate, records),
+                translate.function(align, adc),
+            ]
+        entries = [self.output, self.advance, self.look, self.settle, *self._counts]
+        self._functions = reached(entries)
         without_unread(self._functions, "t->")
         self._real, self._own = real, own
 
@@ -140,36 +159,46 @@ class Tick:
         roots |= {"s": f"{prefix}_t", "t": "tick_t"}
         printer = Printer(self._real, roots, {"t->m": _PLACES})
 
-        def call(one: CFunction, **at: str) -> str:
+        def call(one: CFunction, t: str = "&t", **at: str) -> str:
             names = [p.place if isinstance(p, Array) else p.name for p in one.parameters]
-            return printer.call(one, [at.get(name, name) for name in names], {"t": "&t"})
+            return printer.call(one, [at.get(name, name) for name in names], {"t": t})
 
         sizes = {"raw": NU, "now": NU, "m": len(_PLACES), "drop": 2, "e_now": 2, "x_next": self._n}
+        sizes |= {"phases": N_ADC, "legs": N_LEGS, "edges": N_LEGS, "compare": N_LEGS}
         used = {e.args[0] for f in self._functions for e in f.places()}
         lines = ["typedef struct {"]
         for key, (name, what) in _OF_A_TICK.items():
             if f"t->{name}" in used:
-                size = f"[{sizes.get(key, NY)}]" * (key != "omega")
-                lines.append(f"    real {name}{size}; /* {what} */")
+                size = f"[{sizes.get(key, NY)}]" * (key not in ("omega", "suspect"))
+                kind = "int" if key in INTEGERS else "real"
+                lines.append(f"    {kind} {name}{size}; /* {what} */")
         lines += ["} tick_t;", ""]
         if "t->m" in used:
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
-        return {
+        at = "t" if self._counts else "&t"  # one tick may be part of another function
+        names = ("MEASURE", "MODULATE", "ALIGN")[: len(self._counts)]
+        counts = {
+            name: call(one, adc="counts", first="0")
+            for name, one in zip(names, self._counts, strict=True)
+        }
+        return counts | {
             "TICK": "\n".join(lines),
             "FUNCTIONS": "\n".join(map(printer.function, self._functions)),
-            "OUTPUT": call(self.output, u="out"),
-            "ADVANCE": call(self.advance),
+            "OUTPUT": call(self.output, at, u="out"),
+            "ADVANCE": call(self.advance, at),
             "LOOK": call(self.look),
             "SETTLE": call(self.settle, e_d="e[0]", e_q="e[1]"),
         }
 
     def operations(self) -> Mapping[str, int]:
         """Operations of a step by their signs, see ``translate.operations``."""
-        return operations(self.output) + operations(self.advance)
+        entries = (*self._counts[:2], self.output, self.advance)
+        return sum(map(operations, entries), Counter())
 
     def constants(self) -> int:
         """Different constants of a step."""
-        return len(constants(self.output) | constants(self.advance))
+        entries = (*self._counts[:2], self.output, self.advance)
+        return len(set[float]().union(*map(constants, entries)))
 
 
 _PRIMITIVES = {"rounded": "wide", "between": "word", "root": "wide"}

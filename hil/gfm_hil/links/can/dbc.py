@@ -85,7 +85,7 @@ def _protection() -> list[Signal]:
     ]
 
 
-def _vector(name: Vector, inner: bool, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
+def _vector(name: Vector, inner: int, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
     """Name, identifier, length and signals of every frame of a vector."""
     rows, vector = carried_rows(name, inner), (INNER if inner else VECTORS)[name]
     room = len(rows) if fd else (8 - _HEADER) // 2

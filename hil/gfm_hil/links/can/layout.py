@@ -80,7 +80,7 @@ class Plan:
     transport: dict[Role, int]
     digest: int
     fd: bool
-    inner: bool = False
+    inner: int = False
 
 
 def _definition(message: Message) -> str:
@@ -141,7 +141,7 @@ def _frames_of(title: str, messages: Mapping[str, Message]) -> list[Message]:
     return sorted(found, key=lambda m: m.frame_id)
 
 
-def plan_of(database: Database, inner: bool = False) -> Plan:
+def plan_of(database: Database, inner: int = False) -> Plan:
     """The frames of a DBC that the link uses; ``inner``: in a run with an inner stage.
 
     Raises:

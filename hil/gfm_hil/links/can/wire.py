@@ -104,7 +104,7 @@ CRC_BYTES = 4  # at the end
 _HEAD_BYTES = STATE  # magic, version, data id
 
 
-def size_and_head(group: Vector, inner: bool) -> tuple[int, int]:
+def size_and_head(group: Vector, inner: int) -> tuple[int, int]:
     """Length and first bytes of a vector's frames, which distinguish them from other messages."""
     _, message = buffer(len(carried(group, inner)), DATA_IDS[group])
     return len(message), int.from_bytes(message[:_HEAD_BYTES].tobytes(), "little")

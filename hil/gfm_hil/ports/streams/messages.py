@@ -116,7 +116,7 @@ class Sampler:
         return sample
 
 
-def block_dtype(role: Role, inner: bool = False) -> np.dtype:
+def block_dtype(role: Role, inner: int = False) -> np.dtype:
     """The dtype of one row of a side; ``inner``: of a run with an inner stage."""
     signals, times = signals_of(role, inner), TIMES_OF[role]
     return np.dtype(

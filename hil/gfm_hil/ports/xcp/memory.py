@@ -88,7 +88,7 @@ class Memory:
     """
 
     def __init__(
-        self, operator: Controlled, laws: Iterable[str], inner: bool, recorded: Callable[[], int]
+        self, operator: Controlled, laws: Iterable[str], inner: int, recorded: Callable[[], int]
     ) -> None:
         self._operator, self._recorded = operator, recorded
         self._laws = list(laws)

@@ -48,7 +48,12 @@ class GainChange(Event):
 
 @lru_cache(maxsize=64)
 def retuned(
-    name: str, gains: tuple[tuple[str, float], ...], T_s: float, omega_b: float, inner: str | None
+    name: str,
+    gains: tuple[tuple[str, float], ...],
+    T_s: float,
+    omega_b: float,
+    inner: str | None,
+    counts: str | None,
 ) -> Retuned:
     """A law with some gains changed, discretised, and packed for the kernel.
 
@@ -62,7 +67,7 @@ def retuned(
         if file.schedule is not None:
             raise LawError(f"law {name}", "is scheduled: its gains change by themselves")
         changed = gfm_runtime.tied(file, dict(gains))
-        (law,) = gfm_runtime.load_law(name, inner, **changed).laws
+        (law,) = gfm_runtime.load_law(name, inner, counts, **changed).laws
         discrete = gfm_runtime.discretise(law, T_s)
         return discrete, gfm_runtime.pack_law(discrete, omega_b=omega_b)
     except LawError as problem:
@@ -74,8 +79,9 @@ def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
     ``retuned``."""
     gains = {**controller.gains, **values}
     name = controller.asked
-    inner = controller.sets[name].inner
-    return retuned(name, tuple(sorted(gains.items())), controller.T_s, controller.omega_b, inner)
+    own, changed = controller.sets[name], tuple(sorted(gains.items()))
+    T_s, omega_b = controller.T_s, controller.omega_b
+    return retuned(name, changed, T_s, omega_b, own.inner, own.counts)
 
 
 def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
@@ -92,7 +98,9 @@ def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
             gains.update(event.values)
             try:
                 given = tuple(sorted(gains.items()))
-                found.append(retuned(name, given, scenario.T_s, omega_b, scenario.inner))
+                found.append(
+                    retuned(name, given, scenario.T_s, omega_b, scenario.inner, scenario.counts)
+                )
             except ValueError as problem:
                 raise UserError(f"events, {event.label()}: {problem}") from None
     return found

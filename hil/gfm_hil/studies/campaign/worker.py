@@ -36,12 +36,12 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     """The records of some runs. Raises RunFailed: an error that is not the run's own."""
-    room: dict[bool, tuple[Kept, Kept]] = {}
+    room: dict[int, tuple[Kept, Kept]] = {}
     records = []
     for run, law in jobs:
         try:
             scenario, drawn = campaign.scenario(run, law)
-            inner = scenario.has_inner
+            inner = scenario.carries
             if inner not in room:
                 room[inner] = kept(scenario)
             summary, columns = simulate(scenario, room[inner])
@@ -54,7 +54,7 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
 
 def kept(scenario: Scenario) -> tuple[Kept, Kept]:
     """Room for the columns of a run that its summary reads."""
-    ticks, inner = scenario.ticks, scenario.has_inner
+    ticks, inner = scenario.ticks, scenario.carries
     plant, controller = (Kept(role, ticks, inner, only=READ) for role in ("plant", "controller"))
     return plant, controller
 

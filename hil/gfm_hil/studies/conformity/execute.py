@@ -227,13 +227,13 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
 
 def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
-    seen = set[tuple[bool, int, bool]]()
+    seen = set[tuple[int, int, bool]]()
     for job in jobs:
         with suppress(UserError):  # which the verdict will say
             if job.part.cannot is not None:
                 continue
             scenario = _scenario(job)
-            kind = scenario.has_inner, len(scenario.converters), job.external is not None
+            kind = scenario.carries, len(scenario.converters), job.external is not None
             if kind in seen:
                 continue
             if job.external is not None:

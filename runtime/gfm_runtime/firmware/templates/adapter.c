@@ -15,9 +15,23 @@ static int @P@_do_step(int k, const golden_real *ref, const golden_real *y, gold
     @T@_t *s = &@P@_of[k];
     unsigned long start = GOLDEN_CLOCK(), reading = GOLDEN_CLOCK() - start;
     int result;
+/* @if counts@ */
+    uint16_t adc[GOLDEN_NY], cmp[4];
+    int i;
+    for (i = 0; i < GOLDEN_NY; i++) {
+        adc[i] = (uint16_t)y[i];
+    }
+    start = GOLDEN_CLOCK();
+    result = @T@_isr(@ARGUMENT@s, ref, adc, u, cmp);
+    golden_elapsed = GOLDEN_CLOCK() - start - reading; /* of the call, not of the clock */
+    for (i = 0; i < 3 && cmp[3] != 0; i++) {
+        u[GOLDEN_OF_STEP + i] = (golden_real)cmp[i];
+    }
+/* @else@ */
     start = GOLDEN_CLOCK();
     result = @T@_step(@ARGUMENT@s, ref, y, u);
     golden_elapsed = GOLDEN_CLOCK() - start - reading; /* of the call, not of the clock */
+/* @end@ */
     return result;
 }
 
@@ -41,7 +55,13 @@ static int @P@_do_change(int k, const golden_real *ref, const golden_real *y, go
 static view_t @P@_do_view(int k)
 {
     const @T@_t *s = &@P@_of[k];
-/* @if stages@ */
+/* @if counts@ */
+    static golden_real stage[GOLDEN_STAGE], counts[GOLDEN_COUNTS];
+    const view_t view = {s->x, s->offset, s->u, s->trend, @N@, stage, s->stage.e, s->limited, counts};
+    memcpy(stage, &s->stage, sizeof stage);
+    memcpy(counts, &s->counts, sizeof counts);
+    return view;
+/* @elif stages@ */
     static golden_real stage[GOLDEN_STAGE];
     const view_t view = {s->x, s->offset, s->u, s->trend, @N@, stage, s->stage.e, s->limited};
     memcpy(stage, &s->stage, sizeof stage);
@@ -61,6 +81,13 @@ static view_t @P@_do_view(int k)
 /* @end@ */
 }
 
+/* @if counts@ */
+static void @P@_do_go_on(int k, const golden_real *counts)
+{
+    memcpy(&@P@_of[k].counts, counts, sizeof @P@_of[k].counts);
+}
+
+/* @end@ */
 static void @P@_do_spoil(int k, int stage)
 {
 /* @if fixed@ */

@@ -4,6 +4,9 @@
 /* @if fixed@ */
 #include <stdint.h>
 
+/* @elif counts@ */
+#include <stdint.h>
+
 /* @end@ */
 #ifdef __cplusplus
 extern "C" {
@@ -28,6 +31,13 @@ typedef struct {
 } @P@_stage_t;
 
 /* @end@ */
+/* @if counts@ */
+/* What the interrupt of the A/D keeps. On a change of law copy it to the new law's instance. */
+typedef struct {
+@COUNTS@
+} @P@_counts_t;
+
+/* @end@ */
 /* One instance. All that changes is in here, so there may be several. Treat it as read-only. */
 typedef struct {
     @P@_real x[@GUARD@_NX];      /* states of the law, scaled */
@@ -37,6 +47,9 @@ typedef struct {
 /* @if stages@ */
     @P@_stage_t stage;
     int limited;                /* whether the stage limited the current in this tick */
+/* @end@ */
+/* @if counts@ */
+    @P@_counts_t counts;
 /* @end@ */
 /* @if fixed@ */
     int64_t rest[@GUARD@_NREST]; /* of the offset, the trend and x: their lower bits */
@@ -94,6 +107,18 @@ int @P@_settle(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
 int @P@_switch(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
     @P@_real u[], const @P@_real trend[]@E_OF@, @P@_real *bump);
 
+/* @if counts@ */
+/* The whole of a tick between the pins: counts of the A/D, in the order of the enum, to u[k] as step
+ * gives it and to compare counts of the legs for half a carrier; cmp[@GUARD@_NCMP] is 1 while the gates
+ * may switch. They act from the next tick on. In the safe state it is 0, and u and cmp stay. */
+int @P@_isr(@LAW@@P@_t *s, const @P@_real ref[], const uint16_t adc[],
+    @P@_real u[], uint16_t cmp[]);
+
+/* Before the first tick, and before the one after reset: sets the frame's angle from the measured
+ * voltage, which then has the components counts.sensed of it: along d, if nothing was written there. */
+void @P@_align(@LAW@@P@_t *s, const uint16_t adc[]);
+
+/* @end@ */
 #ifdef __cplusplus
 }
 #endif

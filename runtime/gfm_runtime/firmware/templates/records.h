@@ -20,6 +20,9 @@ typedef struct {
     int inner, priority; /* @KINDS@ */
     int freeze;          /* whether the states of E_u may not lead further into the limit of the current */
     int row[GFM_NX]; /* of u that each state belongs to */
+/* @if counts@ */
+    int @COUNTS_INTEGERS@; /* two currents; kind of modulator, and so on */
+/* @end@ */
     gfm_real @CONSTANTS@;
 /* @end@ */
 } gfm_law_t;

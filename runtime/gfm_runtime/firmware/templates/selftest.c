@@ -26,6 +26,9 @@ typedef struct {
 /* @if stages@ */
     const golden_real *stage, *e;
     int limited;
+/* @if counts@ */
+    const golden_real *counts;
+/* @end@ */
 /* @elif fixed@ */
     const golden_real *rest;
     int rests;
@@ -43,6 +46,9 @@ typedef struct {
         const golden_real *trend@E@, golden_real *bump);
     view_t (*view)(int k);
     void (*spoil)(int k, int stage);
+/* @if counts@ */
+    void (*go_on)(int k, const golden_real *counts);
+/* @end@ */
 } law_t;
 
 @ADAPTERS@
@@ -86,6 +92,10 @@ unsigned golden_row(const golden_word row[])
     static golden_real u[GOLDEN_NU], bump;
     static int law, k;
     golden_real ref[5], y[GOLDEN_NY], own[3];
+/* @if counts@ */
+    golden_real counts[GOLDEN_COUNTS];
+    const golden_real *sensed = y; /* what the law has measured */
+/* @end@ */
     unsigned differ;
     view_t now;
     int result;
@@ -101,17 +111,27 @@ unsigned golden_row(const golden_word row[])
         break;
     case 2: /* change to the row's law */
         now = laws[law].view(k);
-        laws[law].look(k, ref, y, own);
+/* @if counts@ */
+        memcpy(counts, now.counts, sizeof counts);
+        sensed = &counts[GOLDEN_SENSED];
+/* @end@ */
+        laws[law].look(k, ref, @MEASURED@, own);
         law = (int)row[1];
         k = 1 - k;
         laws[law].init(k);
-        laws[law].change(k, ref, y, own, now.trend@NOW_E@, &bump);
+        laws[law].change(k, ref, @MEASURED@, own, now.trend@NOW_E@, &bump);
+/* @if counts@ */
+        laws[law].go_on(k, counts);
+/* @end@ */
         break;
     case 3: /* leave the safe state */
         laws[law].reset(k);
         now = laws[law].view(k);
+/* @if counts@ */
+        sensed = &now.counts[GOLDEN_SENSED];
+/* @end@ */
         memcpy(own, now.u, sizeof own);
-        laws[law].settle(k, ref, y, own, none@NOW_E@);
+        laws[law].settle(k, ref, @MEASURED@, own, none@NOW_E@);
         break;
     case 4: /* no number in the law's state */
     case 5: /* no number in its stage's */
@@ -135,6 +155,9 @@ unsigned golden_row(const golden_word row[])
     }
     differ += compare(now.stage, row + 9, GOLDEN_STAGE);
     differ += (golden_word)now.limited != row[9 + GOLDEN_STAGE];
+/* @if counts@ */
+    differ += compare(now.counts, row + 10 + GOLDEN_STAGE, GOLDEN_COUNTS);
+/* @end@ */
 /* @elif fixed@ */
     differ += compare(now.rest, row + 9, now.rests);
 /* @end@ */

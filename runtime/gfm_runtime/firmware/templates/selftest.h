@@ -11,6 +11,9 @@ enum { GOLDEN_LAWS = @LAWS@, GOLDEN_NX = @NX@, GOLDEN_NY = @NY@, GOLDEN_NU = @NU
 /* @if stages@ */
 enum { GOLDEN_STAGE = @STAGE@, GOLDEN_E = @E_AT@, GOLDEN_BAD_U = @BAD_U@ };
 /* @end@ */
+/* @if counts@ */
+enum { GOLDEN_COUNTS = @N_COUNTS@, GOLDEN_SENSED = @SENSED@, GOLDEN_OF_STEP = 4 };
+/* @end@ */
 enum { GOLDEN_WORDS = @WORDS@ };
 
 /* One row: the number of words that differ. Rows go in their order; the first row starts anew.

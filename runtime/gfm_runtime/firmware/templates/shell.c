@@ -135,6 +135,13 @@ void @P@_reset(@P@_t *s)
     }
     s->limited = 0;
 /* @end@ */
+/* @if counts@ */
+    {
+        const @P@_counts_t rest = {
+            .angle = {@1@, @0@}, .sensed = {@AT_REST@}, .speed = @OMEGA_DEFAULT@};
+        s->counts = rest;
+    }
+/* @end@ */
 /* @if fixed@ */
     @RESET@;
 /* @end@ */
@@ -142,13 +149,19 @@ void @P@_reset(@P@_t *s)
     s->channel = -1;
 }
 
-/* @if own@ */
+/* @if counts@ */
+/* The part of a tick that is in p.u. */
+static int ticked(@LAW@@P@_t *s, const real ref[], const real y[], real u[], tick_t *t)
+{
+/* @elif own@ */
 IN_PLACE int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
-/* @else@ */
-int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
-/* @end@ */
 {
     tick_t t;
+/* @else@ */
+int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+{
+    tick_t t;
+/* @end@ */
 /* @if fixed@ */
     const real *out = t.u;
 /* @else@ */

@@ -1,0 +1,102 @@
+"""What a processor's pins have to do with: the A/D at the phases, and compare values.
+
+The phases of a space vector x that turns in the common frame are Re(x e^(j omega_b t) a^-n) with
+a = e^(j 2 pi/3) and n = 0, 1, 2; in p.u. they are p.u. of a phase's nominal peak value.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_plant.layout import field
+from gfm_plant.model import V_DC
+from gfm_plant.noise import gaussians
+from gfm_plant.records import COMPARE, N_PHASES, PlantRecords
+from gfm_plant.solution import I_F, I_O, V, own
+from gfm_runtime.compiled import compiled, inlined
+
+_A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
+_SEED = np.uint64(1 << 62)  # tells the noise of the phases from that of `sensors`
+
+
+@compiled
+def stands(plant: PlantRecords, at: float) -> complex:
+    """Return e^(j omega_b t) at an instant of the period, s after its beginning."""
+    n = plant.net[0]
+    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
+    return complex(math.cos(angle), math.sin(angle))
+
+
+@inlined
+def _along(x: int, z: complex) -> float:
+    return _A[x].real * z.real + _A[x].imag * z.imag
+
+
+@compiled
+def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: int) -> None:
+    """Write the counts of converter k's A/D at this tick to y from ``first`` on, in the order of
+    the signal table's group ``adc``.
+
+    A sensor's low-pass sees a straight line from tick to tick. A channel with skew samples earlier,
+    on the same line; the current of L_f on the slope that it has before the tick, where its bridge
+    has a zero vector if it is switched.
+    """
+    r, s, w = plant.par[k], plant.st[k], field(plant.now[0], "w")
+    turn = stands(plant, 0.0)
+    i, v, i_o = w[own(k) + I_F] * turn, w[own(k) + V] * turn, w[own(k) + I_O] * turn
+    i, i_o = i * r.current, i_o * r.current
+    slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
+    if r.levels == 0:
+        E = complex(s.E[0], s.E[1]) * field(plant.now[0], "unit")[k] * turn
+        slope += E * (r.omega_b / r.L_f)
+    for j in range(N_PHASES):
+        x = (j - 1) % 3
+        value = _along(x, i if j < 4 else (v if j < 7 else i_o)) if j > 0 else s.x[V_DC]
+        if math.isnan(s.phase_seen[0, j]):
+            s.phase_seen[0, j] = s.phase_seen[1, j] = value
+        change = value - s.phase_seen[0, j]
+        low = (
+            r.phase_weights[0] * s.phase_seen[1, j]
+            + r.phase_weights[1] * s.phase_seen[0, j]
+            + r.phase_weights[2] * value
+        )
+        s.phase_seen[0, j], s.phase_seen[1, j] = value, low
+        back = _along(x, slope) if 0 < j < 4 else change / plant.net[0].T_s
+        seen = low - r.phase_skew[j] * back
+        y[first + j] = _count(r, s.tick, j, seen)
+
+
+@compiled
+def _count(r: Any, tick: int, j: int, value: float) -> float:
+    """Return what channel j reads of a value, counts."""
+    noise = 0.0
+    if r.phase_noise[j] > 0.0:
+        a, b = gaussians(r.seed + _SEED, tick, j // 2)
+        noise = r.phase_noise[j] * (a if j % 2 == 0 else b)
+    value = r.phase_gain[j] * value + r.phase_offset[j] + noise
+    count = math.floor((value - r.phase_lo[j]) / r.phase_lsb[j] + 0.5)
+    return min(max(count, 0.0), r.phase_top)
+
+
+@compiled
+def apply_counts(plant: PlantRecords, k: int, begin: float, lasts: float) -> None:
+    """Set the command of an averaged bridge that acts to the mean voltage, which stands still, of
+    the compare values that came with it.
+
+    Args:
+        begin: of the stretch in which it acts, s after that of the period.
+        lasts: how long, s.
+    """
+    r, s, n = plant.par[k], plant.st[k], plant.net[0]
+    z = 0j
+    for x in range(3):
+        z += _A[x] * min(max(s.u_now[COMPARE + x], 0.0), 1.0 * r.counts)
+    frame = field(plant.now[0], "unit")[k] * stands(plant, begin)
+    half = 0.5 * n.omega_b * s.u_now[1] * lasts
+    frame = frame * complex(math.cos(half), math.sin(half))
+    E = z * frame.conjugate() * (r.leg * s.x[V_DC] / r.counts)
+    s.u_now[2], s.u_now[3] = E.real, E.imag

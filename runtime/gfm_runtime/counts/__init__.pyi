@@ -1,0 +1,34 @@
+from .measure import Measure, align, measure
+from .modulate import Modulate, modulate
+from .pair import (
+    COUNTS_CONSTANTS,
+    COUNTS_NUMBERS,
+    COUNTS_STATE,
+    Counts,
+    begin_counts,
+    counts_fields,
+    counts_names,
+    counts_state_fields,
+    go_on_with,
+    named_counts,
+    pack_counts,
+)
+
+__all__ = [
+    "COUNTS_CONSTANTS",
+    "COUNTS_NUMBERS",
+    "COUNTS_STATE",
+    "Counts",
+    "Measure",
+    "Modulate",
+    "align",
+    "begin_counts",
+    "counts_fields",
+    "counts_names",
+    "counts_state_fields",
+    "go_on_with",
+    "measure",
+    "modulate",
+    "named_counts",
+    "pack_counts",
+]

@@ -1,0 +1,182 @@
+"""From the counts of an A/D at the phases to the measurements y of a law.
+
+Offset and scale of each channel; Clarke's amplitude-invariant transform; Park's, by the angle of
+the controller's own frame; then p, q and V at the filter capacitor, Eq. (9)-(11), and a low-pass.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from gfm_runtime.compiled import inlined
+from gfm_runtime.signals import N_ADC, N_LEGS
+from gfm_runtime.toml_file import TomlTable
+
+Channel = Literal["v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"]
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
+"""In the order of the signal table's group ``adc``."""
+
+I_A, V_A, I_O_A = 1, 4, 7
+"""Where the phases of each quantity begin."""
+
+
+_STILL_ABOVE = 0.1  # p.u.
+
+
+def _ascending(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise PydanticCustomError("ascending", "must be [lo, hi], ascending")
+    return value
+
+
+FullScale = Annotated[tuple[float, float], Field(strict=False), AfterValidator(_ascending)]
+
+
+class Measure(TomlTable):
+    """What the firmware takes its sensors and its A/D for; p.u. of a phase's nominal peak value."""
+
+    bits: int = Field(12, ge=8, le=16, description="of the A/D")
+    v_dc: FullScale = Field((0.0, 2.0), description="full scale [lo, hi] of the DC voltage, p.u.")
+    i: FullScale = Field((-4.0, 4.0), description="full scale of the currents of L_f, p.u.")
+    v: FullScale = Field((-2.0, 2.0), description="full scale of the voltages of C_f, p.u.")
+    i_o: FullScale = Field((-4.0, 4.0), description="full scale of the currents of the line, p.u.")
+    offset: dict[Channel, float] = Field(
+        {}, description="that a channel is known to have, p.u.; it is taken off"
+    )
+    gain: dict[Channel, float] = Field(
+        {}, description="that a channel is known to have; it is divided by"
+    )
+    phases: Literal[2, 3] = Field(
+        3, description="currents of i and i_o with a sensor; with 2 the third is their negative sum"
+    )
+    sum_most: float = Field(
+        0.2,
+        gt=0,
+        le=100,
+        description="largest sum of the three phases of a quantity, p.u.; more, for sum_s: SAFE",
+    )
+    sum_s: float = Field(0.002, ge=0, le=10, description="how long, s")
+    still_s: float = Field(
+        0.015,
+        ge=0,
+        le=10,
+        description="how long a phase may read the same while its quantity is above 0.1 p.u., and "
+        "v_dc an end of its range, s; then SAFE",
+    )
+    f_y: float = Field(0.0, ge=0, description="low-pass on v_dc, p, q and V, Hz; 0: none")
+
+    def constants(self, T_s: float) -> dict[str, Any]:
+        """The constants in ``law_dtype``, by name; T_s in s."""
+        zero, per_count = [], []
+        for name in CHANNELS:
+            low, high = getattr(self, name if name == "v_dc" else name[:-2])
+            lsb, gain = (high - low) / 2**self.bits, self.gain.get(name, 1.0)
+            zero.append((self.offset.get(name, 0.0) - low) / lsb)
+            per_count.append(lsb / gain)
+        follow = -math.expm1(-2 * math.pi * self.f_y * T_s) if self.f_y > 0 else 1.0
+        return {
+            "two": int(self.phases == 2),
+            "adc_zero": zero,
+            "adc_scale": per_count,
+            "adc_top": 2.0**self.bits - 1,
+            "sum_most": self.sum_most,
+            "sum_ticks": float(math.ceil(self.sum_s / T_s - 1e-6)),
+            "still_ticks": float(math.ceil(self.still_s / T_s - 1e-6)),
+            "still_above": 1.5 * _STILL_ABOVE**2,
+            "follow_y": follow,
+        }
+
+
+@inlined
+def measure(law, state, adc, first):
+    """y of this tick from counts: state.sensed; and the channel that is not plausible, or -1:
+    state.suspect. It is one that does not change; or of phases that do not add up one that has not
+    changed meanwhile, else the first.
+
+    Args:
+        law, state: records of ``law_dtype`` and ``state_dtype``.
+        adc: counts of the channels, from index ``first`` on.
+    """
+    y = state.sensed
+    for j in range(N_ADC):
+        state.phases[j] = adc[first + j]  # in the law's own precision
+        state.still[j] += law.one
+        if state.phases[j] != state.last[j]:
+            state.still[j] = law.zero
+        state.last[j] = state.phases[j]
+        state.phases[j] = (state.phases[j] - law.adc_zero[j]) * law.adc_scale[j]
+    if law.two != 0:
+        state.phases[I_A + 2] = -state.phases[I_A] - state.phases[I_A + 1]
+        state.phases[I_O_A + 2] = -state.phases[I_O_A] - state.phases[I_O_A + 1]
+    state.suspect = -1
+    if state.still[0] >= law.still_ticks and (
+        state.last[0] <= law.zero or state.last[0] >= law.adc_top
+    ):
+        state.suspect = 0
+    for k in range(3):
+        at = I_A + 3 * k
+        a, b, c = state.phases[at], state.phases[at + 1], state.phases[at + 2]
+        state.odd[k] = _odd(law, state.odd[k], a + b + c)
+        if state.odd[k] > law.sum_ticks and state.suspect < 0:
+            state.suspect = at
+            for x in range(N_LEGS):
+                if state.still[at + x] >= law.sum_ticks:
+                    state.suspect = at + x
+        if a * a + b * b + c * c > law.still_above:
+            for x in range(N_LEGS):
+                if state.still[at + x] >= law.still_ticks:
+                    state.suspect = at + x
+        y[5 + 2 * k], y[6 + 2 * k] = _park(law, state, a, b, c)
+    p = y[7] * y[9] + y[8] * y[10]
+    q = y[8] * y[9] - y[7] * y[10]
+    V = math.sqrt(y[7] * y[7] + y[8] * y[8])
+    y[0] = _smoothed(law, y[0], state.phases[0])
+    y[1] = _smoothed(law, y[1], p)
+    y[2] = state.speed
+    y[3] = _smoothed(law, y[3], q)
+    y[4] = _smoothed(law, y[4], V)
+
+
+@inlined
+def _odd(law, ticks, total):
+    """For how many ticks the phases of a quantity have not added up to zero."""
+    ticks += law.one
+    if abs(total) <= law.sum_most:
+        ticks = law.zero
+    return ticks
+
+
+@inlined
+def _park(law, state, a, b, c):
+    """The d and q components of three phases."""
+    alpha, beta = (a + a - b - c) * law.per_3, (b - c) * law.per_root_3
+    cosine, sine = state.angle[0], state.angle[1]
+    return alpha * cosine + beta * sine, beta * cosine - alpha * sine
+
+
+@inlined
+def _smoothed(law, low, value):
+    """One tick of the low-pass of v_dc, p, q and V."""
+    if law.follow_y < law.one:
+        value = low + law.follow_y * (value - low)
+    return value
+
+
+@inlined
+def align(law, state, adc, first):
+    """Set the frame's angle so that the voltage of these counts has the components that
+    state.sensed has; arguments as of ``measure``."""
+    for j in range(N_LEGS):
+        state.legs[j] = adc[first + V_A + j]
+        state.legs[j] = (state.legs[j] - law.adc_zero[V_A + j]) * law.adc_scale[V_A + j]
+    a, b, c = state.legs[0], state.legs[1], state.legs[2]
+    alpha, beta = (a + a - b - c) * law.per_3, (b - c) * law.per_root_3
+    cosine = alpha * state.sensed[7] + beta * state.sensed[8]
+    sine = beta * state.sensed[7] - alpha * state.sensed[8]
+    size = math.sqrt(cosine * cosine + sine * sine)
+    if size > law.least_v:
+        state.angle[0], state.angle[1] = cosine / size, sine / size

@@ -1,0 +1,54 @@
+
+/* @if own@ */
+IN_PLACE int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+/* @else@ */
+int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
+/* @end@ */
+{
+    tick_t t;
+    return ticked(@law@s, ref, y, u, &t);
+}
+
+/* @if own@ */
+IN_PLACE int @P@_isr(@LAW@@P@_t *s, const real ref[], const uint16_t adc[], real u[], uint16_t cmp[])
+/* @else@ */
+int @P@_isr(@LAW@@P@_t *s, const real ref[], const uint16_t adc[], real u[], uint16_t cmp[])
+/* @end@ */
+{
+    tick_t t;
+    real counts[@GUARD@_NADC];
+    int i, reason = s->reason;
+    cmp[@GUARD@_NCMP] = 0;
+    if (reason != @GUARD@_OK) {
+        return reason;
+    }
+    for (i = 0; i < @GUARD@_NADC; i++) {
+        counts[i] = (real)adc[i];
+    }
+    @MEASURE@;
+    if (t.suspect >= 0) {
+        s->channel = t.suspect;
+        s->reason = @GUARD@_BAD_SENSOR;
+        return s->reason;
+    }
+    reason = ticked(@law@s, ref, s->counts.sensed, u, &t);
+    if (reason == @GUARD@_OK) {
+        @MODULATE@;
+        for (i = 0; i < @GUARD@_NCMP; i++) {
+            cmp[i] = (uint16_t)t.compare[i];
+        }
+        cmp[@GUARD@_NCMP] = 1;
+    }
+    return reason;
+}
+
+void @P@_align(@LAW@@P@_t *s, const uint16_t adc[])
+{
+    tick_t t;
+    real counts[@GUARD@_NADC];
+    int i;
+    for (i = 0; i < @GUARD@_NADC; i++) {
+        counts[i] = (real)adc[i];
+    }
+    @ALIGN@;
+}

@@ -1,0 +1,129 @@
+"""Runs of laws that read counts of an A/D and give compare counts."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.core.errors import UserError
+from gfm_hil.scenario import load_scenario
+
+COUNTS = "[measure]\nbits = 16\n"
+
+
+def rig(law: str = "mimo-gfm", **by: Any) -> gfmhil.Run:
+    """A step of P_ref on the rig with nominal resistances, or the 0.9 s before it."""
+    kept = {"counts": "rig", "plant__bridge": {"kind": "two-level"}, "duration": 1.2, **by}
+    return gfmhil.run(
+        "rig_switched", law, **({"events": []} if kept["duration"] < 1 else {}), **kept
+    )
+
+
+@pytest.fixture
+def sixteen(tmp_path) -> str:
+    """Measurement with 16 bits and without a low-pass."""
+    file = tmp_path / "sixteen.toml"
+    file.write_text(COUNTS, encoding="utf-8")
+    return str(file)
+
+
+@pytest.mark.parametrize("law", ["mimo-gfm", "vsg-2"])
+@pytest.mark.parametrize(("kind", "most"), [("average", 6e-3), ("two-level", 3e-2)])
+def test_with_ideal_sensors_a_law_measures_what_it_is_given_without_them(tmp_path, law, kind, most):
+    """The averaged bridge differs by the predicted angle, which the firmware turns at once and the
+    plant after its delay; the switched one by the ripple of V besides, 2.5e-2 p.u. of q."""
+    file = tmp_path / "counts.toml"
+    file.write_text(COUNTS + "f_y = 300.0\n", encoding="utf-8")
+    by = {"plant__phases": {"bits": 16}}
+    plain = rig(law, counts="none", plant__bridge={"kind": "average"}, **by)
+    own = rig(law, counts=str(file), plant__bridge={"kind": kind}, **by)
+    assert {plain.status, own.status} <= {"completed", "oscillating"}
+    for name in ("p", "q", "V"):
+        apart = np.subtract(plain.signals[f"y_{name}"], own.signals[f"m_{name}"])
+        assert np.abs(apart).max() <= most, name
+
+
+@pytest.mark.parametrize(
+    ("error", "gives"),
+    [
+        ({"offset": {"i_o_a": 0.02}}, {50: 2 / 3 * 0.02, 100: 0.0}),
+        ({"gain": {"i_o_a": 1.04}}, {50: 0.0, 100: 0.04 / 3 * 0.5}),
+    ],
+)
+def test_an_error_of_one_current_shows_in_p_as_on_hardware(sixteen, error, gives):
+    """Clarke's transform makes of an offset a vector that stands still, 2/3 of it long: 50 Hz in
+    the frame; and of a gain one of a third that turns backwards: 100 Hz."""
+    run = rig(counts=sixteen, plant__phases={"bits": 16, **error}, plant__sensors={}, duration=0.9)
+    wrong = np.subtract(run.signals["m_p"], run.signals["y_p"])[-6000:]
+    k = np.arange(len(wrong))
+    for hertz, amplitude in gives.items():
+        found = 2 * abs(np.mean(wrong * np.exp(-2j * np.pi * hertz * 1e-4 * k)))
+        assert found == pytest.approx(amplitude, abs=3e-4), hertz
+
+
+@pytest.mark.parametrize(
+    ("phases", "named"),
+    [
+        ({"gain": {"i_b": 0.0}}, "adc_i_b"), ({"offset": {"v_c": 3.0}}, "adc_v_c"),
+        ({"offset": {"i_o_a": 0.3}}, "adc_i_o_a"),
+    ],
+)  # fmt: skip
+def test_a_sensor_that_fails_leads_to_the_safe_state_with_its_name(phases, named):
+    """Lost, at its end, and a sum that is not zero."""
+    run = rig(plant__phases=phases, duration=0.1)
+    assert run.status == "safe"
+    assert f"a sensor is not plausible: {named}" in str(run.events)
+
+
+def test_predicted_compensation_keeps_vsg_2_where_dead_time_loses_it(tmp_path):
+    """At 2 us; and it takes most of the seventh harmonic of the line's current of MIMO-GFM away."""
+    bridge, seventh = {"kind": "two-level", "dead_time_s": 2e-6}, []
+    for compensate in ("none", "predicted"):
+        file = tmp_path / f"{compensate}.toml"
+        text = f'f_y = 300.0\n[modulate]\ndead_time_s = 2e-6\ncompensate = "{compensate}"'
+        file.write_text(f"{COUNTS}{text}\nband = 0.02\n", encoding="utf-8")
+        by = {"counts": str(file), "plant__bridge": bridge, "plant__phases": {"bits": 16}}
+        run = rig("vsg-2", duration=2.0, events=[], **by)
+        assert (run.status == "tripped") == (compensate == "none")
+        run = rig(duration=2.0, events=[], **by)
+        i_o = (np.asarray(run.signals["y_adc_i_o_a"])[-4000:] - 2**15) * 8 / 2**16
+        seventh.append(2 * abs(np.mean(i_o * np.exp(-2j * np.pi * 350e-4 * np.arange(4000)))))
+    assert np.ptp(np.asarray(run.signals["y_p"])[-4000:]) < 0.03
+    assert seventh[0] > 4 * seventh[1]
+
+
+def test_the_shipped_scenario_runs_with_either_bridge():
+    for bridge in ({"kind": "average"}, {"kind": "two-level", "dead_time_s": 2e-6}):
+        run = rig(plant__bridge=bridge, counts="rig-dead-time" if len(bridge) > 1 else "rig")
+        compare = np.column_stack([run.signals[f"u_cmp_{leg}"] for leg in "abc"])
+        assert run.status in ("completed", "oscillating")
+        assert 0 < compare.min() < 2500 and 7500 < compare.max() < 10_000
+        assert np.all(compare == np.round(compare))
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("link", ["shm", "zmq"])
+def test_a_link_carries_counts_with_the_same_bits(tmp_path, link):
+    one = rig(duration=0.2)
+    other = rig(duration=0.2, link__type=link, folder=tmp_path / "run")
+    for name in ("y_adc_i_a", "u_cmp_b", "m_p", "true_v_re"):
+        assert np.array_equal(one.signals[name], other.signals[name]), name
+
+
+@pytest.mark.parametrize(
+    ("by", "says"),
+    [
+        ({"counts": "rigg"}, "unknown; use a .toml file or one of ['none', 'rig'"),
+        ({"link__type": "can"}, "link.type = 'can': carries no counts"),
+        ({"plant__bridge": {"timer_hz": 1e8}}, "plant.bridge has 5000: timer_hz and carriers"),
+        ({"plant__phases": {"bits": 17}}, "plant.phases.bits: must be less than or equal to 16"),
+        ({"plant__phases": {"v": [2.0, -2.0]}}, "range [2.0, -2.0]: must be [lo, hi] with lo < hi"),
+        ({"plant__phases": {"skew_s": {"i_a": 2e-4}}}, "plant.phases.skew_s.i_a = 0.0002: must be"),
+        ({"plant__bridge": {"kind": "two-level", "carrier_hz": 15e3}}, "must be 10000 or 20000"),
+    ],
+)
+def test_what_does_not_fit_is_told_in_one_line(by, says):
+    with pytest.raises(UserError) as told:
+        load_scenario("rig_switched", **by)
+    assert says in str(told.value) and "\n" not in str(told.value)
