@@ -153,7 +153,8 @@ def _numbers(option: str, text: str, kind: type, low: Any, high: Any) -> list[An
     try:
         values = sorted({kind(word) for word in text.split(",")})
     except ValueError:
-        raise UserError(f"{option} {text!r}: numbers separated by commas") from None
+        whole = "whole numbers" if kind is int else "numbers"
+        raise UserError(f"{option} {text!r}: {whole} separated by commas") from None
     return [_within(option, value, low, high) for value in values]
 
 
