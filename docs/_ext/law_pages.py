@@ -119,7 +119,7 @@ def matrix(file: LawFile, which: str) -> str:
 
 
 def _plant(name: str, rig: bool) -> Plant:
-    home = load_law(name).laws[0].home_grid
+    home = load_law(name).first.home_grid
     options: dict[str, object] = {"factors": {"L_g": home.L_g, "R_g": home.R_g}}
     if rig:
         options |= {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": BANDWIDTH_HZ}}
@@ -147,7 +147,7 @@ def overview() -> str:
     """One row a law."""
     rows = []
     for name in law_names():
-        file, law = law_file(name), load_law(name).laws[0]
+        file, law = law_file(name), load_law(name).first
         cells = "; ".join(
             f"{i}{j} {cell_text(file, i + j)}"
             for i in "123"
@@ -177,7 +177,7 @@ def _set_points(file: LawFile) -> str:
 
 def _law(name: str) -> list[str]:
     file, laws = law_file(name), load_law(name)
-    law, home = laws.laws[0], laws.laws[0].home_grid
+    law, home = laws.first, laws.first.home_grid
     ideal, rig = worst_mode(name, False), worst_mode(name, True)
     lines = [f"(law-{name})=", f"#### {name}: {law.title}", "", " ".join(law.source.split()), ""]
     lines += ["$$", matrix(file, "phi"), "$$", ""]
@@ -207,13 +207,15 @@ def _law(name: str) -> list[str]:
         markdown(["parameter", "value", "unit", "source"], parameters),
     ]
     if laws.schedule is not None:
-        lines += ["", "Stages, by the estimated reactance $X$ of the grid [p.u.]:", ""]
+        by_V = laws.schedule.by_V
+        of = "voltage $V$" if by_V else "estimated reactance $X$ of the grid"
+        lines += ["", f"Stages, by the {of} [p.u.]:", ""]
         rows = []
-        for k, stage in enumerate(laws.schedule.stages):
+        for k, stage in enumerate(laws.schedule.in_order):
             last = k == len(laws.schedule.stages) - 1
             changed = ", ".join(f"`{n}` = {v:g}" for n, v in stage.parameters.items())
-            rows.append(("no end" if last else f"{stage.X:g}", changed or "none"))
-        lines.append(markdown(("up to $X$", "parameters that differ"), rows))
+            rows.append(("no end" if last else f"{stage.end:g}", changed or "none"))
+        lines.append(markdown(("up to $V$" if by_V else "up to $X$", "parameters that differ"), rows))
     return [*lines, ""]
 
 

@@ -40,7 +40,7 @@ from gfm_runtime.states import OK, READY, RUNNING, STATES
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
 SPARE = 2  # places for laws with other gains: one may be in force while the other is filled
-X_MAX = 10.0  # p.u.; stands for "no upper end" of a schedule's last stage
+NO_END = 10.0  # p.u.; up to which a schedule's last stage is in force
 
 
 class Controller:
@@ -148,16 +148,17 @@ class Controller:
         self.ctl["request"], self.ctl["stages"] = first, 0
         if schedule is not None:
             n = len(schedule.stages)
-            X = np.sort([stage.X for stage in schedule.stages])
-            X[-1] = X_MAX
+            ends = np.array([*schedule.ends[:-1], NO_END])
             self.ctl["stages"] = n
             self.ctl["stage_law"][0, :n] = range(first, first + n)
-            self.ctl["above"][0, :n] = X * (1 + schedule.hysteresis)
-            self.ctl["below"][0, :n] = X * (1 - schedule.hysteresis)
+            self.ctl["by_V"] = schedule.by_V
+            self.ctl["above"][0, :n] = ends * (1 + schedule.hysteresis)
+            self.ctl["below"][0, :n] = ends * (1 - schedule.hysteresis)
             self.ctl["since"] = 0
             self.ctl["dwell"] = round(schedule.dwell_s / self.T_s)
-            self.est[:] = make_impedance(self.T_s, schedule.X_0, self.omega_b, schedule.X_f)
-            self.ctl["request"] = first + int(np.searchsorted(X[:-1], schedule.X_0))
+            if schedule.X_0 is not None:
+                self.est[:] = make_impedance(self.T_s, schedule.X_0, self.omega_b, schedule.X_f)
+            self.ctl["request"] = first + schedule.start
 
     def retune(self, discrete: DiscreteLaw, packed: NDArray[Any], gains: dict[str, float]) -> int:
         """Request the law that was requested last with other gains; bumpless, at the next tick.

@@ -27,13 +27,18 @@ class LawSet:
     """The laws of one name: a single law, or the stages of a gain-scheduled one."""
 
     name: str  #: what results call it
-    #: one law, or one for each stage in ascending order of the stage's reactance
+    #: one law, or one for each stage in the order of `Schedule.ends`
     laws: tuple[BuiltLaw, ...]
     schedule: Schedule | None = None  #: None, or the limits of the stages
     #: the inner stage that replaces the law file's own, by name or path; None: its own
     inner: str | None = None
     counts: str | None = None  #: likewise, measurement and modulation
     asked: str = ""  #: the name or path by which it is asked for; its name if empty
+
+    @property
+    def first(self) -> BuiltLaw:
+        """The law that is in force at the start."""
+        return self.laws[self.schedule.start if self.schedule else 0]
 
 
 def law_titles(names: Iterable[str]) -> dict[str, str]:
@@ -125,7 +130,7 @@ def load_law(
     file = law_file(name)
     if inner is not None:
         file = file.model_copy(update={"inner": named_inner(inner)})
-    stages = sorted(file.schedule.stages, key=lambda stage: stage.X) if file.schedule else []
+    stages = file.schedule.in_order if file.schedule else []
     sets = [{**stage.parameters, **changed} for stage in stages] or [changed]
     try:
         laws = tuple(build_law(file, parameters) for parameters in sets)
@@ -137,5 +142,5 @@ def load_law(
 
 
 def get_law(name: str, **changed: float) -> BuiltLaw:
-    """A single law; of a gain-scheduled one, the first stage."""
-    return load_law(name, None, None, **changed).laws[0]
+    """A single law; of a gain-scheduled one, the stage in force at the start."""
+    return load_law(name, None, None, **changed).first

@@ -54,7 +54,8 @@ controller_dtype = np.dtype(
         # gain scheduling: how many points, and the law of each
         ("stages", "i8"),
         ("stage_law", "i8", (MAX_STAGES,)),
-        ("above", "f8", (MAX_STAGES,)),  # the next point is taken above this reactance, p.u.
+        ("by_V", "i8"),  # whether the points are voltages; else reactances of the grid
+        ("above", "f8", (MAX_STAGES,)),  # the next point is taken above this value, p.u.
         ("below", "f8", (MAX_STAGES,)),  # and left again below this one, p.u.
         ("dwell", "i8"),  # least ticks between two changes
         ("since", "i8"),  # ticks since the last change, until the next one is allowed
@@ -116,28 +117,32 @@ def follow_plant(ctl, tripped):
 
 
 @inlined
-def choose(c, now, X, above, below):
-    """The stage for the reactance X, p.u., with hysteresis and a least time between changes."""
+def choose(c, now, at, above, below):
+    """The stage for a reactance or a voltage, p.u., with hysteresis and a least time between
+    changes. A voltage that falls changes it at once, one that rises after that time above."""
     stage = now
     if c.since <= c.dwell:
         c.since += 1
+    if c.by_V and at <= above[now]:
+        c.since = 0
     if c.since > c.dwell:
-        while stage + 1 < c.stages and above[stage] < X:
+        while stage + 1 < c.stages and above[stage] < at:
             stage += 1
-        while stage > 0 and below[stage - 1] > X:
+    if c.by_V or c.since > c.dwell:
+        while stage > 0 and below[stage - 1] > at:
             stage -= 1
     return stage
 
 
 @compiled
 def _schedule(c, est, y):
-    """Request the stage for the estimated reactance."""
-    X = estimate(est, y[1], y[2], y[4])
+    """Request the stage for the voltage, or for the estimated reactance."""
+    at = y[4] if c.by_V else estimate(est, y[1], y[2], y[4])
     now = 0
     for k in range(c.stages):
         if c.stage_law[k] == c.active:
             now = k
-    stage = choose(c, now, X, c.above, c.below)
+    stage = choose(c, now, at, c.above, c.below)
     if stage != now:
         c.request, c.since = c.stage_law[stage], 0
 

@@ -7,10 +7,11 @@ and the same checks. ``docs/laws.md`` shows one line by line.
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -83,28 +84,72 @@ class SetPoints(TomlTable):
 
 
 class SchedulePoint(TomlTable):
-    """Gains of a schedule, in force up to the reactance X (p.u.)."""
+    """Gains of a schedule, in force up to the reactance X or the voltage V (p.u.)."""
 
-    X: float = Field(gt=0, description="up to which reactance, p.u.; the last one has no end")
+    X: float | None = Field(
+        None, gt=0, description="up to which reactance, p.u.; the last one has no end"
+    )
+    V: float | None = Field(
+        None, gt=0, description="up to which voltage V, p.u., in place of X; the last one has no end"
+    )
     parameters: dict[str, float] = Field(
         default_factory=dict, description="values that differ from [parameters]"
     )
 
+    @property
+    def end(self) -> float:
+        """``X`` or ``V``, p.u."""
+        return self.V or self.X or 0.0
+
 
 class Schedule(TomlTable):
-    """Gains as a function of the estimated grid reactance."""
+    """Gains as a function of the estimated grid reactance, or of the voltage V that is measured."""
 
     stages: Annotated[list[SchedulePoint], Field(min_length=2, max_length=8)] = Field(
         description="two to eight"
     )
     hysteresis: float = Field(0.15, ge=0, lt=1, description="relative, on every boundary")
-    dwell_s: float = Field(0.5, ge=0, description="least time between two changes, s")
-    X_0: float = Field(gt=0, description="estimate to start from, p.u.")
+    dwell_s: float = Field(
+        0.5,
+        ge=0,
+        description="least time between two changes, s; V takes a lower stage at once, and a higher "
+        "one after this time above its end",
+    )
+    X_0: float | None = Field(None, gt=0, description="estimate to start from, p.u.; with X alone")
     X_f: float = Field(
         0.0,
         ge=0,
         description="reactance of the converter's own filter, taken off the estimate, p.u.",
     )
+
+    @model_validator(mode="after")
+    def _one_quantity(self) -> Self:
+        by_V = self.stages[0].V is not None
+        if any((one.V is not None) != by_V or (one.X is None) != by_V for one in self.stages):
+            raise ValueError("stages: each needs X, or each needs V")
+        if by_V == (self.X_0 is not None):
+            raise ValueError("X_0: goes with stages of X, which need it")
+        return self
+
+    @property
+    def by_V(self) -> bool:
+        """Whether V chooses the stage; else the reactance."""
+        return self.stages[0].V is not None
+
+    @property
+    def in_order(self) -> list[SchedulePoint]:
+        """The stages by their ends, the least first."""
+        return sorted(self.stages, key=lambda one: one.end)
+
+    @property
+    def ends(self) -> list[float]:
+        """Up to which reactance or voltage each stage is in force, p.u., in ascending order."""
+        return [one.end for one in self.in_order]
+
+    @property
+    def start(self) -> int:
+        """The stage that is in force at the start, at ``X_0`` or at nominal voltage."""
+        return bisect_left(self.ends[:-1], self.X_0 or 1.0)
 
 
 def _base_or_whole(schema: dict[str, Any]) -> None:
@@ -170,7 +215,7 @@ class LawFile(TomlTable):
         "shipped one or of a file; none if not given",
     )
     schedule: Schedule | None = Field(
-        None, description="gains by the estimated grid reactance; fixed gains if none"
+        None, description="gains by the estimated grid reactance or by V; fixed gains if none"
     )
 
 

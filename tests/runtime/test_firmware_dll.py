@@ -33,6 +33,7 @@ SUPPORT = Path(__file__).parents[1] / "support"
 REAL64, EMT = 9, 1
 OK, MESSAGE = 0, 1
 TICKS = 1000
+DIP = {"type": "grid-voltage", "t": 0.5, "V_g": 0.97, "duration": 0.1}
 
 
 class Signal(c.Structure):
@@ -231,43 +232,61 @@ def test_only_the_interface_is_exported(built, tmp_path):
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])
-def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(built, real):
-    """What the shipped run measured, 12 s, tick by tick, with the change of stage among them."""
-    scenario = load_scenario("weakening_grid", link__type="inproc")
-    run = run_in_memory(scenario)
+@pytest.mark.parametrize(
+    ("law", "scenario", "changed", "stages"),
+    [
+        ("mimo-gfm-scheduled", "weakening_grid", {}, [0, 1]),
+        ("mimo-gfm-ride-through", "pref_step", {"duration": 3.0, "events": [DIP]}, [1, 0, 1]),
+    ],
+)
+def test_a_scheduled_law_changes_its_stage_as_the_kernel_does(
+    built, real, law, scenario, changed, stages
+):
+    """What a run measured, tick by tick, with the changes of stage among them."""
+    run = run_in_memory(load_scenario(scenario, law=law, link__type="inproc", **changed))
     refs = np.column_stack([run.columns[f"ref_{name}"][:] for name in names("ref")])
     ys = np.column_stack([run.columns[f"y_{name}"][:] for name in carried("y", False)])
     refs, ys = (np.ascontiguousarray(a.astype(real).astype(float)) for a in (refs, ys))
     u = np.array([0.5, 1.0, 1.0])
-    model = Model(built("mimo-gfm-scheduled", "none", real))
+    model = Model(built(law, "none", real))
     assert model.info.NumDoubleStates == model.info.NumFloatStates == 0
     model.start(u)
-    kernel = Controller([load_law("mimo-gfm-scheduled")], T_S, refs[0], real=real)
+    kernel = Controller([load_law(law)], T_S, refs[0], real=real)
     kernel.start(np.zeros(kernel.active_law.order), u)
-    settle_into(kernel.laws[0], kernel.states[0], refs[0], ys[0], u.copy(), np.zeros(3))
+    k = int(kernel.ctl["active"][0])
+    settle_into(kernel.laws[k], kernel.states[k], refs[0], ys[0], u.copy(), np.zeros(3))
     records = kernel.ctl, kernel.laws, kernel.states, kernel.est, ys[0], u
     control_it = control.compile(tuple(map(typeof, records)))  # else it asks for types every tick
-    expected = u.copy()
+    expected, active = u.copy(), [k]
     for k in range(len(ys)):
         kernel.ctl["ref"] = kernel.ctl["ref_target"] = refs[k]
         control_it(*records[:4], ys[k], expected)
+        if kernel.ctl["active"][0] != active[-1]:
+            active.append(int(kernel.ctl["active"][0]))
         assert model.tick(refs[k], ys[k]) == OK
         assert model.outputs.tobytes() == np.append(expected, 0.0).tobytes(), k
-    assert kernel.ctl["changes"][0] == 1 and kernel.active == "mimo-gfm-scheduled[1]"
+    assert active == stages
 
 
 @pytest.mark.parametrize("style", STYLES)
-@pytest.mark.parametrize("inner", ["none", "cascaded"])
-def test_a_scheduled_law_is_exported_whole(tmp_path, style, inner):
-    command = ["firmware", "export", "mimo-gfm-scheduled", "--inner", inner, "--style", style]
+@pytest.mark.parametrize(
+    ("law", "inner"),
+    [
+        ("mimo-gfm-scheduled", "none"),
+        ("mimo-gfm-scheduled", "cascaded"),
+        ("mimo-gfm-ride-through", "none"),
+    ],
+)
+def test_a_scheduled_law_is_exported_whole(tmp_path, style, law, inner):
+    command = ["firmware", "export", law, "--inner", inner, "--style", style]
     assert main([*command, "-o", str(tmp_path)]) == 0
+    source = f"gfm_{law.replace('-', '_')}.c"
     for compiler in ("gcc", "clang"):
-        done = cc(tmp_path, *STRICT, "-c", "gfm_mimo_gfm_scheduled.c", compiler=compiler)
+        done = cc(tmp_path, *STRICT, "-c", source, compiler=compiler)
         assert (done.returncode, done.stderr) == (0, "")
     done = cc(tmp_path, "-S", ".", "-B", "build", compiler="cmake")
-    assert done.returncode == 0 and "gfm_mimo_gfm_scheduled.c" in (
-        tmp_path / "CMakeLists.txt"
-    ).read_text(encoding="utf-8")
+    assert done.returncode == 0
+    assert source in (tmp_path / "CMakeLists.txt").read_text(encoding="utf-8")
 
 
 def test_without_a_compiler_the_command_names_it(tmp_path, refused, monkeypatch):

@@ -1,4 +1,4 @@
-"""Gain scheduling: stages over the estimated reactance, hysteresis, dwell."""
+"""Gain scheduling: stages over the estimated reactance or the voltage, hysteresis, dwell."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ import pytest
 from gfm_runtime import LawError, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import MAX_STAGES
+from gfm_runtime.lawfile import parse_law
 
 from ..support.laws import REF
 
@@ -104,6 +105,42 @@ def test_the_estimator_is_restarted_in_place():
     held = c.est
     c.select("three")
     assert c.est is held
+
+
+def test_a_voltage_that_falls_changes_the_stage_at_once_and_its_return_after_the_dwell():
+    c = Controller([load_law("mimo-gfm-ride-through")], T_S, list(REF))
+    c.start(np.zeros(c.active_law.order), np.array([0.0, 1.0, 1.0]))
+    dip, usual = (f"mimo-gfm-ride-through[{k}]" for k in range(2))
+    dwell, stages, u = int(c.ctl["dwell"][0]), [c.active], np.zeros(3)
+    low = {*range(100, 200), *range(200 + dwell, 300 + dwell), *range(302 + dwell, 400 + dwell)}
+    second = 403 + 2 * dwell  # soon after the way back
+    for k in range(second + 10):
+        y = REF.copy()
+        y[4] = 0.98 if k in low or k == second else 0.992 if k < 100 else 1.0
+        c.step(y, u)
+        if c.active != stages[-1]:
+            stages += [k, c.active]
+        assert c.ctl["bump"][0] <= 1e-12
+    assert stages == [usual, 100, dip, 400 + 2 * dwell, usual, second, dip]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "why"),
+    [
+        ('X_0 = 0.1\n[[schedule.stages]]\nX = 0.1\n[[schedule.stages]]\nV = 0.9\n',
+         "stages: each needs X, or each needs V"),
+        ('[[schedule.stages]]\nV = 0.9\n[[schedule.stages]]\nparameters = {}\n',
+         "stages: each needs X, or each needs V"),
+        ('[[schedule.stages]]\nX = 0.1\n[[schedule.stages]]\nX = 0.9\n',
+         "X_0: goes with stages of X, which need it"),
+        ('X_0 = 1.0\n[[schedule.stages]]\nV = 0.1\n[[schedule.stages]]\nV = 0.9\n',
+         "X_0: goes with stages of X, which need it"),
+    ],
+)  # fmt: skip
+def test_stages_of_one_quantity(schedule, why):
+    text = f'base = "mimo-gfm"\nname = "own"\ntitle = ""\nsource = ""\n[schedule]\n{schedule}'
+    with pytest.raises(LawError, match=why):
+        parse_law(text)
 
 
 def test_too_many_stages():

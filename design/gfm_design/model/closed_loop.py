@@ -205,8 +205,8 @@ class ClosedLoop(LinearLoop):
         """The loop of a law on a plant, around their operating point.
 
         Args:
-            law: catalogue name, path of a law file (of a scheduled law its first stage), a law, or
-                one at its sampling time.
+            law: catalogue name, path of a law file (of a scheduled law the stage in force at the
+                start), a law, or one at its sampling time.
             plant: converter, delay, sensors, DC source, grid and factors of the elements, as in a
                 scenario; by default the paper's converter, with neither delay nor sensors.
             references: (V_dcref, P_ref, omega_g, Q_ref, V_ref), p.u.

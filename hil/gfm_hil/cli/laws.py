@@ -51,7 +51,7 @@ def call(options: argparse.Namespace) -> int:
     chosen = [names for asked, names in groups if asked] or [law_names]
     for name in (name for names in chosen for name in names()):
         laws, file = load_law(name), law_file(name)
-        first = laws.laws[0]
+        first = laws.first
         rows.append(
             {
                 "name": name,
@@ -95,7 +95,7 @@ def call_show(options: argparse.Namespace) -> int:
         print(json.dumps(_as_json(file, discrete), indent=2, ensure_ascii=False))
         return 0
     console = terminal(highlight=False)
-    first = laws.laws[0]
+    first = laws.first
     console.print(f"[bold]{laws.name}[/]: {first.title}")
     console.print(" ".join(first.source.split()).replace("[", "\\["), style="dim")
     console.print(f"errors: {first.error_map} · grid: {first.home_grid.note}")

@@ -63,7 +63,7 @@ def stages(scenario: Scenario) -> dict[str, Any]:
     if not scenario.carries:
         return {}
     laws = {
-        title: load_law(name, scenario.inner, scenario.counts).laws[0]
+        title: load_law(name, scenario.inner, scenario.counts).first
         for name, title in law_titles(scenario.laws()).items()
     }
     kinds = {name: law.inner.kind if law.inner else NO_INNER for name, law in laws.items()}

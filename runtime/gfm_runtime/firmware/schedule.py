@@ -60,7 +60,7 @@ def schedule_sources(
     bench = Controller([laws], T_s, [s.default for s in group("ref")], omega_b=omega_b)
     ctl, n = bench.ctl[0], len(stages)
     double = np.dtype(np.float64)
-    choices = {"stages": m.stages}
+    choices = {"stages": m.stages, "by_X": not schedule.by_V}
     own = style == "unrolled"
     parts = [
         (str(k), p.prefix if own else "gfm", "" if own else f"&{p.prefix}_law, ")
@@ -100,34 +100,36 @@ def schedule_sources(
         "START": str(ctl["active"]),
         "ABOVE": literals(ctl["above"][:n], double),
         "BELOW": literals(ctl["below"][:n], double),
-        "X_0": repr(float(schedule.X_0)),
-        "FUNCTIONS": _functions(m.prefix, bench.est[0], ctl, n),
+        "X_0": repr(schedule.X_0),
+        "QUANTITY": "voltage" if schedule.by_V else "estimated reactance of the grid",
+        "AT_START": "nominal V" if schedule.by_V else f"the estimate X_0 = {schedule.X_0!r} p.u.",
+        "FUNCTIONS": _functions(m.prefix, None if schedule.by_V else bench.est[0], ctl, n),
     }
     return {f"{m.prefix}{end}": written(f"schedule{end}", keys, choices) for end in (".h", ".c")}
 
 
-def _functions(prefix: str, est: np.void, ctl: np.void, n: int) -> str:
-    """The estimate of the reactance and the choice of a stage, in C."""
-    constant = ("T_s", "omega_b", "X_f", "forget", "settled")
-    grid = Struct(
-        {
-            name: est[name] if name in constant else place(name, (), f"g->{name}")
-            for name in est.dtype.names or ()
-        }
-    )
+def _functions(prefix: str, est: np.void | None, ctl: np.void, n: int) -> str:
+    """The estimate of the reactance, if it is needed, and the choice of a stage, in C."""
     scheduled = Struct(
-        {"stages": n, "dwell": ctl["dwell"], "since": place("since", (), "s->since")}
-    )
+        {"stages": n, "by_V": ctl["by_V"], "dwell": ctl["dwell"],
+         "since": place("since", (), "s->since")}
+    )  # fmt: skip
     ends = [Array(name, (n,)) for name in ("above", "below")]
-    now, X = Expr("var", ("now",), "int"), Expr("var", ("X",))
+    now, at = Expr("var", ("now",), "int"), Expr("var", ("at",))
     translate = Translator(unroll=True)
     printer = Printer(
-        est["X"].dtype, {"g": f"{prefix}_estimate_t", "s": f"{prefix}_t"}, real_type="double"
+        np.dtype(np.float64), {"g": f"{prefix}_estimate_t", "s": f"{prefix}_t"}, real_type="double"
     )
-    return "\n".join(
-        printer.function(one)
-        for one in (
-            translate.function(estimate, [grid, *(Expr("var", (name,)) for name in "pwV")]),
-            translate.function(choose, [scheduled, now, X, *ends]),
+    functions = []
+    if est is not None:
+        constant = ("T_s", "omega_b", "X_f", "forget", "settled")
+        grid = Struct(
+            {
+                name: est[name] if name in constant else place(name, (), f"g->{name}")
+                for name in est.dtype.names or ()
+            }
         )
-    )
+        arguments = [grid, *(Expr("var", (name,)) for name in "pwV")]
+        functions.append(translate.function(estimate, arguments))
+    functions.append(translate.function(choose, [scheduled, now, at, *ends]))
+    return "\n".join(printer.function(one) for one in functions)

@@ -8,7 +8,7 @@
 
 @GUARDS@
 #if DBL_MANT_DIG != 53
-#error "double is not the IEEE 754 type of 64 bits, in which the estimate is made"
+#error "double is not the IEEE 754 type of 64 bits, in which the stage is chosen"
 #endif
 
 typedef @P@_real real;
@@ -51,7 +51,9 @@ void @P@_init(@P@_t *s)
 {
     (void)memset(s, 0, sizeof *s);
 @INIT@
+    /* @if by_X@ */
     s->grid.X = @X_0@;
+    /* @end@ */
     s->active = @START@;
 }
 
@@ -69,8 +71,12 @@ int @P@_step(@P@_t *s, const real ref[], const real y[], real u[])
 {
     if (s->reason == @GUARD@_OK && accepted(ref, y)) {
         static const double above[] = {@ABOVE@}, below[] = {@BELOW@};
-        const double X = estimate(&s->grid, (double)y[1], (double)y[2], (double)y[4]);
-        const int stage = choose(s, s->active, X, above, below);
+        /* @if by_X@ */
+        const double at = estimate(&s->grid, (double)y[1], (double)y[2], (double)y[4]);
+        /* @else@ */
+        const double at = (double)y[4];
+        /* @end@ */
+        const int stage = choose(s, s->active, at, above, below);
         if (stage != s->active) {
             real own[@N_ROWS@] = {0}, trend[@N_ROWS@] = {0}@E_MEMORY@;
             look(s, ref, y, own, trend@e@);

@@ -1,7 +1,7 @@
-/* @LAW_NAME@: @COUNT@ stages of gains by the estimated reactance of the grid. @MADE@
+/* @LAW_NAME@: @COUNT@ stages of gains by the @QUANTITY@. @MADE@
  *
  * Source: @SOURCE@
- * The estimate is made in double, whatever the law's precision: it has the bench's bits. */
+ * The stage is chosen in double, whatever the law's precision: by the bench's bits. */
 #ifndef @GUARD@_H
 #define @GUARD@_H
 
@@ -24,30 +24,34 @@ enum {
     @GUARD@_BAD_REF = @FIRST_GUARD@_BAD_REF
 };
 
+/* @if by_X@ */
 /* The estimate of the grid's reactance from the swings of p and omega_u. */
 typedef struct {
     double p_smooth, omega_smooth, theta, p_slow, p_slower, s_pt, s_tt, s_pp, omega_slow;
     double X; /* p.u. */
     long age; /* ticks, until it has settled */
 } @P@_estimate_t;
+/* @end@ */
 
 /* One instance. All that changes is in here, so there may be several. Treat it as read-only. */
 typedef struct {
 @MEMBERS@
+    /* @if by_X@ */
     @P@_estimate_t grid;
+    /* @end@ */
     long since;  /* ticks since the last change, until the next one is allowed */
     long changes; /* of stage, so far */
     int active;  /* the stage that is in force, from 0 */
     int reason;  /* 0, or why it is in the safe state */
 } @P@_t;
 
-/* Makes an instance ready: the stage of the estimate X_0 = @X_0@ p.u., its states 0. */
+/* Makes an instance ready: the stage of @AT_START@, its states 0. */
 void @P@_init(@P@_t *s);
 
 /* Leaves the safe state: the states of the stage in force are 0. Call settle before the next step. */
 void @P@_reset(@P@_t *s);
 
-/* One tick, as a law's step: estimates the reactance, changes the stage without a bump if it must. */
+/* One tick, as a law's step: chooses the stage first, and changes it without a bump. */
 int @P@_step(@P@_t *s, const @P@_real ref[], const @P@_real y[], @P@_real u[]);
 
 /* As a law's settle, for the stage in force. */
