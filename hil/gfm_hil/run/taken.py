@@ -15,7 +15,7 @@ Method = Literal["trace", "proc"]
 METHODS = {"trace": "by the kernel's trace", "proc": "by /proc"}
 ROWS = np.dtype([("processor", "i4"), ("begin", "i8"), ("end", "i8"), ("ran", "i8"), ("who", "i4")])
 STOPPED = "a signal that stopped it"
-WAITS = "its own wait for memory or a disk"
+WAITS = "its own wait in the kernel"  # for memory, a disk, or a worker of a line
 _MOST = 0.5  # of a stall, that a name must explain
 
 
