@@ -215,7 +215,9 @@ def _law(name: str) -> list[str]:
             last = k == len(laws.schedule.stages) - 1
             changed = ", ".join(f"`{n}` = {v:g}" for n, v in stage.parameters.items())
             rows.append(("no end" if last else f"{stage.end:g}", changed or "none"))
-        lines.append(markdown(("up to $V$" if by_V else "up to $X$", "parameters that differ"), rows))
+        lines.append(
+            markdown(("up to $V$" if by_V else "up to $X$", "parameters that differ"), rows)
+        )
     return [*lines, ""]
 
 

@@ -90,7 +90,9 @@ class SchedulePoint(TomlTable):
         None, gt=0, description="up to which reactance, p.u.; the last one has no end"
     )
     V: float | None = Field(
-        None, gt=0, description="up to which voltage V, p.u., in place of X; the last one has no end"
+        None,
+        gt=0,
+        description="up to which voltage V, p.u., in place of X; the last one has no end",
     )
     parameters: dict[str, float] = Field(
         default_factory=dict, description="values that differ from [parameters]"
@@ -112,7 +114,7 @@ class Schedule(TomlTable):
     dwell_s: float = Field(
         0.5,
         ge=0,
-        description="least time between two changes, s; V takes a lower stage at once, and a higher "
+        description="least time between two changes, s; V takes a lower stage at once, a higher "
         "one after this time above its end",
     )
     X_0: float | None = Field(None, gt=0, description="estimate to start from, p.u.; with X alone")
