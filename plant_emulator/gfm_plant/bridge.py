@@ -13,14 +13,14 @@ Even states of the gates are levels, the odd one above each is the dead time to 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_plant.dc_link import discharge
 from gfm_plant.layout import field
-from gfm_plant.model import DELTA, V_DC, terminal
+from gfm_plant.model import DELTA, terminal
 from gfm_plant.period import limit_voltage, take_command
 from gfm_plant.records import COMPARE, N_GATES, PlantRecords
 from gfm_plant.series import (
@@ -29,67 +29,108 @@ from gfm_plant.series import (
     MID,
     REG,
     SOURCE,
+    accept,
     begin_series,
-    dc_at,
+    bend,
+    choose_powers,
     end_series,
     find_terms,
-    how_many,
+    hold_current,
     limit_of,
+    look,
+    make_powers,
     normal,
-    w_at,
 )
-from gfm_plant.solution import I_F, I_O, V, circuit, grid_source, integrals, own, turned
+from gfm_plant.solution import circuit, grid_source, integrals, turned
 from gfm_runtime.compiled import compiled, inlined
 
-_A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
-_NONE = 1e-12  # p.u.; a current that is no more is none
-_NOW = 1e-15  # s; an edge that is no further away is now
-_EVENTS = 200  # of one unit of the carrier; then currents may pass zero unseen
-_TRIES = 100
-_CLOSE = 1e-15  # p.u.; what is watched happens where it is no further from zero
-LEVELS = {"two-level": (2, 1)}
-"""Of a leg, by kind, and the state of its gates that blocks it."""
+_AXES = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
+_NO_CURRENT = 1e-12  # p.u.; a smaller one is none
+_INSTANT = 1e-15  # s; edges that are no further apart are one
+_MOST_EVENTS = 200  # in a unit of the carrier; then currents may pass zero unseen
+_MOST_STEPS = 100  # of a search
+_BALANCE = 10.0  # of v_dc that legs are moved by, per p.u. of the midpoint's displacement
+_RESOLUTION = 1e-14  # p.u.; what is watched has happened where it is further above zero
+
+
+class Topology(NamedTuple):
+    """What a leg can do.
+
+    Attributes:
+        levels: how many voltages it has.
+        off: the state of its gates that blocks it.
+        conducts: for each state of the gates how a current leaves the leg, and how one enters it:
+            by the rail N or P or the midpoint O of the DC link, and by a switch, a diode, or both.
+    """
+
+    levels: int
+    off: int
+    conducts: tuple[tuple[str, str], ...]
+
+
+_LOW, _HIGH = ("N diode", "N switch"), ("P switch", "P diode")
+TOPOLOGIES = {
+    "two-level": Topology(2, 1, (_LOW, ("N diode", "P diode"), _HIGH)),
+    "t-type": Topology(
+        3,
+        5,
+        (
+            _LOW, ("N diode", "O both"), ("O both", "O both"), ("O both", "P diode"), _HIGH,
+            ("N diode", "P diode"),
+        ),
+    ),
+}  # fmt: skip
 
 # what ends an interval before its time: + the leg, its current is zero; it begins to conduct
-# outwards, or inwards; + 3 * outwards + inwards, two legs begin to; the DC source's limit
-_NOTHING, _ZERO, _OUT, _IN, _PAIR, _LIMIT = -1, 0, 3, 6, 9, 20
+# outwards, or inwards; + 3 * outwards + inwards, two legs begin to; the DC source's limit; the
+# limit of phase currents
+_NOTHING, _ZERO, _OUT, _IN, _PAIR, _LIMIT, _PEAK = -1, 0, 3, 6, 9, 20, 21
+_ALL = 3  # legs without current
 
 
 def bands(kind: str, drops: tuple[float, float, float, float]) -> NDArray[np.float64]:
     """Return the table of a topology, (N_GATES, 2, 4); see ``band`` in `gfm_plant.records`.
 
     Args:
-        kind: a key of ``LEVELS``.
+        kind: a key of ``TOPOLOGIES``.
         drops: thresholds of switch and diode, p.u. of v_dc, and their resistances, p.u.
     """
     V_s, V_d, R_s, R_d = drops
-    least, most = np.zeros(4), np.array([1.0, 0.0, 0.0, 0.0])
-    switch, diode = np.array([0, 0, V_s, R_s]), np.array([0, 0, V_d, R_d])
-    sign = np.array([1, 1, -1, 1])  # outwards a threshold lowers the leg's voltage
+    rails = {"N": (0.0, 0.0), "O": (0.5, -0.5), "P": (1.0, 0.0)}
+    devices = {"switch": (V_s, R_s), "diode": (V_d, R_d), "both": (V_s + V_d, R_s + R_d)}
     found = np.zeros((N_GATES, 2, 4))
-    for gate, (by_out, by_in) in enumerate(
-        [
-            ((least, diode), (least, switch)),  # the lower one is on
-            ((least, diode), (most, diode)),
-            ((most, switch), (most, diode)),
-        ]
-    ):
-        found[gate] = by_out[0] + sign * by_out[1], by_in[0] + by_in[1]
+    for gate, ways in enumerate(TOPOLOGIES[kind].conducts):
+        for side, way in enumerate(ways):
+            rail, device = way.split()
+            V, R = devices[device]
+            # outwards a threshold lowers the leg's voltage
+            found[gate, side] = *rails[rail], V if side else -V, R
     return found
 
 
-@compiled
-def modulate(r: Any, s: Any, E: complex, v_dc: float) -> tuple[int, int, int]:
+@inlined
+def modulate(r: Any, s: Any, E: complex, v_dc: float, i: complex = 0j) -> tuple[int, int, int]:
     """Return the compare counts of three legs that give the voltage E, a space vector in p.u. that
     stands still, on average: what ideal firmware does.
 
     They are those of space-vector modulation: the largest and the smallest of the three voltages
     lie evenly around the middle of v_dc. What v_dc cannot give is cut off in each leg, which ends
-    in six steps.
+    in six steps. With a midpoint all three are moved together, within what is left, so that the
+    current i takes the midpoint back to the middle.
     """
     per_leg = 1.0 / (1.5 * r.leg * v_dc)
     a, b, c = _along(0, E) * per_leg, _along(1, E) * per_leg, _along(2, E) * per_leg
-    middle = 0.5 - 0.5 * (max(a, b, c) + min(a, b, c))
+    low, high = min(a, b, c), max(a, b, c)
+    middle = 0.5 - 0.5 * (high + low)
+    if r.levels > 2:
+        # what moving them upwards does to the current out of the midpoint
+        upwards = 0.0
+        for x in range(3):
+            share = (a if x == 0 else (b if x == 1 else c)) + middle
+            upwards += -_along(x, i) if share > 0.5 else _along(x, i)
+        most = max(0.5 - 0.5 * (high - low), 0.0)
+        move = _BALANCE * s.ends[0, MID] * (-1.0 if upwards > 0.0 else 1.0)
+        middle += min(max(move, -most), most)
     return _count(r, a + middle), _count(r, b + middle), _count(r, c + middle)
 
 
@@ -117,7 +158,7 @@ def _taken(r: Any, s: Any, x: int) -> int:
 @inlined
 def _along(x: int, z: complex) -> float:
     """Return the part of a space vector along the axis of leg x."""
-    return _A[x].real * z.real + _A[x].imag * z.imag
+    return _AXES[x].real * z.real + _AXES[x].imag * z.imag
 
 
 @compiled
@@ -136,12 +177,13 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
         if first < end and begin < last:
             if begin <= first:
                 for k in range(n.n_converters):
-                    _load(plant, k, unit)
+                    _load(plant, k, c, unit)
             a, b = max(begin, first) - first, min(end, last) - first
-            _go(plant, c, a, b)
+            _advance_unit(plant, c, a, b)
             for k in range(n.n_converters):
                 s = plant.st[k]
-                s.ahead = normal(s.ahead * turned(n.omega_b * s.u_now[1] * (b - a)))
+                half = turned(0.5 * n.omega_b * s.u_now[1] * (b - a))
+                s.ahead = normal(s.ahead * half * half)
                 s.x[DELTA] += (b - a) * (n.omega_b * s.u_now[1] - speed)
             if last <= end:
                 for k in range(n.n_converters):
@@ -151,27 +193,28 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
     end_series(plant, c, begin, end - begin)
 
 
-@compiled
-def _load(plant: PlantRecords, k: int, unit: int) -> None:
+@inlined
+def _load(plant: PlantRecords, k: int, c: int, unit: int) -> None:
     """Begin a unit of the carrier: take the command that acts, and load compare values."""
     n, r, s = plant.net[0], plant.par[k], plant.st[k]
+    s.ends[0, REG] -= r.i_u_gain * s.u_now[0]
     take_command(plant, k, field(n, "unit_part")[unit])
+    s.ends[0, REG] += r.i_u_gain * s.u_now[0]
     _watch_source(r, s)
-    if s.trip != 0:
-        for x in range(3):
-            s.gate[x], s.level[x], s.base[x] = r.off, -1, -1
-            s.edges[x, 0] = s.edges[x, 1] = s.on_at[x] = math.inf
+    if s.trip != 0 or _over_peak(n, c, r, s, 0) > 0.0:
+        _block(r, s)
         s.E[0] = s.E[1] = 0.0
         return
-    limit_voltage(s, r.m_max * s.x[V_DC])
+    limit_voltage(s, r.m_max * s.ends[0, DC])
     half = turned(0.5 * n.omega_b * s.u_now[1] * n.unit_s)
     E = complex(s.E[0], s.E[1]) * s.ahead * half
-    counts = modulate(r, s, E, s.x[V_DC])
+    i = complex(s.ends[0, 0], s.ends[0, 1]) * field(n, "axis")[c].conjugate()
+    counts = modulate(r, s, E, s.ends[0, DC], i)
     if not s.u_now[COMPARE] < 0.0:  # those of the controller
         counts = _taken(r, s, 0), _taken(r, s, 1), _taken(r, s, 2)
     down = n.updates == 2 and unit % 2 == 1  # the second half of the carrier's period
     for x in range(3):
-        base = min(counts[x] // r.counts, r.levels - 2)
+        base = 0 if r.levels == 2 else min(counts[x] // r.counts, r.levels - 2)
         on = counts[x] - base * r.counts
         s.base[x] = base
         s.edges[x, 0] = -1.0 if down else on * r.count_s
@@ -183,59 +226,87 @@ def _load(plant: PlantRecords, k: int, unit: int) -> None:
 
 
 @inlined
+def _block(r: Any, s: Any) -> None:
+    """Turn all switches off until compare values are loaded."""
+    s.soonest = math.inf
+    for x in range(3):
+        s.gate[x], s.level[x], s.base[x] = r.off, -1, -1
+        s.edges[x, 0] = s.edges[x, 1] = s.on_at[x] = s.next[x] = math.inf
+
+
+@inlined
+def _over_peak(n: Any, c: int, r: Any, s: Any, end: int) -> float:
+    """Return by how much a phase current is above the hardware's limit, p.u., at an end of an
+    interval."""
+    most = 0.0
+    for x in range(3):
+        most = max(most, abs(_of_leg(n, c, x, s.ends[end, 0], s.ends[end, 1])))
+    return r.current * most - r.i_peak
+
+
+@inlined
 def _watch_source(r: Any, s: Any) -> None:
     """Set between which limits the DC source's control is, and whether its integral goes on."""
     if s.trip != 0:
         s.limit, s.winds = 1.0, 0.0
         return
-    asked = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
+    asked = r.k_p * (1.0 - s.ends[0, DC]) + s.ends[0, REG]
     s.limit = 1.0 if asked > s.i_most[0] else (-1.0 if asked < s.i_most[1] else 0.0)
-    s.winds = 0.0 if s.limit * (1.0 - s.x[V_DC]) > 0.0 else 1.0
+    s.winds = 0.0 if s.limit * (1.0 - s.ends[0, DC]) > 0.0 else 1.0
 
 
-@compiled
-def _go(plant: PlantRecords, c: int, begin: float, end: float) -> None:
+@inlined
+def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None:
     """Go on from edge to edge, between two instants of a unit, s after its beginning."""
     n, t, events = plant.net[0], begin, 0
     longest = LARGEST / field(n, "fastest")[c]
     for k in range(n.n_converters):
-        if plant.par[k].filtered:
-            w = field(plant.now[0], "w")
-            _see(plant.par[k], plant.st[k], 0, w[own(k) + V], w[own(k) + I_O])
-    while True:
+        s = plant.st[k]
+        s.soonest = s.next[0] = s.next[1] = s.next[2] = begin
+    while t < end:
         until, watched = min(end, t + longest), False
         for k in range(n.n_converters):
             r, s = plant.par[k], plant.st[k]
-            changed = t == begin
-            for x in range(3):
-                e_0, e_1 = s.edges[x, 0], s.edges[x, 1]
-                level = s.base[x] + (1 if t < e_0 or t >= e_1 else 0)
-                if level != s.level[x] and s.base[x] >= 0:
-                    _command(r, s, x, level, t)
-                    changed = True
-                while s.on_at[x] <= t + _NOW:
-                    _turn_on(r, s, x, t)
-                    changed = True
-                edge = e_0 if t < e_0 else (e_1 if t < e_1 else math.inf)
-                until = min(until, edge, s.on_at[x])
-            if changed:
+            if s.soonest <= t + _INSTANT:
+                _switch(r, s, t)
+            if s.due == 2:
                 _settle(plant, k, c)
-            watched = watched or s.open >= 0 or _flows(s) or r.i_max < math.inf or r.energy > 0.0
-        if t >= end:
-            return
-        h = until - t
-        terms = how_many(h * field(n, "fastest")[c])
-        find_terms(plant, c, h, terms, watched)
-        tau, which, what = 1.0, -1, _NOTHING
-        if watched and events < _EVENTS:
-            tau, which, what = _first_event(plant, c, terms)
-        if tau < 1.0:
-            _cut(plant, terms, tau)
-        _take(plant, tau * h)
+            if s.due > 0:
+                _prepare(plant, k, c)
+            until = min(until, s.soonest)
+            watched = watched or s.open >= 0 or _flows(s) or s.i_most[0] < math.inf
+            watched = watched or r.i_peak < math.inf
+        h, tau, which, what = until - t, 1.0, -1, _NOTHING
+        terms = find_terms(plant, c, h)
+        if watched and events < _MOST_EVENTS:
+            tau, which, what = _first_event(plant, c, h, terms)
+        for k in range(n.n_converters):
+            if t == begin and plant.par[k].filtered:
+                _see(plant.par[k], plant.st[k], 0)
+            if tau < 1.0:
+                look(plant, k, c, h, terms, tau)
+            _sense(plant, k, c, h, terms, tau)
+        accept(plant, c, tau * h, terms, tau)
         t = until if tau == 1.0 else t + tau * h
         if what != _NOTHING:
             events += 1
             _change(plant, which, c, what)
+
+
+@inlined
+def _switch(r: Any, s: Any, t: float) -> None:
+    """Turn on and off what the edges and dead times of a bridge ask for at an instant of a unit."""
+    s.soonest, s.due = math.inf, 2
+    for x in range(3):
+        if s.next[x] <= t + _INSTANT:
+            e_0, e_1 = s.edges[x, 0], s.edges[x, 1]
+            level = s.base[x] + (1 if t < e_0 or t >= e_1 else 0)
+            if level != s.level[x] and s.base[x] >= 0:
+                _command(r, s, x, level, t)
+            while s.on_at[x] <= t + _INSTANT:
+                _turn_on(r, s, x, t)
+            s.next[x] = min(e_0 if t < e_0 else (e_1 if t < e_1 else math.inf), s.on_at[x])
+        s.soonest = min(s.soonest, s.next[x])
 
 
 @inlined
@@ -244,7 +315,7 @@ def _flows(s: Any) -> bool:
     return s.flows[0] != 0 or s.flows[1] != 0 or s.flows[2] != 0
 
 
-@compiled
+@inlined
 def _command(r: Any, s: Any, x: int, level: int, t: float) -> None:
     """Begin to bring leg x to a level: what is on turns off at once."""
     s.level[x] = level
@@ -258,7 +329,7 @@ def _command(r: Any, s: Any, x: int, level: int, t: float) -> None:
         s.on_at[x] = t + r.dead
 
 
-@compiled
+@inlined
 def _turn_on(r: Any, s: Any, x: int, t: float) -> None:
     """End a dead time of leg x."""
     wanted = 2 * s.level[x]
@@ -279,52 +350,48 @@ def _voltage(r: Any, s: Any, x: int, side: int, v_dc: float, mid: float, i: floa
 
 
 @inlined
-def _seen_by(n: Any, c: int, x: int, z: complex) -> float:
-    """Return the part of a space vector of circuit c along the axis of leg x."""
-    return _along(x, z * field(n, "axis")[c].conjugate())
+def _of_leg(n: Any, c: int, x: int, a: float, b: float) -> float:
+    """Return the part of a space vector a + jb of circuit c along the axis of leg x."""
+    axis = field(n, "leg_axis")[c, x]
+    return axis.real * a + axis.imag * b
 
 
-@compiled
+@inlined
 def _settle(plant: PlantRecords, k: int, c: int) -> None:
     """Find which devices of bridge k conduct, after its gates have changed or a current has become
     zero."""
-    n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
+    n, r, s = plant.net[0], plant.par[k], plant.st[k]
     none, which = 0, -1
     s.flows[0] = s.flows[1] = s.flows[2] = 0
     for x in range(3):
         if r.wide[s.gate[x]]:
-            i = field(now, "w")[own(k) + I_F] * r.current
-            along = _seen_by(n, c, x, i)
-            if abs(along) > _NONE:
+            along = r.current * _of_leg(n, c, x, s.ends[0, 0], s.ends[0, 1])
+            if abs(along) > _NO_CURRENT:
                 s.flows[x] = 1 if along > 0.0 else -1
             else:
                 none, which = none + 1, x
     s.open = -1
     if none >= 2:
-        field(now, "w")[own(k) + I_F] = 0j
-        v = field(now, "w")[own(k) + V]
-        excess, out, into = _drives(n, c, r, s, v, s.x[V_DC], s.mid)
+        hold_current(plant, k, c, 0j)
+        excess, out, into = _drives(n, c, r, s, 0)
         if excess > 0.0:
             _conduct_pair(plant, k, c, out, into)
         else:
-            s.open = 3
+            s.open = _ALL
     elif none == 1:
         _hold_or_conduct(plant, k, c, which)
-    _prepare(plant, k, c)
 
 
 @compiled
-def _drives(
-    n: Any, c: int, r: Any, s: Any, v: complex, v_dc: float, mid: float
-) -> tuple[float, int, int]:
+def _drives(n: Any, c: int, r: Any, s: Any, end: int) -> tuple[float, int, int]:
     """Return by how much the circuit would drive a current through a bridge without any, p.u. of
-    v_dc, and the legs by which it would leave and enter it."""
+    v_dc, and the legs by which it would leave and enter it; ``end``: of the interval, 0 or 1."""
     out = into = 0
     low, high = -math.inf, math.inf
     for x in range(3):
-        outside = _seen_by(n, c, x, v) / (1.5 * r.leg)
-        least = _voltage(r, s, x, 0, v_dc, mid, 0.0) - outside
-        most = _voltage(r, s, x, 1, v_dc, mid, 0.0) - outside
+        outside = _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / (1.5 * r.leg)
+        least = _voltage(r, s, x, 0, s.ends[end, DC], s.ends[end, MID], 0.0) - outside
+        most = _voltage(r, s, x, 1, s.ends[end, DC], s.ends[end, MID], 0.0) - outside
         if least > low:
             low, out = least, x
         if most < high:
@@ -345,46 +412,81 @@ def _conduct_pair(plant: PlantRecords, k: int, c: int, out: int, into: int) -> N
 
 
 @compiled
-def _floats(
-    n: Any, c: int, r: Any, s: Any, x: int, v: complex, i: complex, v_dc: float, mid: float
-) -> float:
-    """Return the voltage of leg x without current, whose two others conduct, p.u. of v_dc."""
-    mean = 0.0
+def _beyond(n: Any, c: int, r: Any, s: Any, x: int, end: int) -> tuple[float, float]:
+    """Return by how much the voltage of leg x, which has no current and whose two others conduct,
+    is below the least and above the largest one that it can have, p.u. of v_dc."""
+    v_dc, mid, mean = s.ends[end, DC], s.ends[end, MID], 0.0
     for y in range(3):
         if y != x:
             side = 1 if s.flows[y] < 0 else 0
-            mean += 0.5 * _voltage(r, s, y, side, v_dc, mid, _seen_by(n, c, y, i))
-    return mean + 1.5 * _seen_by(n, c, x, v) / (1.5 * r.leg)
+            i = r.current * _of_leg(n, c, y, s.ends[end, 0], s.ends[end, 1])
+            mean += 0.5 * _voltage(r, s, y, side, v_dc, mid, i)
+    has = mean + _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / r.leg
+    return (
+        _voltage(r, s, x, 0, v_dc, mid, 0.0) - has, has - _voltage(r, s, x, 1, v_dc, mid, 0.0)
+    )  # fmt: skip
 
 
 @compiled
 def _hold_or_conduct(plant: PlantRecords, k: int, c: int, x: int) -> None:
     """Have leg x, which has no current, carry none, unless the circuit drives one."""
-    n, r, s, w = plant.net[0], plant.par[k], plant.st[k], field(plant.now[0], "w")
-    i = w[own(k) + I_F] * r.current
-    has = _floats(n, c, r, s, x, w[own(k) + V], i, s.x[V_DC], s.mid)
+    s = plant.st[k]
+    out, into = _beyond(plant.net[0], c, plant.par[k], s, x, 0)
     s.flows[x], s.open = 0, -1
-    if has < _voltage(r, s, x, 0, s.x[V_DC], s.mid, 0.0):
+    if out > 0.0:
         s.flows[x] = 1
-    elif has > _voltage(r, s, x, 1, s.x[V_DC], s.mid, 0.0):
+    elif into > 0.0:
         s.flows[x] = -1
     else:
         s.open = x
-        w[own(k) + I_F] -= _A[x] * field(n, "axis")[c] * (_seen_by(n, c, x, i) / r.current)
+        _end_current(plant, k, c, x)
 
 
 @compiled
+def _end_current(plant: PlantRecords, k: int, c: int, x: int) -> None:
+    """Take what rounding has left of leg x's current."""
+    n, s = plant.net[0], plant.st[k]
+    a, b, axis = s.ends[0, 0], s.ends[0, 1], field(n, "leg_axis")[c, x]
+    along = _of_leg(n, c, x, a, b)
+    hold_current(plant, k, c, complex(a - along * axis.real, b - along * axis.imag))
+
+
+@inlined
 def _prepare(plant: PlantRecords, k: int, c: int) -> None:
+    """Make the equations ready until the next edge."""
+    plant.st[k].due = 0
+    if not field(plant.net[0], "alone")[c]:
+        _set_rates(plant, k, c)
+    elif choose_powers(plant, c, _key(plant.net[0], plant.par[0], plant.st[0], c)):
+        _set_rates(plant, 0, c)
+        make_powers(plant, c)
+
+
+@inlined
+def _key(n: Any, r: Any, s: Any, c: int) -> int:
+    """Return a number > 0 of what the equations of a bridge depend on, besides its parameters."""
+    a = r.band_kind[s.gate[0], 1 if s.flows[0] < 0 else 0]
+    b = r.band_kind[s.gate[1], 1 if s.flows[1] < 0 else 0]
+    d = r.band_kind[s.gate[2], 1 if s.flows[2] < 0 else 0]
+    if r.cancels and a == b and b == d:
+        a = b = d = 0
+    key = ((a * 16 + b) * 16 + d) * 8 + s.open + 1
+    key = key * 3 + int(s.limit) + 1
+    key = (key * 2 + (1 if s.winds > 0.0 else 0)) * 2 + (1 if s.chopper > 0.0 else 0)
+    return key * len(field(n, "alone")) + c + 1
+
+
+@compiled
+def _set_rates(plant: PlantRecords, k: int, c: int) -> None:
     """Set what bridge k's voltage is made of, and what drives the current of L_f, until the next
     edge. A leg without current takes its axis out of what drives."""
     n, r, s = plant.net[0], plant.par[k], plant.st[k]
-    axis = field(n, "axis")[c]
     by_dc = by_mid = drop = 0j
     R_aa = R_bb = r.R_f
     R_ab = 0.0
     for x in range(3):
         b = r.band[s.gate[x], 1 if s.flows[x] < 0 else 0]
-        a = _A[x] * axis
+        a = field(n, "leg_axis")[c, x]
         if b[0] != 0.0:
             by_dc += b[0] * a
         if b[1] != 0.0:
@@ -400,10 +502,10 @@ def _prepare(plant: PlantRecords, k: int, c: int) -> None:
     per_L = r.omega_b / (r.L_f * r.current)
     q_aa = q_bb = per_L
     q_ab = 0.0
-    if s.open == 3:
+    if s.open == _ALL:
         q_aa = q_bb = 0.0
     elif s.open >= 0:
-        a = _A[s.open] * axis
+        a = field(n, "leg_axis")[c, s.open]
         q_aa, q_ab, q_bb = (
             per_L * a.imag * a.imag, -per_L * a.real * a.imag, per_L * a.real * a.real
         )  # fmt: skip
@@ -424,19 +526,26 @@ def _times(q_aa: float, q_ab: float, q_bb: float, z: complex) -> complex:
 
 
 @compiled
-def _first_event(plant: PlantRecords, c: int, terms: int) -> tuple[float, int, int]:
+def _first_event(plant: PlantRecords, c: int, h: float, terms: int) -> tuple[float, int, int]:
     """Return when in the interval, as a part of it, the first of what is watched happens; in which
     converter; and what."""
-    first, which, what = 1.0, -1, _NOTHING
-    for k in range(plant.net[0].n_converters):
-        if not _may_happen(plant, k, c, terms):
+    n, first, which, what = plant.net[0], 1.0, -1, _NOTHING
+    for k in range(n.n_converters):
+        r, s = plant.par[k], plant.st[k]
+        if first < 1.0:
+            look(plant, k, c, h, terms, first)
+        f_0, f_1 = _excess(n, c, r, s, 0)[0], _excess(n, c, r, s, 1)[0]
+        # paths of currents are nearly straight
+        straight = s.open < 0 and s.i_most[0] == math.inf
+        if straight and max(f_0, f_1) < -r.current * bend(plant, k, c, h):
             continue
-        a, f_a = 0.0, _strain(plant, k, c, terms, 0.0)[0]
+        a, f_a, most = 0.0, f_0, first
         for part in range(1, 5):  # a current may leave zero and come back
-            b = 0.25 * part * first
-            f_b, found = _strain(plant, k, c, terms, b)
-            if f_b > 0.0:
-                first, what = _find(plant, k, c, terms, a, f_a, b, f_b, found)
+            b = 0.25 * part * most
+            look(plant, k, c, h, terms, b)
+            f_b, happens = _excess(n, c, r, s, 1)
+            if f_b > _RESOLUTION:
+                first, what = _search(plant, k, c, h, terms, a, f_a, b, f_b, happens)
                 which = k
                 break
             a, f_a = b, f_b
@@ -444,39 +553,23 @@ def _first_event(plant: PlantRecords, c: int, terms: int) -> tuple[float, int, i
 
 
 @compiled
-def _may_happen(plant: PlantRecords, k: int, c: int, terms: int) -> bool:
-    """Return whether anything that is watched of converter k may happen in the interval: not where
-    it is currents alone, and each further from zero than all terms together can take it."""
-    n, now, s = plant.net[0], plant.now[0], plant.st[k]
-    if s.open >= 0 or s.i_most[0] < math.inf:
-        return True
-    x, i = field(now, "terms"), own(k) + I_F
-    reach = _NONE
-    for j in range(1, terms + 1):
-        reach += abs(x[j, i].real) + abs(x[j, i].imag)
-    for leg in range(3):
-        if s.flows[leg] != 0 and s.flows[leg] * _seen_by(n, c, leg, x[0, i]) <= reach:
-            return True
-    return False
-
-
-@compiled
-def _find(
-    plant: PlantRecords, k: int, c: int, terms: int,
+def _search(
+    plant: PlantRecords, k: int, c: int, h: float, terms: int,
     a: float, f_a: float, b: float, f_b: float, what: int,
 ) -> tuple[float, int]:  # fmt: skip
-    """Return where the strain is zero, between a, where it is not above, and b, where it is; and
+    """Return where the excess is zero, between a, where it is not above, and b, where it is; and
     what it is of. By false position (the Illinois form)."""
     side = 0
-    for _ in range(_TRIES):
+    for _ in range(_MOST_STEPS):
         at = 0.5 * (a + b)
-        if f_a < -_CLOSE:  # else it may be that of a current which has just begun to flow
+        if f_a < -_RESOLUTION:  # else it may be that of a current which has just begun to flow
             at = (a * f_b - b * f_a) / (f_b - f_a)
-        if not a < at < b or f_b < _CLOSE:
+        if not a < at < b or f_b < _RESOLUTION:
             break
-        f, found = _strain(plant, k, c, terms, at)
+        look(plant, k, c, h, terms, at)
+        f, happens = _excess(plant.net[0], c, plant.par[k], plant.st[k], 1)
         if f > 0.0:
-            b, f_b, what = at, f, found
+            b, f_b, what = at, f, happens
             f_a *= 0.5 if side == 1 else 1.0
             side = 1
         else:
@@ -487,36 +580,31 @@ def _find(
 
 
 @compiled
-def _strain(plant: PlantRecords, k: int, c: int, terms: int, tau: float) -> tuple[float, int]:
-    """Return the largest of what is watched of converter k at a part tau of the interval, each
-    above zero where it has happened, and which it is."""
-    n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
+def _excess(n: Any, c: int, r: Any, s: Any, end: int) -> tuple[float, int]:
+    """Return the largest of what is watched of a converter at an end of the interval, each above
+    zero where it has happened, and which it is."""
     worst, what = -math.inf, _NOTHING
-    v_dc = dc_at(now, k, DC, terms, tau)
-    if s.open >= 0 or _flows(s):
-        i = w_at(now, own(k) + I_F, terms, tau) * r.current
-        for x in range(3):
-            if s.flows[x] != 0:
-                value = -s.flows[x] * _seen_by(n, c, x, i)
-                if value > worst:
-                    worst, what = value, _ZERO + x
-        if s.open >= 0:
-            v, mid = w_at(now, own(k) + V, terms, tau), dc_at(now, k, MID, terms, tau)
-            if s.open == 3:
-                value, out, into = _drives(n, c, r, s, v, v_dc, mid)
-                if value > worst:
-                    worst, what = value, _PAIR + 3 * out + into
-            else:
-                x = s.open
-                has = _floats(n, c, r, s, x, v, i, v_dc, mid)
-                value = _voltage(r, s, x, 0, v_dc, mid, 0.0) - has
-                if value > worst:
-                    worst, what = value, _OUT + x
-                value = has - _voltage(r, s, x, 1, v_dc, mid, 0.0)
-                if value > worst:
-                    worst, what = value, _IN + x
+    for x in range(3):
+        if s.flows[x] != 0:
+            value = -s.flows[x] * r.current * _of_leg(n, c, x, s.ends[end, 0], s.ends[end, 1])
+            if value > worst:
+                worst, what = value, _ZERO + x
+    if s.open == _ALL:
+        value, out, into = _drives(n, c, r, s, end)
+        if value > worst:
+            worst, what = value, _PAIR + 3 * out + into
+    elif s.open >= 0:
+        least, most = _beyond(n, c, r, s, s.open, end)
+        if max(least, most) > worst:
+            worst = max(least, most)
+            what = (_OUT if least > most else _IN) + s.open
+    if r.i_peak < math.inf and s.base[0] >= 0:
+        value = _over_peak(n, c, r, s, end)
+        if value > worst:
+            worst, what = value, _PEAK
     if s.trip == 0 and s.i_most[0] < math.inf:
-        asked = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - v_dc) + dc_at(now, k, REG, terms, tau)
+        v_dc = s.ends[end, DC]
+        asked = r.k_p * (1.0 - v_dc) + s.ends[end, REG]
         if s.limit == 0.0:
             value = max(asked - s.i_most[0], s.i_most[1] - asked)
         else:
@@ -531,82 +619,78 @@ def _strain(plant: PlantRecords, k: int, c: int, terms: int, tau: float) -> tupl
 def _change(plant: PlantRecords, k: int, c: int, what: int) -> None:
     """Go on after an event in converter k, in the state at its instant."""
     r, s = plant.par[k], plant.st[k]
+    s.due = 1
     if what == _LIMIT:
         _watch_source(r, s)
+    elif what == _PEAK:
+        _block(r, s)
+        s.due = 2
     elif what >= _PAIR:
         _conduct_pair(plant, k, c, (what - _PAIR) // 3, (what - _PAIR) % 3)
-        _prepare(plant, k, c)
     elif what >= _OUT:
         x = (what - _OUT) % 3
         s.open, s.flows[x] = -1, 1 if what < _IN else -1
-        _prepare(plant, k, c)
     else:
-        w, axis = field(plant.now[0], "w"), field(plant.net[0], "axis")[c]
-        i = w[own(k) + I_F]
-        w[own(k) + I_F] = i - _A[what] * axis * _seen_by(plant.net[0], c, what, i)
-        _settle(plant, k, c)
+        _end_current(plant, k, c, what)
+        s.due = 2
 
 
 @inlined
-def _see(r: Any, s: Any, which: int, v: complex, i_o: complex) -> None:
-    """Keep what the sensors see at the beginning (0), the middle (1) or the end (2) of an
-    interval."""
-    s.seen[which, 0], s.seen[which, 1], s.seen[which, 2] = terminal(
-        v.real, v.imag, i_o.real * r.current, i_o.imag * r.current
-    )
-
-
-@compiled
-def _cut(plant: PlantRecords, terms: int, tau: float) -> None:
-    """End an interval at a part tau of it."""
-    n, now = plant.net[0], plant.now[0]
-    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
-    for which in range(2):
-        at = tau if which else 0.5 * tau
-        for i in range(n.n_states):
-            w_to[which, i] = w_at(now, i, terms, at)
-        for k in range(n.n_converters):
-            for what in range(4):
-                dc_to[which, k, what] = dc_at(now, k, what, terms, at)
-
-
-@compiled
-def _take(plant: PlantRecords, step: float) -> None:
-    """Take the states on to the end of an interval of ``step`` s."""
-    n, now = plant.net[0], plant.now[0]
-    w, source, speed = field(now, "w"), field(now, "source"), field(now, "source_speed")
-    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
-    for k in range(n.n_converters):
-        r, s, at = plant.par[k], plant.st[k], own(k)
-        v_0, v_1, v_2 = s.x[V_DC], dc_to[0, k, DC], dc_to[1, k, DC]
-        s.x[V_DC], s.i_reg = v_2, dc_to[1, k, REG]
-        s.i_source, s.mid = dc_to[1, k, SOURCE], dc_to[1, k, MID]
-        if r.energy > 0.0:
-            s.drawn[0] = _drawn(r, s, w[at + I_F], v_0)
-            s.drawn[1] = _drawn(r, s, w_to[0, at + I_F], v_1)
-            s.drawn[2] = _drawn(r, s, w_to[1, at + I_F], v_2)
-            discharge(r, s, step, v_0, v_1, v_2)
-        if r.filtered:
-            _see(r, s, 1, w_to[0, at + V], w_to[0, at + I_O])
-            _see(r, s, 2, w_to[1, at + V], w_to[1, at + I_O])
-            b_0, b_1, b_2, b_3 = _weights(step * r.omega_s)
-            s.sensed[0] = b_0 * s.sensed[0] + b_1 * v_0 + b_2 * v_1 + b_3 * v_2
-            for j in range(3):
-                s.sensed[1 + j] = (
-                    b_0 * s.sensed[1 + j]
-                    + b_1 * s.seen[0, j] + b_2 * s.seen[1, j] + b_3 * s.seen[2, j]
-                )  # fmt: skip
-                s.seen[0, j] = s.seen[2, j]
-    for i in range(n.n_states):
-        w[i] = w_to[1, i]
-    for k in range(n.n_converters, now.n_s):
-        source[k] = source[k] * turned(speed[k] * step)
+def _sense(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) -> None:
+    """Take the battery and the sensors' filters on over a part tau of an interval of h s."""
+    r, s = plant.par[k], plant.st[k]
+    step, v_0, v_2 = tau * h, s.ends[0, DC], s.ends[1, DC]
+    if r.energy > 0.0:
+        s.drawn[0], s.drawn[2] = _drawn(r, s, 0), _drawn(r, s, 1)
+        look(plant, k, c, h, terms, 0.5 * tau)
+        s.drawn[1], v_1 = _drawn(r, s, 1), s.ends[1, DC]
+        discharge(r, s, step, v_0, v_1, v_2)
+        look(plant, k, c, h, terms, tau)
+    if not r.filtered:
+        return
+    b_0, b_1, b_2, b_3 = _weights(step * r.omega_s)
+    v_1 = 0.5 * (v_0 + v_2) + 0.125 * step * (_dc_slope(r, s, 0) - _dc_slope(r, s, 1))
+    s.sensed[0] = b_0 * s.sensed[0] + b_1 * v_0 + b_2 * v_1 + b_3 * v_2
+    _see(r, s, 1)
+    for j in range(3):  # the value in the middle by those at the ends and their slopes
+        middle = 0.5 * (s.seen[0, j] + s.seen[1, j])
+        middle += 0.125 * step * (s.seen_slopes[0, j] - s.seen_slopes[1, j])
+        s.sensed[1 + j] = (
+            b_0 * s.sensed[1 + j] + b_1 * s.seen[0, j] + b_2 * middle + b_3 * s.seen[1, j]
+        )
+        s.seen[0, j], s.seen_slopes[0, j] = s.seen[1, j], s.seen_slopes[1, j]
 
 
 @inlined
-def _drawn(r: Any, s: Any, i: complex, v_dc: float) -> float:
+def _see(r: Any, s: Any, end: int) -> None:
+    """Keep what the sensors see at an end of an interval, p, q and V, and what these change by in a
+    second."""
+    v_a, v_b = s.ends[end, 2], s.ends[end, 3]
+    o_a, o_b = r.current * s.ends[end, 4], r.current * s.ends[end, 5]
+    dv_a, dv_b = s.slopes[end, 0], s.slopes[end, 1]
+    do_a, do_b = r.current * s.slopes[end, 2], r.current * s.slopes[end, 3]
+    p, q, v = terminal(v_a, v_b, o_a, o_b)
+    s.seen[end, 0], s.seen[end, 1], s.seen[end, 2] = p, q, v
+    s.seen_slopes[end, 0] = dv_a * o_a + v_a * do_a + dv_b * o_b + v_b * do_b
+    s.seen_slopes[end, 1] = dv_b * o_a + v_b * do_a - dv_a * o_b - v_a * do_b
+    s.seen_slopes[end, 2] = (v_a * dv_a + v_b * dv_b) / v if v > 0.0 else 0.0
+
+
+@inlined
+def _dc_slope(r: Any, s: Any, end: int) -> float:
+    """Return what v_dc changes by in a second at an end of an interval, Eq. (8)."""
+    v_dc, gives = s.ends[end, DC], s.ends[end, SOURCE]
+    if r.tau_dc == 0.0:
+        gives = limit_of(s) if s.limit != 0.0 else r.k_p * (1.0 - v_dc) + s.ends[end, REG]
+    drawn = r.current * (s.by_dc.real * s.ends[end, 0] + s.by_dc.imag * s.ends[end, 1])
+    return r.omega_b / r.C_dc * (gives - s.chopper * v_dc - drawn)
+
+
+@inlined
+def _drawn(r: Any, s: Any, end: int) -> float:
     """Return the power that the bridge draws, p.u.; the midpoint takes no part in it on average."""
-    return v_dc * r.current * (s.by_dc.real * i.real + s.by_dc.imag * i.imag)
+    i_a, i_b = s.ends[end, 0], s.ends[end, 1]
+    return s.ends[end, DC] * r.current * (s.by_dc.real * i_a + s.by_dc.imag * i_b)
 
 
 @inlined
@@ -614,8 +698,7 @@ def _weights(x: float) -> tuple[float, float, float, float]:
     """Return the weights of a first-order low-pass after x time constants: of its state, and of a
     parabola through its input at the beginning, the middle and the end."""
     if x < 0.1:
-        f_3 = 1 / 6 - x * (1 / 24 - x * (1 / 120 - x * (1 / 720 - x * (1 / 5040 - x * (
-            1 / 40320 - x * (1 / 362880 - x * (1 / 3628800)))))))  # fmt: skip
+        f_3 = 1 / 6 - x * (1 / 24 - x * (1 / 120 - x * (1 / 720 - x * (1 / 5040))))
         f_2 = 0.5 - x * f_3
         f_1 = 1.0 - x * f_2
         whole = 1.0 - x * f_1

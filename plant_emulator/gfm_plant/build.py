@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_plant.bridge import LEVELS, bands
+from gfm_plant.bridge import TOPOLOGIES, bands
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
@@ -164,7 +164,7 @@ def _make(
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
     st["phase_seen"] = math.nan
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
-    now["closed"] = grid_node is not None
+    now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
     network.connect(wiring)
@@ -353,14 +353,18 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
             f"plant.delay.fraction = {options.delay.fraction:g}: compare values are loaded"
             f" {units} times a period, so it must be a multiple of {1 / units:g}"
         )
-    par["levels"], par["off"] = LEVELS[bridge.kind]
+    topology = TOPOLOGIES[bridge.kind]
+    par["levels"], par["off"] = topology.levels, topology.off
     par["counts"], par["count_s"] = round(counts), 1 / bridge.timer_hz
     par["dead"] = bridge.dead_time_s
     par["least"] = round(bridge.min_pulse_s / 2 * bridge.timer_hz)
     V, R = bases.V_dcref, bases.base_of("R")
     drops = bridge.V_switch / V, bridge.V_diode / V, bridge.R_switch / R, bridge.R_diode / R
     par["band"] = found = bands(bridge.kind, drops)
-    par["wide"] = [bool((one[0] * [1, 1, 1, 1] != one[1]).any()) for one in found]
+    par["wide"] = [bool((out != into).any()) for out, into in found]
+    kinds = np.unique(found.reshape(-1, 4), axis=0, return_inverse=True)[1]
+    par["band_kind"] = kinds.reshape(1, -1, 2)
+    par["cancels"] = not any(drops)
 
 
 def _carrier(converters: Mapping[str, tuple[Plant, str]], T_s: float) -> tuple[int, int]:

@@ -31,6 +31,8 @@ _Arrays = Mapping[str, tuple[type, tuple[str | int, ...]]]
 
 TERMS = 24
 """Of the series of a switched bridge, at most."""
+POWERS, ORDER, SLOTS = 5, 16, 256
+"""How many powers of a matrix `powers` keeps, of which order, and of how many matrices."""
 
 _NET: _Arrays = {
     "to_grid": (float, ("n_w",)),  # what each state of w brings to the grid, as a current
@@ -67,12 +69,13 @@ _NET: _Arrays = {
     "node_turn": (complex, ("n_c",)),
     "node_i": (int, ("n_nodes",)),
     # with switched bridges, see `series`: which cut of the period each unit of the carrier belongs
-    # to; of each circuit e^(-j angle) of its axis alpha, its fastest rate, 1/s; of each converter
-    # what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both axes, 1/s; the
-    # other entries of w' = A w + B s: how many, row and column, values on both axes; whether there
-    # are none but what the grid does to the only line
+    # to; of each circuit e^(-j angle) of its axis alpha, the axes of the legs, its fastest rate,
+    # 1/s; of each converter what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both
+    # axes, 1/s; the other entries of w' = A w + B s: how many, row and column, values on both axes;
+    # whether there are none but what the grid does to the only line
     "unit_part": (int, ("n_units",)),
     "axis": (complex, ("n_rates",)),
+    "leg_axis": (complex, ("n_rates", 3)),
     "fastest": (float, ("n_rates",)),
     "own_rates": (float, ("n_rates", "n_converters", 2, 5)),
     "n_links": (int, ("n_rates", 2)),
@@ -96,12 +99,17 @@ _NOW: _Arrays = {
     "w_before": (complex, ("n_w",)),  # at the last tick
     "unit_before": (complex, ("n_s",)),
     # with switched bridges: the terms of the series of w and of the DC links (v_dc, i_reg,
-    # i_source, mid), for the length of an interval, and what they add up to in its middle and at
-    # its end; of the sources the values, the last term, and their speeds, 1/s
+    # i_source, mid), for the length of an interval; of the sources the values, the last term, and
+    # their speeds, 1/s; of a converter alone on its grid, see `powers`, matrices by their keys,
+    # with what else they were made for, the speed of the grid and the limit of the DC source, and
+    # the voltage of the bridge by v_dc; and x, its products with the powers, and where it leads
     "terms": (complex, ("n_terms", "n_w")),
     "dc_terms": (float, ("n_terms", "n_converters", 4)),
-    "w_to": (complex, (2, "n_w")),
-    "dc_to": (float, (2, "n_converters", 4)),
+    "slot_key": (int, ("n_slots",)),
+    "slot_for": (float, ("n_slots", 2)),
+    "slot_by_dc": (complex, ("n_slots",)),
+    "power": (float, ("n_slots", POWERS, ORDER, ORDER)),
+    "vector": (float, (POWERS + 1, ORDER)),
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),
@@ -151,6 +159,10 @@ a circuit has up to two modes a state.
 now_dtype = _header(
     [
         ("row", "i8"),  # in the group of circuits
+        ("order", "i8"),  # of the matrices of `powers`
+        # e^(j omega_b t) at the beginning of a period, and its tick
+        ("stands", "c16"),
+        ("stands_tick", "i8"),
         # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
         ("closed", "i8"),
         ("omega_g", "f8"),
@@ -209,6 +221,7 @@ def make_net_and_now(
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
         "n_units": units, "n_rates": MOST_CONTACTS * (converters + 1) if units else 0,
         "n_entries": states * max(states, sources), "n_terms": TERMS if units else 0,
+        "n_slots": SLOTS if units and converters == 1 else 0,
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
     net["connections"] = connections

@@ -187,6 +187,7 @@ def _bytes(record: Record) -> NDArray[np.uint8]:
 def _connect(plant: Network, wiring: Wiring) -> None:
     net, N, order = plant.net[0], len(wiring.units), wiring.order
     net["n_states"] = len(order)
+    plant.now["slot_key"] = 0
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][order.index(name)] = factor
@@ -241,9 +242,9 @@ def _pack_rates(
     net, N, places = plant.net[0], len(wiring.units), wiring.sources()
     axes, angle, names = wiring.rates(blocked, contact)
     net["axis"][circuit] = np.exp(-1j * angle)
-    net["fastest"][circuit] = max(one.fastest for one in axes) + max(
-        _fastest_with_dc(r) for r in plant.par
-    )
+    net["leg_axis"][circuit] = np.exp(1j * (2 * np.pi / 3 * np.arange(3) - angle))
+    fastest = max(one.fastest for one in axes)
+    net["fastest"][circuit] = max(_fastest_with_dc(r, fastest) for r in plant.par)
     by_w = [one.by_w.copy() for one in axes]
     for k in range(N):
         i_f, v, i_o = range(N_OWN * k, N_OWN * (k + 1))
@@ -272,14 +273,19 @@ def _pack_rates(
             net["link"][circuit, which, : len(entries), axis] = factors[tuple(entries.T)]
 
 
-def _fastest_with_dc(r: Any) -> float:
-    """A bound of what the DC link of a converter adds to the fastest rate, 1/s."""
-    per_C = r["omega_b"] / r["C_dc"]
-    found = math.sqrt(per_C * r["omega_b"] / r["L_f"]) * 3 * r["leg"] + per_C * r["k_p"]
-    found += math.sqrt(per_C * r["k_i"]) + per_C * r["chopper"][0]
-    R = float(r["band"][:, :, 3].max())
-    found += r["omega_b"] * R / r["L_f"]
-    return float(found + (1 / r["tau_dc"] if r["tau_dc"] > 0.0 else 0.0))
+def _fastest_with_dc(r: Any, circuit: float) -> float:
+    """A bound of the norm in energy coordinates of a circuit, whose own is ``circuit``, and the DC
+    link of a converter, 1/s."""
+    per_C, per_L = r["omega_b"] / r["C_dc"], r["omega_b"] / r["L_f"]
+    ac = circuit + per_L * float(r["band"][:, :, 3].max())
+    joins = math.sqrt(per_C * per_L) * r["leg"]
+    dc = math.sqrt(per_C * r["k_i"]) + per_C * r["chopper"][0]
+    dc += per_C * r["k_p"]
+    if r["tau_dc"] > 0.0:
+        dc += 1 / r["tau_dc"] + math.sqrt(per_C * max(1.0, r["k_p"]) / r["tau_dc"])
+    if r["levels"] > 2:  # the midpoint besides
+        joins *= 2.0
+    return float((ac + dc) / 2 + math.hypot((ac - dc) / 2, joins))
 
 
 def _nodes(net: Any, wiring: Wiring) -> dict[int, str]:

@@ -268,10 +268,11 @@ def _part_is_enough(schema: dict[str, Any]) -> None:
 class BridgeOptions(Options):
     """The bridge: its average over a period, or the switches themselves."""
 
-    kind: Literal["average", "two-level"] = Field(
+    kind: Literal["average", "two-level", "t-type"] = Field(
         "average",
         description="average: a voltage that follows the command; two-level: six switches with "
-        "diodes, modulated by space vectors",
+        "diodes, modulated by space vectors; t-type: each leg has a switch for both directions to "
+        "the midpoint of C_dc besides",
     )
     carrier_hz: Positive | None = Field(
         None, description="of the symmetrical carrier, 1/T_s or 2/T_s; 1/T_s if none"
@@ -386,7 +387,8 @@ class Plant(Options):
     i_peak: Positive | None = Field(
         None,
         description="peak-current limit of the bridge, p.u.: its hardware blocks pulses so that "
-        "the current of L_f stays within; none if not given",
+        "the current of L_f stays within; a switched bridge turns all off until the compare values "
+        "are loaded next; none if not given",
     )
     bridge: BridgeOptions = Field(
         BridgeOptions(), description="averaged, or switched and still solved exactly"
@@ -420,10 +422,6 @@ class Plant(Options):
         if given and self.grid.scr is not None:
             raise ValueError(
                 f"grid.scr = {self.grid.scr:g}: sets the line; leave out {' and '.join(given)}"
-            )
-        if self.bridge.kind != "average" and self.i_peak is not None:
-            raise ValueError(
-                f"i_peak = {self.i_peak:g}: is a limit of bridge.kind = 'average'; leave one out"
             )
         return self
 

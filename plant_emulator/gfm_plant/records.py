@@ -22,6 +22,7 @@ COMPARE = 4  # place of the compare values in a command, below 0: it has none
 N_PHASES = 10  # channels of the A/D at the phases, in the order of the group ``adc``
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
+N_LIVE = 10  # states of a converter with a switched bridge, see ``ends``
 N_GATES = 6  # states of the gates of a leg, at most, see `bridge`
 N_RING = 256  # places of a ring that holds one cycle
 
@@ -91,6 +92,9 @@ converter_par_dtype = np.dtype(
         ("leg", "f8"),
         ("wide", "i8", (N_GATES,)),
         ("band", "f8", (N_GATES, 2, 4)),
+        # which of all different ones it is; whether legs of one kind give no voltage together
+        ("band_kind", "i8", (N_GATES, 2)),
+        ("cancels", "i8"),
         # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
         ("filtered", "i8"),
         ("omega_s", "f8"),  # bandwidth, rad/s
@@ -151,29 +155,42 @@ converter_state_dtype = np.dtype(
         # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
         ("phase_seen", "f8", (2, N_PHASES)),
         # in a piece of time: power that the bridge draws, and what the sensors see, at its
-        # beginning, middle and end; the command's voltage and the largest that v_dc gives
+        # beginning, middle and end (and what these change by in a second at the beginning and the
+        # end of an interval between two edges); the command's voltage and the most that v_dc gives
         ("drawn", "f8", (3,)),
         ("seen", "f8", (3, 3)),
+        ("seen_slopes", "f8", (2, 3)),
         ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
         # the legs of a switched bridge: gates, commanded level, sign of the current where it
         # decides (0: there is none), and when the next gate turns on, s from the beginning of the
-        # unit; of this unit the level below the carrier and the edges down and up, s
+        # unit; of this unit the level below the carrier and the edges down and up, s; when each leg
+        # changes next, and the first of them
         ("gate", "i8", (3,)),
         ("level", "i8", (3,)),
         ("flows", "i8", (3,)),
         ("on_at", "f8", (3,)),
         ("base", "i8", (3,)),
         ("edges", "f8", (3, 2)),
+        ("next", "f8", (3,)),
+        ("soonest", "f8"),
         # v of the upper less that of the lower half of C_dc, p.u. of v_dc; at which limit the DC
         # source is, and whether its integral goes on; legs without current: none (-1), one, all (3)
         ("mid", "f8"),
         ("limit", "f8"),
         ("winds", "f8"),
         ("open", "i8"),
-        # of the interval between two edges: the bridge's voltage by v_dc, by mid and by nothing, as
+        # of the interval between two edges: the states i_f, v, i_o (alpha and beta), v_dc, integral
+        # of the source's control with i_u, current of the source, and midpoint, at its beginning
+        # and where it leads to; what v and i_o change by in a second there; what has to be done
+        # before it: 1: equations, 2: find what conducts besides; the matrix of `powers` in
+        # force; the bridge's voltage by v_dc, by mid and by nothing, as
         # a space vector, and what they and the voltage at its terminal, and the current, do to the
         # current, 1/s
+        ("ends", "f8", (2, N_LIVE)),
+        ("slopes", "f8", (2, 4)),
+        ("due", "i8"),
+        ("slot", "i8"),
         ("by_dc", "c16"),
         ("by_mid", "c16"),
         ("di_dc", "c16"),

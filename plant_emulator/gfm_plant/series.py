@@ -7,7 +7,8 @@ coefficients, x' = A x + what the sources give, which turn at constant speeds. I
     x(t + tau h) = sum over j of c_j tau^j,  c_(j+1) = h/(j + 1) (A c_j + ...)
 
 is exact to rounding with as many terms as h times the norm of A asks for. It holds for all tau in
-[0, 1], so that it also says when a current becomes zero or a diode begins to conduct.
+[0, 1], so that it also says when a current becomes zero or a diode begins to conduct. `powers` sums
+it for one converter on its grid.
 
 An unbalanced fault acts on two axes, on which the real and the imaginary parts of all space vectors
 have rates of their own, see `circuit`; all vectors are then turned so that alpha is real.
@@ -20,25 +21,39 @@ from typing import Any
 
 import numpy as np
 
-from gfm_plant.layout import TERMS, field
+from gfm_plant.layout import ORDER, POWERS, TERMS, field
 from gfm_plant.model import V_DC
+from gfm_plant.powers import (
+    MID_AT,
+    ONE,
+    SMALL,
+    SOURCE_AT,
+    N,
+    P,
+    begin_powers,
+    fill_powers,
+    find_slot,
+    go_to,
+)
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import I_F, I_O, V, grid_source, own, turned
 from gfm_runtime.compiled import compiled, inlined
 
-DC, REG, SOURCE, MID = 0, 1, 2, 3
-"""Of a DC link: v_dc, the integral of its source's control, its source's current, and the midpoint.
-Without a lag the source's current is what its control asks for."""
+DC, REG, SOURCE, MID = 6, 7, 8, 9
+"""Places in ``ends`` of v_dc, the integral of its source's control, its source's current, and the
+midpoint, behind i_f, v and i_o. Without a lag the source's current is what its control asks for."""
 
-LARGEST = 1.0
+LARGEST = 0.6
 """Of the norm of A times the length of an interval; a longer one is cut."""
 
-_SMALLEST = 1e-16  # p.u.; of the first term that is left out
+_SMALLEST = 1e-15  # p.u.; of the first term that is left out
 _PER = np.array([1.0 / max(j, 1) for j in range(TERMS + 1)])  # 1 / j
 _ENOUGH = np.array([(_SMALLEST * math.factorial(j + 1)) ** (1 / (j + 1)) for j in range(TERMS)])
 
+_TWO_LEVELS = _ENOUGH[2 * POWERS - 1]
 
-@compiled
+
+@inlined
 def begin_series(plant: PlantRecords, c: int, at: float) -> None:
     """Take w, the sources and the bridges' frames from the common frame to that of a series.
 
@@ -55,15 +70,29 @@ def begin_series(plant: PlantRecords, c: int, at: float) -> None:
     for i in range(n.n_states):
         w[i] = w[i] * to
     for k in range(n.n_converters):
-        plant.st[k].ahead = unit[k] * stands
+        s = plant.st[k]
+        s.ahead = unit[k] * stands
+        for i in range(3):
+            s.ends[0, 2 * i], s.ends[0, 2 * i + 1] = w[own(k) + i].real, w[own(k) + i].imag
+        s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID] = s.x[V_DC], s.i_source, s.mid
+        s.ends[0, REG] = s.i_reg + plant.par[k].i_u_gain * s.u_now[0]
     g, omega_g = grid_source(n), now.omega_g + 0.5 * n.T_s * now.omega_g_slope
     for k in range(2):
         E = now.sequence[k]
         source[g + k] = complex(now.V_g * E.real, now.V_g * E.imag) * unit[g + k] * to
         speed[g + k] = (omega_g if k == 0 else -omega_g) * n.omega_b
+    if field(n, "alone")[c]:
+        r, s, x = plant.par[0], plant.st[0], field(now, "vector")
+        few = r.tau_dc == 0.0 and r.levels < 3 and source[g + 1] == 0j
+        now.order = SMALL if few else ORDER
+        for j in range(REG + 1):
+            x[0, j] = s.ends[0, j]
+        x[0, ONE], x[0, SOURCE_AT], x[0, MID_AT] = 1.0, s.i_source, s.mid
+        x[0, P], x[0, P + 1] = source[g].real, source[g].imag
+        x[0, N], x[0, N + 1] = source[g + 1].real, source[g + 1].imag
 
 
-@compiled
+@inlined
 def end_series(plant: PlantRecords, c: int, at: float, lasted: float) -> None:
     """Take w, the sources and the bridges' frames back to the common frame.
 
@@ -75,10 +104,15 @@ def end_series(plant: PlantRecords, c: int, at: float, lasted: float) -> None:
     w, unit = field(now, "w"), field(now, "unit")
     back = _stands(plant, at + lasted).conjugate()
     to = back * field(n, "axis")[c].conjugate()
+    for k in range(n.n_converters):
+        s = plant.st[k]
+        unit[k] = normal(s.ahead * back)
+        s.x[V_DC], s.i_source, s.mid = s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID]
+        s.i_reg = s.ends[0, REG] - plant.par[k].i_u_gain * s.u_now[0]
+        for i in range(3):
+            w[own(k) + i] = complex(s.ends[0, 2 * i], s.ends[0, 2 * i + 1])
     for i in range(n.n_states):
         w[i] = w[i] * to
-    for k in range(n.n_converters):
-        unit[k] = normal(plant.st[k].ahead * back)
     g, speed = grid_source(n), field(now, "source_speed")
     for k in range(g, g + (2 if now.unbalance_left > 0.0 else 1)):
         unit[k] = normal(unit[k] * turned((speed[k] - n.omega_b) * lasted))
@@ -94,9 +128,27 @@ def normal(u: complex) -> complex:
 @inlined
 def _stands(plant: PlantRecords, at: float) -> complex:
     """Return e^(j omega_b t) at an instant of the period."""
-    n = plant.net[0]
-    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
-    return complex(math.cos(angle), math.sin(angle))
+    n, now, tick = plant.net[0], plant.now[0], plant.st[0].tick
+    if at == n.T_s:
+        tick, at = tick + 1, 0.0
+    if at == 0.0 and tick == now.stands_tick:
+        return now.stands
+    angle = n.omega_b * (n.T_s * tick + at)
+    found = complex(math.cos(angle), math.sin(angle))
+    if at == 0.0:
+        now.stands, now.stands_tick = found, tick
+    return found
+
+
+@compiled
+def hold_current(plant: PlantRecords, k: int, c: int, i: complex) -> None:
+    """Set the current of L_f of converter k at the beginning of an interval, p.u. of the
+    network."""
+    s = plant.st[k]
+    s.ends[0, 0], s.ends[0, 1] = i.real, i.imag
+    if field(plant.net[0], "alone")[c]:
+        x = field(plant.now[0], "vector")
+        x[0, 0], x[0, 1] = i.real, i.imag
 
 
 @inlined
@@ -108,21 +160,116 @@ def how_many(x: float) -> int:
     return j
 
 
-@compiled
-def find_terms(plant: PlantRecords, c: int, h: float, terms: int, kept: bool) -> None:
-    """Find the states in the middle and at the end of an interval of h s, from the present ones on.
-
-    Args:
-        plant, c: as for ``begin_series``.
-        h: s.
-        terms: as ``how_many`` says.
-        kept: whether ``w_at`` and ``dc_at`` are to be called for other instants.
-    """
-    n = plant.net[0]
+@inlined
+def find_terms(plant: PlantRecords, c: int, h: float) -> int:
+    """Find the series of an interval of h s from the present states on, and where it leads to;
+    returns how many terms of ``terms`` it has."""
+    n, now = plant.net[0], plant.now[0]
+    size = h * field(n, "fastest")[c]
     if field(n, "alone")[c]:
-        _find_alone(plant, c, h, terms, kept)
+        terms, s, x = 0, plant.st[0], field(now, "vector")
+        begin_powers(now, s.slot, h, 2 if size < _TWO_LEVELS else 3)
+        _read_powers(plant, c)
+        for j in range(4):
+            s.slopes[0, j] = x[1, 2 + j]
     else:
+        terms = how_many(size)
         _find_together(plant, c, h, terms)
+        x_1 = field(now, "terms")
+        for k in range(n.n_converters):
+            s, per_h = plant.st[k], 1.0 / h
+            v, i_o = x_1[1, own(k) + V], x_1[1, own(k) + I_O]
+            s.slopes[0, 0], s.slopes[0, 1] = per_h * v.real, per_h * v.imag
+            s.slopes[0, 2], s.slopes[0, 3] = per_h * i_o.real, per_h * i_o.imag
+            look(plant, k, c, h, terms, 1.0)
+    return terms
+
+
+@inlined
+def _read_powers(plant: PlantRecords, c: int) -> None:
+    """Read where the powers lead to, and what changes there in a second."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[0]
+    x = field(now, "vector")
+    for j in range(REG + 1):
+        s.ends[1, j] = x[POWERS, j]
+    s.ends[1, SOURCE], s.ends[1, MID] = s.ends[0, SOURCE], s.ends[0, MID]
+    if now.order == ORDER:
+        s.ends[1, SOURCE], s.ends[1, MID] = x[POWERS, SOURCE_AT], x[POWERS, MID_AT]
+    if not plant.par[0].filtered:
+        return
+    q, link = field(n, "own_rates"), field(n, "link")
+    i_a, i_b, v_a, v_b, o_a, o_b = (
+        x[POWERS, 0], x[POWERS, 1], x[POWERS, 2], x[POWERS, 3], x[POWERS, 4], x[POWERS, 5]
+    )  # fmt: skip
+    p_a, p_b = x[POWERS, P], x[POWERS, P + 1]
+    if now.order == ORDER:
+        p_a, p_b = p_a + x[POWERS, N], p_b + x[POWERS, N + 1]
+    s.slopes[1, 0] = q[c, 0, 0, 0] * i_a + q[c, 0, 0, 1] * v_a + q[c, 0, 0, 2] * o_a
+    s.slopes[1, 1] = q[c, 0, 1, 0] * i_b + q[c, 0, 1, 1] * v_b + q[c, 0, 1, 2] * o_b
+    s.slopes[1, 2] = q[c, 0, 0, 3] * v_a + q[c, 0, 0, 4] * o_a + link[c, 1, 0, 0] * p_a
+    s.slopes[1, 3] = q[c, 0, 1, 3] * v_b + q[c, 0, 1, 4] * o_b + link[c, 1, 0, 1] * p_b
+
+
+@compiled
+def look(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) -> None:
+    """Take ``ends`` of converter k to a part tau of the interval."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[k]
+    if field(n, "alone")[c]:
+        go_to(now, s.slot, tau * h)
+        _read_powers(plant, c)
+        return
+    x, dc = field(now, "terms"), field(now, "dc_terms")
+    for i in range(3):
+        y, slope = x[terms, own(k) + i], x[terms, own(k) + i] * complex(terms, 0.0)
+        for j in range(terms - 1, -1, -1):
+            z = x[j, own(k) + i]
+            y = complex(z.real + tau * y.real, z.imag + tau * y.imag)
+            if j > 0:
+                slope = complex(j * z.real + tau * slope.real, j * z.imag + tau * slope.imag)
+        s.ends[1, 2 * i], s.ends[1, 2 * i + 1] = y.real, y.imag
+        if i > 0:
+            s.slopes[1, 2 * i - 2], s.slopes[1, 2 * i - 1] = slope.real / h, slope.imag / h
+    for what in range(4):
+        value = dc[terms, k, what]
+        for j in range(terms - 1, -1, -1):
+            value = dc[j, k, what] + tau * value
+        s.ends[1, DC + what] = value
+
+
+@inlined
+def bend(plant: PlantRecords, k: int, c: int, h: float) -> float:
+    """Return by how much the current of L_f may differ from a straight line in the interval, p.u.
+    of the network: twice what its second derivative at the beginning gives."""
+    now = plant.now[0]
+    if field(plant.net[0], "alone")[c]:
+        x = field(now, "vector")
+        return 0.25 * h * h * (abs(x[2, 0]) + abs(x[2, 1]))
+    x_2 = field(now, "terms")[2, own(k) + I_F]
+    return 0.5 * (abs(x_2.real) + abs(x_2.imag))
+
+
+@inlined
+def accept(plant: PlantRecords, c: int, step: float, terms: int, tau: float) -> None:
+    """Take the states on to where ``ends`` lead, a part tau of the interval, after ``step`` s."""
+    n, now = plant.net[0], plant.now[0]
+    if field(n, "alone")[c]:
+        x = field(now, "vector")
+        for j in range(ORDER):
+            x[0, j] = x[POWERS, j]
+    else:
+        x, w = field(now, "terms"), field(now, "w")
+        source, speed = field(now, "source"), field(now, "source_speed")
+        for i in range(own(n.n_converters), n.n_states):
+            y = x[terms, i]
+            for j in range(terms - 1, -1, -1):
+                y = complex(x[j, i].real + tau * y.real, x[j, i].imag + tau * y.imag)
+            w[i] = y
+        for k in range(n.n_converters, now.n_s):
+            source[k] = source[k] * turned(speed[k] * step)
+    for k in range(n.n_converters):
+        s = plant.st[k]
+        for j in range(MID + 1):
+            s.ends[0, j] = s.ends[1, j]
 
 
 @compiled
@@ -133,12 +280,14 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
     source, s_term = field(now, "source"), field(now, "source_term")
     s_speed = field(now, "source_speed")
     n_links, link_place, link = field(n, "n_links"), field(n, "link_place"), field(n, "link")
-    for i in range(n.n_states):
+    for i in range(own(n.n_converters), n.n_states):
         x[0, i] = w[i]
     for k in range(n.n_converters):
         s = plant.st[k]
-        dc[0, k, DC], dc[0, k, REG], dc[0, k, MID] = s.x[V_DC], s.i_reg, s.mid
-        dc[0, k, SOURCE] = s.i_source
+        for i in range(3):
+            x[0, own(k) + i] = complex(s.ends[0, 2 * i], s.ends[0, 2 * i + 1])
+        for what in range(4):
+            dc[0, k, what] = s.ends[0, DC + what]
     for k in range(n.n_converters, now.n_s):
         s_term[k] = source[k]
     for j in range(1, terms + 1):
@@ -150,11 +299,11 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
             i, v, i_o = x[j - 1, at + I_F], x[j - 1, at + V], x[j - 1, at + I_O]
             (
                 i_a, i_b, v_a, v_b, o_a, o_b,
-                dc[j, k, DC], dc[j, k, REG], dc[j, k, SOURCE], dc[j, k, MID],
+                dc[j, k, 0], dc[j, k, 1], dc[j, k, 2], dc[j, k, 3],
             ) = _own_term(
                 _constants(plant, c, k), 1.0 if j == 1 else 0.0, d,
                 i.real, i.imag, v.real, v.imag, i_o.real, i_o.imag,
-                dc[j - 1, k, DC], dc[j - 1, k, REG], dc[j - 1, k, SOURCE], dc[j - 1, k, MID],
+                dc[j - 1, k, 0], dc[j - 1, k, 1], dc[j - 1, k, 2], dc[j - 1, k, 3],
             )  # fmt: skip
             x[j, at + I_F] = complex(i_a, i_b)
             x[j, at + V] = complex(v_a, v_b)
@@ -170,70 +319,6 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
         for k in range(n.n_converters, now.n_s):
             y, turn = s_term[k], d * s_speed[k]
             s_term[k] = complex(-turn * y.imag, turn * y.real)
-    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
-    for which in range(2):
-        tau = 0.5 if which == 0 else 1.0
-        for i in range(n.n_states):
-            w_to[which, i] = w_at(now, i, terms, tau)
-        for k in range(n.n_converters):
-            for what in range(4):
-                dc_to[which, k, what] = dc_at(now, k, what, terms, tau)
-
-
-@compiled
-def _find_alone(plant: PlantRecords, c: int, h: float, terms: int, kept: bool) -> None:
-    """``find_terms`` in a circuit of one converter whose line ends at the grid."""
-    n, now, s = plant.net[0], plant.now[0], plant.st[0]
-    x, dc, w = field(now, "terms"), field(now, "dc_terms"), field(now, "w")
-    constants, g = _constants(plant, c, 0), grid_source(n)
-    source, speed, link = field(now, "source"), field(now, "source_speed"), field(n, "link")
-    i_a, i_b, v_a, v_b = w[I_F].real, w[I_F].imag, w[V].real, w[V].imag
-    o_a, o_b = w[I_O].real, w[I_O].imag
-    v_dc, reg, flow, mid = s.x[V_DC], s.i_reg, s.i_source, s.mid
-    # of both sequences of the grid what it does to the current of the line
-    by_a, by_b, turn = link[c, 1, 0, 0], link[c, 1, 0, 1], speed[g]
-    p_a, p_b, n_a, n_b = source[g].real, source[g].imag, source[g + 1].real, source[g + 1].imag
-    one, half = 1.0, 1.0
-    if kept:
-        x[0, I_F], x[0, V], x[0, I_O] = w[I_F], w[V], w[I_O]
-        dc[0, 0, DC], dc[0, 0, REG], dc[0, 0, SOURCE], dc[0, 0, MID] = v_dc, reg, flow, mid
-    m_va, m_vb, m_oa, m_ob, m_dc = v_a, v_b, o_a, o_b, v_dc  # in the middle
-    m_ia, m_ib = i_a, i_b
-    t_ia, t_ib, t_va, t_vb, t_oa, t_ob = i_a, i_b, v_a, v_b, o_a, o_b  # at the end
-    t_dc, t_reg, t_flow, t_mid = v_dc, reg, flow, mid
-    for j in range(1, terms + 1):
-        d = h * _PER[j]
-        i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg, flow, mid = _own_term(
-            constants, one, d, i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg, flow, mid
-        )
-        o_a += d * by_a * (p_a + n_a)
-        o_b += d * by_b * (p_b + n_b)
-        p_a, p_b = -d * turn * p_b, d * turn * p_a
-        n_a, n_b = d * turn * n_b, -d * turn * n_a
-        if kept:
-            x[j, I_F], x[j, V], x[j, I_O] = (
-                complex(i_a, i_b), complex(v_a, v_b), complex(o_a, o_b)
-            )  # fmt: skip
-            dc[j, 0, DC], dc[j, 0, REG], dc[j, 0, SOURCE], dc[j, 0, MID] = v_dc, reg, flow, mid
-        one = 0.0
-        half *= 0.5
-        m_ia, m_ib, m_dc = m_ia + half * i_a, m_ib + half * i_b, m_dc + half * v_dc
-        m_va, m_vb = m_va + half * v_a, m_vb + half * v_b
-        m_oa, m_ob = m_oa + half * o_a, m_ob + half * o_b
-        t_ia, t_ib, t_va, t_vb = t_ia + i_a, t_ib + i_b, t_va + v_a, t_vb + v_b
-        t_oa, t_ob, t_dc = t_oa + o_a, t_ob + o_b, t_dc + v_dc
-        t_reg, t_flow, t_mid = t_reg + reg, t_flow + flow, t_mid + mid
-    w_to, dc_to = field(now, "w_to"), field(now, "dc_to")
-    w_to[0, I_F], w_to[0, V], w_to[0, I_O] = (
-        complex(m_ia, m_ib), complex(m_va, m_vb), complex(m_oa, m_ob)
-    )  # fmt: skip
-    w_to[1, I_F], w_to[1, V], w_to[1, I_O] = (
-        complex(t_ia, t_ib), complex(t_va, t_vb), complex(t_oa, t_ob)
-    )  # fmt: skip
-    dc_to[0, 0, DC] = m_dc
-    dc_to[1, 0, DC], dc_to[1, 0, REG], dc_to[1, 0, SOURCE], dc_to[1, 0, MID] = (
-        t_dc, t_reg, t_flow, t_mid
-    )  # fmt: skip
 
 
 @inlined
@@ -243,10 +328,9 @@ def _constants(plant: PlantRecords, c: int, k: int) -> Any:
     n, r, s = plant.net[0], plant.par[k], plant.st[k]
     q = field(n, "own_rates")[c, k]
     per_C = r.omega_b / r.C_dc
-    free = 1.0 if s.limit == 0.0 else 0.0
-    held = free * r.i_u_gain * s.u_now[0]
+    free, held = 1.0, 0.0
     if s.limit != 0.0:
-        held += limit_of(s)
+        free, held = 0.0, limit_of(s)
     per_lag, quick = 0.0, 1.0
     if r.tau_dc > 0.0:
         per_lag, quick = 1.0 / r.tau_dc, 0.0
@@ -302,20 +386,59 @@ def limit_of(s: Any) -> float:
 
 
 @inlined
-def w_at(now: Any, i: int, terms: int, tau: float) -> complex:
-    """Return state i of w at a part tau of the interval."""
-    x = field(now, "terms")
-    y = x[terms, i]
-    for j in range(terms - 1, -1, -1):
-        y = complex(x[j, i].real + tau * y.real, x[j, i].imag + tau * y.imag)
-    return y
+def choose_powers(plant: PlantRecords, c: int, key: int) -> bool:
+    """Have the only converter use the powers of a key; returns whether they are to be filled."""
+    now, s = plant.now[0], plant.st[0]
+    s.slot, there = find_slot(now, key)
+    made_for, speed = field(now, "slot_for"), field(now, "source_speed")[grid_source(plant.net[0])]
+    limit = 0.0 if s.limit == 0.0 else limit_of(s)
+    if not there:
+        made_for[s.slot, 0], made_for[s.slot, 1] = speed, limit
+        return True
+    s.by_dc = field(now, "slot_by_dc")[s.slot]
+    A, r = field(now, "power"), plant.par[0]
+    if made_for[s.slot, 1] != limit:
+        made_for[s.slot, 1] = limit
+        row, per = (SOURCE_AT, 1.0 / r.tau_dc) if r.tau_dc > 0.0 else (DC, r.omega_b / r.C_dc)
+        A[s.slot, 0, ONE, row] = per * limit
+        fill_powers(now, s.slot, 1)
+    if made_for[s.slot, 0] != speed:
+        made_for[s.slot, 0] = speed
+        _turn_grid(now, s.slot, speed)
+        fill_powers(now, s.slot, 2)
+    return False
 
 
 @inlined
-def dc_at(now: Any, k: int, what: int, terms: int, tau: float) -> float:
-    """Return a state of converter k's DC link at a part tau of the interval."""
-    x = field(now, "dc_terms")
-    y = x[terms, k, what]
-    for j in range(terms - 1, -1, -1):
-        y = x[j, k, what] + tau * y
-    return y
+def _turn_grid(now: Any, slot: int, speed: float) -> None:
+    A = field(now, "power")
+    A[slot, 0, P, P + 1], A[slot, 0, P + 1, P] = speed, -speed
+    A[slot, 0, N, N + 1], A[slot, 0, N + 1, N] = -speed, speed
+
+
+@compiled
+def make_powers(plant: PlantRecords, c: int) -> None:
+    """Make the matrix of the only converter, whose constants are set, and its powers."""
+    n, now, s = plant.net[0], plant.now[0], plant.st[0]
+    A, x, link = field(now, "power"), field(now, "vector"), field(n, "link")
+    field(now, "slot_by_dc")[s.slot] = s.by_dc
+    constants = _constants(plant, c, 0)
+    for column in range(ORDER):
+        for row in range(ORDER):
+            A[s.slot, 0, column, row] = 0.0
+        for j in range(ORDER):  # a unit vector; the row that `begin_powers` writes last
+            x[POWERS, j] = 1.0 if j == column else 0.0
+        (
+            A[s.slot, 0, column, 0], A[s.slot, 0, column, 1], A[s.slot, 0, column, 2],
+            A[s.slot, 0, column, 3], A[s.slot, 0, column, 4], A[s.slot, 0, column, 5],
+            A[s.slot, 0, column, DC], A[s.slot, 0, column, REG],
+            A[s.slot, 0, column, SOURCE_AT], A[s.slot, 0, column, MID_AT],
+        ) = _own_term(
+            constants, x[POWERS, ONE], 1.0, x[POWERS, 0], x[POWERS, 1], x[POWERS, 2], x[POWERS, 3],
+            x[POWERS, 4], x[POWERS, 5], x[POWERS, DC], x[POWERS, REG],
+            x[POWERS, SOURCE_AT], x[POWERS, MID_AT],
+        )  # fmt: skip
+    for column in (P, N):  # of both sequences of the grid what it does to the current of the line
+        A[s.slot, 0, column, 4], A[s.slot, 0, column + 1, 5] = link[c, 1, 0, 0], link[c, 1, 0, 1]
+    _turn_grid(now, s.slot, field(now, "source_speed")[grid_source(n)])
+    fill_powers(now, s.slot, 0)

@@ -2,13 +2,24 @@
 averaged bridge, and what it refuses."""
 
 import cmath
+import itertools
 import math
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.integrate import solve_ivp
 
-from gfm_plant import Plant, fault, make_plant, plant_advance, plant_equilibrium
+from gfm_plant import (
+    Plant,
+    fault,
+    make_network,
+    make_plant,
+    phase_jump,
+    plant_advance,
+    plant_equilibrium,
+    plant_step,
+)
 from gfm_plant.bridge import advance_bridges, modulate
 from gfm_plant.circuit import (
     Branch,
@@ -19,7 +30,9 @@ from gfm_plant.circuit import (
     find_modes,
     find_rates,
 )
+from gfm_plant.components import NetworkParts
 from gfm_plant.model import V_DC
+from gfm_plant.options import Grid
 from gfm_plant.protection import trip
 
 from ..support.switched import Reference
@@ -109,7 +122,7 @@ class Inside:
     def period(self, seen):
         """Go on by a period; ``seen(plant, t)`` is called after each step, t from its beginning."""
         st, step = self.plant.st, T_S / self.steps
-        st["u"][0, 0] = self.u
+        st["u"][0, 0, : len(self.u)] = self.u
         for k in range(self.steps):
             advance_bridges(self.plant.records, k * step, (k + 1) * step)
             seen(self.plant, (k + 1) * step)
@@ -232,6 +245,114 @@ def test_a_blocked_bridge_is_a_rectifier():
     assert max(currents[-400:]) < 0.02
 
 
+def test_each_of_several_bridges_is_as_it_is_alone():
+    """On an ideal grid nothing passes between them; the network's series is not that of one."""
+    options = [
+        Plant.model_validate(
+            {"bridge": {"kind": "two-level", "dead_time_s": dead, **DROPS}, "dc_source": source}
+        )
+        for dead, source in ((1e-6, {"mode": "regulated"}), (2e-6, {"i_max": 0.7}))
+    ]
+    names = {f"c{k}": (one, "bus") for k, one in enumerate(options)}
+    both = make_network(names, T_S, Grid(), NetworkParts(grid="bus"))
+    alone = [make_plant(one, T_S) for one in options]
+    starts = [plant_equilibrium(one.par, P, 1.0) for one, P in zip(alone, (0.6, 0.2), strict=True)]
+    for one, (x, u) in zip(alone, starts, strict=True):
+        one.start(x, u)
+    both.start(*(np.array(each) for each in zip(*starts, strict=True)))
+    for _ in range(40):
+        plant_step(both.records)
+        for one in alone:
+            plant_step(one.records)
+    for k, one in enumerate(alone):
+        assert np.abs(both.st["x"][k] - one.st["x"][0]).max() < 1e-12
+
+
+def halves(plant, u, periods):
+    """A t-type bridge of ideal switches by DOP853, phase by phase with both halves of C_dc, with
+    the plant's edges: the largest error of all states at ticks."""
+    r, st, now = plant.par[0], plant.st, plant.now
+    axes, w = np.exp(2j * np.pi / 3 * np.arange(3)), float(r["omega_b"])
+    per_v = math.sqrt(2 / 3) * 700 / 380
+
+    def states():
+        at = np.exp(1j * w * T_S * st["tick"][0])
+        v_dc, mid = st[0]["x"][V_DC], st[0]["mid"]
+        return np.array([*now["w"][0, :3] * at, (v_dc - mid) / 2, (v_dc + mid) / 2])
+
+    def slope(t, z, levels, begin):
+        i, v, i_o, low, high = z
+        legs = np.array([0.0, low.real, low.real + high.real])[levels]
+        i_x = (i * axes.conj()).real
+        upper, middle = per_v * i_x[levels == 2].sum(), per_v * i_x[levels == 1].sum()
+        return np.array([
+            w / r["L_f"] * (per_v * legs @ axes - v - r["R_f"] * i),
+            w / r["C_f"] * (i - i_o),
+            w / r["L_g"] * (v - np.exp(1j * w * (begin + t)) - r["R_g"] * i_o),
+            w / (2 * r["C_dc"]) * (u[0] - upper - middle),
+            w / (2 * r["C_dc"]) * (u[0] - upper),
+        ])  # fmt: skip
+
+    z, worst = states(), 0.0
+    for k in range(periods):
+        plant_step(plant.records)
+        edges, base = st[0]["edges"], st[0]["base"]
+        times = np.unique([0.0, T_S, *edges[(edges > 0) & (edges < T_S)]])
+        for a, b in itertools.pairwise(times):
+            middle = (a + b) / 2
+            levels = base + ((middle < edges[:, 0]) | (middle > edges[:, 1]))
+            more = {"args": (levels, k * T_S), "rtol": 1e-13, "atol": 1e-15}
+            z = solve_ivp(slope, (a, b), z, "DOP853", **more).y[:, -1]
+        worst = max(worst, np.abs(states() - z).max())
+    return worst
+
+
+def test_three_levels_are_exact_and_both_halves_of_the_dc_link_stay_equal():
+    plant, _, u = switched({"kind": "t-type"}, P=0.6, dc_source={"mode": "controlled"})
+    plant.st["mid"] = 0.1
+    assert halves(plant, u, 12) < 1e-11
+    for _ in range(1500):
+        plant_advance(plant.records, u)
+    assert abs(plant.st[0]["mid"]) < 5e-3
+
+
+@pytest.mark.parametrize(("kind", "levels"), [("two-level", 3), ("t-type", 5)])
+def test_levels_of_the_voltages_between_phases(kind, levels):
+    plant, _, u = switched({"kind": kind})
+    seen, line = set(), np.exp(2j * np.pi / 3) - 1
+
+    def see(plant, t):
+        e = complex(plant.st[0]["by_dc"]) / (1.5 * plant.par[0]["leg"])
+        seen.add(round((e * line.conjugate()).real, 6) + 0.0)
+
+    inside = Inside(plant, u, 50)
+    for _ in range(200):
+        inside.period(see)
+    assert seen == set(np.linspace(-1, 1, levels))
+
+
+@pytest.mark.parametrize("kind", ["two-level", "t-type"])
+def test_the_hardware_blocks_pulses_at_its_limit(kind):
+    """No phase current passes i_peak after a jump of the grid's angle that would ask for more."""
+    largest = {}
+    for i_peak in (None, 1.5):
+        off = {name: {"enabled": False} for name in ("over_current", "under_voltage")}
+        plant, _, u = switched({"kind": kind, "dead_time_s": 1e-6}, i_peak=i_peak, protection=off)
+        phase_jump(plant, -25.0)
+        inside, currents = Inside(plant, u, 20), []
+
+        def see(plant, t, currents=currents):
+            i = plant.now["w"][0, 0] * np.exp(1j * plant.par[0]["omega_b"] * (
+                T_S * plant.st[0]["tick"] + t))  # fmt: skip
+            currents.append(np.abs((i * np.exp(-2j * np.pi / 3 * np.arange(3))).real).max())
+
+        for _ in range(300):
+            inside.period(see)
+        largest[i_peak] = max(currents)
+    assert largest[None] > 2.0
+    assert 1.49 < largest[1.5] < 1.5 + 1e-9  # it is reached between two looks
+
+
 @pytest.mark.parametrize("kind", ["3ph", "LG", "LLG"])
 def test_a_fault_is_another_matrix(kind):
     """A switched bridge in a fault that is cleared phase by phase, beside an averaged one."""
@@ -277,7 +398,7 @@ def test_times_that_do_not_fit_are_refused(bridge, more, words):
     ("options", "words"),
     [
         ({"bridge": {"kind": "two-level", "V_diode": -1.0}}, "greater than or equal to 0"),
-        ({"bridge": {"kind": "two-level"}, "i_peak": 2.0}, "i_peak = 2: is a limit of bridge.kind"),
+        ({"bridge": {"kind": "three-level"}}, "'average', 'two-level' or 't-type'"),
     ],
 )
 def test_options_that_make_no_bridge_are_refused(options, words):

@@ -47,7 +47,7 @@ def test_fraction_splits_the_period_exactly(rest, samples, fraction):
 def test_dac_rounds_and_clamps(rest):
     plant = rest(dac={"bits": 8, "range": {"E_u": [0.0, 2.0], "i_u": [-1.0, 1.0]}})
     plant.advance(u=np.array([5.0, 1.00123, 1.001]))
-    assert list(plant.st["u_now"][0]) == [1.0 - 2 / 256, 1.00123, 1.0, 0.0]
+    assert list(plant.st["u_now"][0, :4]) == [1.0 - 2 / 256, 1.00123, 1.0, 0.0]
 
 
 def test_rig_boards_by_name(rest):
