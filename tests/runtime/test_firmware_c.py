@@ -19,7 +19,7 @@ from ..support import firmware
 from ..support.firmware import SOME, STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
-pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 PAGES = Path(__file__).parents[2] / "docs"
 FUSES = pytest.mark.skipif(

@@ -14,7 +14,7 @@ from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 
 from ..support.firmware import STRICT, T_S, cc, exported
 
-pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 
 def law(name: str, inner: str, measure: dict[str, Any], **modulate: Any) -> BuiltLaw:

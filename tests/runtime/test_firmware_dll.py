@@ -27,7 +27,7 @@ from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import STRICT, T_S, accepted, bench, cc
 
-pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 SUPPORT = Path(__file__).parents[1] / "support"
 REAL64, EMT = 9, 1

@@ -47,7 +47,7 @@ PAGES = Path(__file__).parents[2] / "docs"
 #: one of each error map, and the most states
 FAST = ("vsg-2", "psc-dc", "dvoc", "hybrid-angle", "vsg-11")
 EACH_LAW = [pytest.param(name, marks=() if name in FAST else pytest.mark.full) for name in LAWS]
-COMPILERS = [pytest.mark.compilers, pytest.mark.timeout(300)]
+COMPILERS = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 
 def module(name: str) -> Module:

@@ -19,7 +19,7 @@ from gfm_runtime.states import BAD_Y, RUNNING
 
 from ..support.firmware import STRICT, T_S, accepted, bench, cc
 
-pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 TICKS = 500
 START = [0.5, 1.0, 1.0, 0.05]

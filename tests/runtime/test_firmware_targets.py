@@ -13,7 +13,7 @@ from gfm_runtime.inner_file import inner_names
 from ..support.firmware import STAGED, cc, exported
 from ..support.laws import LAWS
 
-pytestmark = [pytest.mark.compilers, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 #: instructions on a Cortex-M4F in float32, unrolled: a law and its limits
 MOST = 300

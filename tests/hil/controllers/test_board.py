@@ -21,7 +21,7 @@ QEMU = ("qemu-system-arm", "-machine", "mps2-an386", "-display", "none", "-monit
 
 
 @pytest.mark.compilers
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)
 def test_a_board_controls_the_plant_over_its_uart(tmp_path):
     """Each u on the line has the bits of the float32 kernel at the y that the plant sent."""
     place = tmp_path / "board"

@@ -43,7 +43,7 @@ FAILS_AT = 100  # step of the model
 
 
 def compiles(test: Any) -> Any:
-    return pytest.mark.apt(pytest.mark.timeout(300)(test))
+    return pytest.mark.apt(pytest.mark.timeout(900)(test))
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from ...support.processes import write
 
 
 def qemu(test: Any) -> Any:
-    return pytest.mark.compilers(pytest.mark.timeout(300)(test))
+    return pytest.mark.compilers(pytest.mark.timeout(900)(test))
 
 
 SHM, PAUSE_S = {"type": "shm"}, 2.0

@@ -33,7 +33,7 @@ from ...support.processes import (
     wait_for,
 )
 
-pytestmark = [pytest.mark.processes, pytest.mark.timeout(400)]  # the first one compiles
+pytestmark = [pytest.mark.processes, pytest.mark.timeout(900)]  # the first one compiles
 
 
 def over(link: str, patience_s: float = 30.0) -> dict[str, Any]:

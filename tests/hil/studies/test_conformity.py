@@ -848,7 +848,7 @@ def test_a_test_replaces_what_its_clause_demands(lab):
 
 
 @pytest.mark.compilers
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)
 def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
     (lab / "strict.toml").write_text(STRICT)
     built = str(lab.parent / "dll")
@@ -885,7 +885,7 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
 
 
 @pytest.mark.compilers
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("target", ["host", pytest.param("m4f", marks=pytest.mark.apt)])
 def test_the_firmware_of_a_law_gets_the_verdicts_of_the_law(lab, target):
     name = f"pil:{target}"
