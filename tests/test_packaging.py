@@ -31,8 +31,9 @@ RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 _FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "toml_file")
 _STAGES = ("dual_sequence", "kinds", "stage", "virtual_stator", "voltage_loop")  # their options
+_COUNTS = ("measure", "modulate", "pair")  # likewise
 BESIDE_THE_LOOP = {
-    **{f"{name}.py": {"pydantic", "pydantic_core"} for name in (*_FILES, *_STAGES)},
+    **{f"{name}.py": {"pydantic", "pydantic_core"} for name in (*_FILES, *_STAGES, *_COUNTS)},
     "elf.py": {"elftools"},  # the extra "calibration"
 }
 OF_THE_SAME_PROJECT = {"pydantic_core", "llvmlite"}  # as pydantic and numba, which pin them

@@ -348,7 +348,7 @@ def _runs(place: Path) -> tuple[Path, Path]:
     (going / "scenario.toml").write_text(scenario_toml(scenario), "utf-8")
     for role in ("plant", "controller"):
         part = RolePart.create(going, role, scenario.ticks)
-        part.signals[:], part.progress[:] = 1.0, (10, 0)
+        part.signals[:], part.progress[:] = 1.0, (10, 0, 0)
         (going / f"commands_{role}.json").write_text(
             f'{{"endpoint": "ipc://{held}/{role}", "T_s": 0.0001, "names": ["vsg-2"], "laws":'
             ' [{"label": "vsg-2", "name": "vsg-2", "gains": {"D_p": 0.01}},'

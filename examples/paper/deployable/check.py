@@ -20,7 +20,8 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
 from gfm_hil.api.design import problem_name
-from gfm_hil.cli.design.gains import add_inner_option, channels_as_json, chosen_law
+from gfm_hil.cli.common import add_inner
+from gfm_hil.cli.design.gains import channels_as_json, chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_runtime import build_law, discretise
@@ -40,7 +41,7 @@ _RANGE = {
 def add(kinds: Any) -> None:
     command = kinds.add_parser("check", help="whether a law holds in the box of real loops")
     command.add_argument("--law", required=True, help="catalogue name or law file")
-    add_inner_option(command)
+    add_inner(command)
     add_box(command)
     command.add_argument("--random", type=int, default=1000, help="points inside, of either source")
     command.add_argument("--seed", type=int, default=0, help="of those points")

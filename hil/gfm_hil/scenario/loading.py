@@ -253,6 +253,11 @@ def check_scenario(
     for law in dict.fromkeys([*scenario.laws(), *scenario.compare]):
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         wrong += [ours + line for line in _law_mistakes(law, scenario)]
+    if not wrong:  # what is exchanged follows from all laws
+        each = [scenario.of(name) for name in scenario.converters] or [scenario]
+        for member in each:
+            for law in member.laws():
+                wrong += [f"{where}: {line}" for line in _counts_mistakes(law, member)]
     try:
         _try_plant(scenario)
     except UserError as problem:
@@ -281,7 +286,17 @@ def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
     try:
         for stage in stages:
             discretise(stage, scenario.T_s)
-            _check_counts(stage, scenario)
+    except LawError as problem:
+        return problem.within(f"law {law}").lines
+    return ()
+
+
+def _counts_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
+    """What is wrong with a law's measurement and modulation, if the scenario's laws have them."""
+    try:
+        if scenario.carries == COUNTS:
+            for stage in load_law(law, scenario.inner, scenario.counts).laws:
+                _check_counts(stage, scenario)
     except LawError as problem:
         return problem.within(f"law {law}").lines
     return ()
@@ -289,8 +304,6 @@ def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
 
 def _check_counts(law: BuiltLaw, scenario: Scenario) -> None:
     """Raise LawError if a law's timer does not fit the sampling time, or is not the plant's."""
-    if scenario.carries != COUNTS:
-        return
     if law.counts is None:
         why = "missing, and other laws of the scenario have them; give the scenario counts"
         raise LawError("measure, modulate", why)

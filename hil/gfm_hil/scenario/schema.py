@@ -348,9 +348,9 @@ class Scenario(StrictSchema):
 
     @cached_property
     def carries(self) -> int:
-        """What frames and recording have beside y and u of Phi: with an inner stage in one of the
-        laws its signals (``INNER``), and with laws that measure and modulate also counts
-        (``COUNTS``); else nothing (``PLAIN``)."""
+        """What frames and recording have beside y and u of Phi. With an inner stage in one of the
+        laws these are its signals (``INNER``), with laws that measure and modulate also counts
+        (``COUNTS``), else nothing (``PLAIN``)."""
         each = [self.of(name) for name in self.converters] or [self]
         files = [(one, law_file(name)) for one in each for name in one.laws()]
         counts = named_counts(self.counts) if self.counts is not None else None

@@ -67,7 +67,7 @@ def test_u_is_taken_from_k_minus_hold_to_k_and_no_other(make, attack_now):
 
 @pytest.mark.attack("1.3", "a state byte of 99 or a reason byte of 200", "running; IndexError")
 @by_role
-@pytest.mark.parametrize(("state", "reason"), [(5, 0), (99, 0), (255, 0), (SAFE, 7), (0, 200)])
+@pytest.mark.parametrize(("state", "reason"), [(5, 0), (99, 0), (255, 0), (SAFE, 8), (0, 200)])
 def test_a_state_or_reason_without_a_meaning_is_refused(role, state, reason, make):
     reader = limited(role, make(**REALTIME))
     assert fault_of(reader, 1, 91, state, reason) == "state"

@@ -17,8 +17,10 @@ from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import (
     ACTS,
+    CONTROLLER_COUNTS,
     CONTROLLER_INNER,
     INSTRUCTIONS,
+    PLANT_COUNTS,
     PLANT_INNER,
     PLANT_OPTIONS,
     TABLE,
@@ -58,8 +60,9 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def test_the_table_has_every_column_of_the_recording(table):
-    # of a stage, a transformer, and a processor
-    absent = {*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER, INSTRUCTIONS}
+    # of a stage, a transformer, phases in counts, and a processor
+    counts = *PLANT_COUNTS, *CONTROLLER_COUNTS
+    absent = {*PLANT_INNER, *PLANT_OPTIONS, *CONTROLLER_INNER, *counts, INSTRUCTIONS}
     assert list(table.recorded) == [name for name in TABLE if name not in absent]
     assert len({len(x) for x in table.recorded.values()}) == 1
     assert table.recorded["plant_received"].min() > 0
