@@ -112,7 +112,7 @@ def test_records_are_plain_structs(make, real):
     end = 0
     for kind, offset, *_ in dtype.fields.values():
         assert kind.base in (np.dtype(real), np.dtype(np.int64))
-        assert offset == end, "fields follow each other without gaps"
+        assert 0 <= offset - end < kind.base.itemsize, "no gap but what a number needs"
         end = offset + kind.itemsize
     assert dtype.itemsize - end < 8
 
