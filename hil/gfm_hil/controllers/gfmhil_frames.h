@@ -23,10 +23,10 @@
 #define GFMHIL_NU 3 /* i_u, omega_u, E_u */
 #endif
 
-enum { GFMHIL_MAGIC = 0x4647, GFMHIL_TABLE_VERSION = 2, GFMHIL_Y_ID = 1, GFMHIL_U_ID = 2 };
+enum { GFMHIL_MAGIC = 0x4647, GFMHIL_TABLE_VERSION = 3, GFMHIL_Y_ID = 1, GFMHIL_U_ID = 2 };
 enum { GFMHIL_INIT, GFMHIL_READY, GFMHIL_RUNNING, GFMHIL_SAFE, GFMHIL_STOPPED }; /* state */
 enum { GFMHIL_OK, GFMHIL_BAD_Y, GFMHIL_BAD_U, GFMHIL_STALE, GFMHIL_LOST_PEER, GFMHIL_PLANT_TRIP,
-       GFMHIL_OPERATOR }; /* reason */
+       GFMHIL_OPERATOR, GFMHIL_BAD_SENSOR }; /* reason */
 enum { GFMHIL_LONGEST = 504 }; /* bytes of a message */
 
 typedef struct __attribute__((packed)) {
