@@ -53,7 +53,7 @@ class UdpLink:
         self.port = Port(np.array([self._socket.fileno()]), _port_send, _port_receive, _SPINS)
 
     def send(self, message: bytes) -> bool:
-        with suppress(OSError):  # nobody is there yet
+        with suppress(OSError):  # the other side has not opened its port yet
             return self._socket.send(message) > 0
         return False
 

@@ -22,7 +22,7 @@ Numbers = NDArray[np.int64]
 #: columns of the readings of an exchange: the deadline or t1, t1, t2, t3, t4; -1: there is none
 DUE, SENT, HEARD, ANSWERED, RECEIVED = range(5)
 _STRETCHES = 16  # of a round: the quickest exchange of each says how the clocks drift
-_FEW = 64  # exchanges, of which the drift cannot be told
+_FEW = 64  # with fewer exchanges the drift of the clocks is not estimated
 _FASTEST = 1e6  # ns of drift in a second
 STEPPED = "a clock stepped"
 

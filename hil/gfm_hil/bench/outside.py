@@ -82,7 +82,7 @@ PROGRAMS: Mapping[str, tuple[_Command, Callable[[str], Times]]] = {
 
 
 def missing(name: str) -> str:
-    """Why a program does not measure here; "" if it does."""
+    """The reason for which a program cannot measure here; "" if it can."""
     if shutil.which(name) is None:
         return f"{name}: not installed (Debian: {'rt-tests' if name == 'cyclictest' else name})"
     if name != "rtla":

@@ -280,7 +280,7 @@ def answer(
         endpoint, options: of the link.
         ptp_us: as of ``peer_of``.
         fifo: ask for the priority of a run in real time.
-        say: is called with a line for whoever watches.
+        say: receives each line of progress.
 
     Raises:
         UserError: the endpoint cannot be used.

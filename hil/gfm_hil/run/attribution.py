@@ -45,7 +45,7 @@ def missed_ticks(timing: Timing) -> Times:
 
 
 class Attributed(NamedTuple):
-    """Why each missed tick was missed; arrays of the shape of ``missed_ticks``."""
+    """The cause of each missed tick; arrays of the shape of ``missed_ticks``."""
 
     causes: Times  # index into ``CAUSES``
     names: list[str]  # who took the time; "" if it was the run itself, or if nobody watched
@@ -55,7 +55,7 @@ def attribute(
     timing: Timing, T_ns: int, events: Iterable[int] = (), taken: Taken | None = None,
     processors: Collection[int] = (),
 ) -> Attributed:  # fmt: skip
-    """Why each tick of a run in real time was missed.
+    """Find the cause of each missed tick of a run in real time.
 
     Args:
         timing: arrays of ``timing.npz``, each (ticks,), of successive ticks.
