@@ -20,11 +20,11 @@ from gfm_plant.layout import Record, make_net_and_now
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
-from gfm_plant.options import COMMANDS, MEASURED, PHASES, Grid, Overload, Phases, Plant, Protection
+from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
 from gfm_plant.wiring import ConverterCircuit, Wiring
-from gfm_runtime.signals import SPACE_VECTOR
+from gfm_runtime.signals import CHANNELS, SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
@@ -413,8 +413,8 @@ def _pack_phases(par: Record, phases: Phases, T_s: float) -> None:
         ("gain", phases.gain, 1.0), ("offset", phases.offset, 0.0),
         ("noise", phases.noise_std, 0.0), ("skew", phases.skew_s, 0.0),
     ):  # fmt: skip
-        par[f"phase_{name}"] = [values.get(channel, default) for channel in PHASES]
-    ends = [phases.ends(channel) for channel in PHASES]
+        par[f"phase_{name}"] = [values.get(channel, default) for channel in CHANNELS]
+    ends = [phases.ends(channel) for channel in CHANNELS]
     par["phase_lo"] = [low for low, _ in ends]
     par["phase_lsb"] = [(high - low) / 2**phases.bits for low, high in ends]
     par["phase_top"] = 2**phases.bits - 1

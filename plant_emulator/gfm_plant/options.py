@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -25,19 +25,13 @@ from gfm_plant.parameters import (
     load_converter,
 )
 from gfm_plant.records import MAX_DELAY, N_OVERLOADS
-from gfm_runtime.signals import COUNTS, Y_NAMES, carried, names
+from gfm_runtime.signals import COUNTS, FULL_SCALES, Y_NAMES, Channel, carried, names, quantity
 
 Measured = Literal["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q", "i_od", "i_oq"]
 Command = Literal["i_u", "omega_u", "E_u", "E_q"]
 MEASURED = cast("tuple[Measured, ...]", (*(Y_NAMES[k] for k in SENSED), *names("y_inner")))
 COMMANDS = cast("tuple[Command, ...]", carried("u", COUNTS))
 """The channels, in the order of the records."""
-
-Phase = Literal[
-    "v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"
-]  # fmt: skip
-PHASES: tuple[Phase, ...] = get_args(Phase)
-"""Channels of the A/D at the phases, in the order of the group ``adc``."""
 
 
 class Battery(Options):
@@ -230,25 +224,29 @@ class Phases(Options):
     of a phase's nominal peak value, sqrt(2/3) V_n and sqrt(2/3) S_n/V_n."""
 
     bits: int = Field(12, ge=8, le=16, description="of the A/D")
-    v_dc: Range = Field((0.0, 2.0), description="full scale [lo, hi] of the DC voltage, p.u.")
-    i: Range = Field((-4.0, 4.0), description="full scale of the currents of L_f, p.u.")
-    v: Range = Field((-2.0, 2.0), description="full scale of the voltages of C_f, p.u.")
-    i_o: Range = Field((-4.0, 4.0), description="full scale of the currents of the line, p.u.")
-    gain: dict[Phase, float] = Field({}, description="measured over true value, default 1")
-    offset: dict[Phase, float] = Field({}, description="added to the measured value, p.u.")
-    noise_std: dict[Phase, NonNegative] = Field(
+    v_dc: Range = Field(
+        FULL_SCALES["v_dc"], description="full scale [lo, hi] of the DC voltage, p.u."
+    )
+    i: Range = Field(FULL_SCALES["i"], description="full scale of the currents of L_f, p.u.")
+    v: Range = Field(FULL_SCALES["v"], description="full scale of the voltages of C_f, p.u.")
+    i_o: Range = Field(
+        FULL_SCALES["i_o"], description="full scale of the currents of the line, p.u."
+    )
+    gain: dict[Channel, float] = Field({}, description="measured over true value, default 1")
+    offset: dict[Channel, float] = Field({}, description="added to the measured value, p.u.")
+    noise_std: dict[Channel, NonNegative] = Field(
         {}, description="standard deviation of white Gaussian noise, p.u."
     )
-    skew_s: dict[Phase, NonNegative] = Field(
+    skew_s: dict[Channel, NonNegative] = Field(
         {}, description="by how much a channel samples before the tick, s"
     )
     bandwidth_hz: Positive | None = Field(
         None, description="first-order low-pass of each channel; none if not given"
     )
 
-    def ends(self, channel: Phase) -> tuple[float, float]:
+    def ends(self, channel: Channel) -> tuple[float, float]:
         """Full scale of a channel, p.u."""
-        low, high = getattr(self, channel if channel == "v_dc" else channel[:-2])
+        low, high = getattr(self, quantity(channel))
         return low, high
 
 

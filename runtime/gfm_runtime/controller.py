@@ -22,7 +22,7 @@ from gfm_runtime.counts import align, go_on_with, measure, modulate
 from gfm_runtime.impedance import estimate
 from gfm_runtime.inner import settle_inner, take_measurements
 from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner
-from gfm_runtime.signals import N_LEGS, NU, NU_INNER, NY, NY_INNER, group
+from gfm_runtime.signals import N_LEGS, NU, NU_INNER, NY, NY_INNER, Y_V_D, Y_V_Q, group
 from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
 from gfm_runtime.switchover import change_law, settle_into
 
@@ -222,21 +222,37 @@ def control(ctl, laws, states, est, y, u):
     c = ctl[0]
     if c.state != RUNNING:
         return
-    inner, counts = len(y) > NY, len(y) > NY_INNER
-    if counts:
-        if c.aligns:
-            c.aligns = 0
-            if c.joins:
-                states[c.active].sensed[7], states[c.active].sensed[8] = 1.0, 0.0
-            align(laws[c.active], states[c.active], y, NY_INNER)
-        measure(laws[c.active], states[c.active], y, NY_INNER)
-        if states[c.active].suspect >= 0:
-            _go_safe(c, BAD_SENSOR, states[c.active].suspect)
-            return
-        if not accept(c, states[c.active].sensed):
-            return
-    elif not accept(c, y):
+    counts, before = len(y) > NY_INNER, c.active
+    if not (_sense(c, laws[before], states[before], y) if counts else accept(c, y)):
         return
+    _tick(c, laws, states, est, len(y) > NY, u)
+    if counts:
+        if c.active != before:
+            go_on_with(states[c.active], states[before])
+        if c.state == RUNNING:
+            modulate(laws[c.active], states[c.active])
+            for x in range(N_LEGS):
+                u[NU_INNER + x] = int(states[c.active].compare[x])
+
+
+@inlined
+def _sense(c, law, state, y):
+    """Measure from the counts at the end of y (21,); whether all is plausible and in range."""
+    if c.aligns:
+        c.aligns = 0
+        if c.joins:
+            state.sensed[Y_V_D], state.sensed[Y_V_Q] = 1.0, 0.0
+        align(law, state, y, NY_INNER)
+    measure(law, state, y, NY_INNER)
+    if state.suspect >= 0:
+        _go_safe(c, BAD_SENSOR, state.suspect)
+        return False
+    return accept(c, state.sensed)
+
+
+@inlined
+def _tick(c, laws, states, est, inner, u):
+    """A tick in p.u., from the y that ``c`` has accepted; other arguments as of ``control``."""
     if c.joins:
         c.joins = 0
         _join(laws[c.active], states[c.active], c, inner)
@@ -246,8 +262,6 @@ def control(ctl, laws, states, est, y, u):
         if inner:
             take_measurements(states[k], c.y)
             settle_inner(laws[k], states[k], c.out[2], c.out[3])
-        if counts:
-            go_on_with(states[k], states[c.active])
         c.active, c.changes = k, c.changes + 1
     if inner:
         look_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
@@ -260,10 +274,6 @@ def control(ctl, laws, states, est, y, u):
             c.u[i] = states[c.active].u[i]  # the law's own
         for i in range(NU_INNER):
             u[i] = c.out[i]
-        if counts:
-            modulate(laws[c.active], states[c.active])
-            for x in range(N_LEGS):
-                u[NU_INNER + x] = int(states[c.active].compare[x])
         return
     look(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others

@@ -22,12 +22,24 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import astuple, dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 TABLE_VERSION = 3
 
 Group = Literal["y", "u", "y_inner", "u_inner", "adc", "compare", "ref", "d"]
 Vector = Literal["y", "u"]
+Channel = Literal["v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"]
+CHANNELS: tuple[Channel, ...] = get_args(Channel)
+"""Of the A/D at a converter's phases, in the order of the group ``adc``."""
+_READ = {"v_dc": "the DC voltage", "i": "the current of L_f", "v": "the voltage of C_f",
+         "i_o": "the current of the line"}  # fmt: skip
+FULL_SCALES = {"v_dc": (0.0, 2.0), "i": (-4.0, 4.0), "v": (-2.0, 2.0), "i_o": (-4.0, 4.0)}
+"""Of the A/D by default, p.u. of V_dcref and of a phase's nominal peak value, by quantity."""
+
+
+def quantity(channel: Channel) -> str:
+    """What a channel reads: v_dc, i, v or i_o."""
+    return channel if channel == "v_dc" else channel[:-2]
 
 
 @dataclass(frozen=True)
@@ -76,14 +88,9 @@ SIGNALS: tuple[Signal, ...] = (
            "q component of the bridge's voltage"),
     *(
         Signal("adc", f"adc_{name}", f"n_{{{name}}}", "counts", "1", 1.0, 0.0, 65535.0, 0.0,
-               f"A/D's reading of {what}")
-        for name, what in {
-            "v_dc": "the DC voltage",
-            **{f"{x}_{leg}": f"{what}, phase {leg}" for x, what in {
-                "i": "the current of L_f", "v": "the voltage of C_f",
-                "i_o": "the current of the line",
-            }.items() for leg in "abc"},
-        }.items()
+               f"A/D's reading of {_READ[quantity(name)]}"
+               + f", phase {name[-1]}" * (name != "v_dc"))
+        for name in CHANNELS
     ),
     *(
         Signal("compare", f"cmp_{leg}", f"m_{leg}", "counts", "1", 1.0, 0.0, 65535.0, 0.0,
@@ -99,7 +106,9 @@ line-to-line RMS is sqrt(3/2) times the phase amplitude."""
 
 NY, NU = 5, 3  # of Phi
 NY_INNER, NU_INNER = 11, 4  # of a run with an inner stage
-N_ADC, N_LEGS = 10, 3
+#: places in its y
+Y_V_DC, Y_P, Y_OMEGA, Y_Q, Y_V, Y_I_D, Y_I_Q, Y_V_D, Y_V_Q, Y_I_OD, Y_I_OQ = range(NY_INNER)
+N_ADC, N_LEGS = len(CHANNELS), 3
 NY_COUNTS, NU_COUNTS = NY_INNER + N_ADC, NU_INNER + N_LEGS  # of one that measures and modulates
 
 #: what a run exchanges beside y and u of Phi: nothing, the signals of an inner stage, and counts

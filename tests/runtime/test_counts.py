@@ -8,7 +8,7 @@ import pytest
 
 from gfm_runtime import LawError, discretise, load_law, pack_law, state_dtype
 from gfm_runtime.counts import Counts, Measure, Modulate, align, measure, modulate, named_counts
-from gfm_runtime.counts.measure import CHANNELS
+from gfm_runtime.signals import CHANNELS
 
 T_S, OMEGA_B, TOP = 1e-4, 100 * math.pi, 10_000
 AXES = np.exp(2j * np.pi / 3 * np.arange(3))

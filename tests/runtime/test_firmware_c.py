@@ -213,16 +213,19 @@ def test_what_would_change_bits_does_not_compile(folders, flag, why):
 
 def test_the_pages_examples_compile(tmp_path):
     page = (PAGES / "firmware.md").read_text(encoding="utf-8")
-    plain, in_integers, with_stage = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
+    plain, in_integers, with_stage, to_pins = re.findall(r"```c\n(.*?)```", page, re.DOTALL)
     exported(tmp_path, FIXED, "unrolled", "vsg-1")
     (tmp_path / "integers.txt").write_text(in_integers)
     done = cc(tmp_path, *STRICT, "-fsyntax-only", "-x", "c", "integers.txt")
     assert (done.returncode, done.stderr) == (0, "")
     exported(tmp_path, "float32", "unrolled", "vsg-1")
-    law = load_law("vsg-2", "cascaded").laws[0]
-    exported(tmp_path, "float32", "unrolled", of={"vsg-2": law})
-    for code in (plain, with_stage):
-        (tmp_path / "example.txt").write_text("void block_the_bridge(void);\n" + code)
+    called = "#include <stdint.h>\nvoid block_the_bridge(void);\nvoid report(int channel);\n"
+    called += "void set_compare(uint16_t a, uint16_t b, uint16_t c, uint16_t enable);\n"
+    for code, *chosen in ((plain,), (with_stage, "cascaded"), (to_pins, "cascaded", "rig")):
+        if chosen:
+            law = load_law("vsg-2", *chosen).laws[0]
+            exported(tmp_path, "float32", "unrolled", of={"vsg-2": law})
+        (tmp_path / "example.txt").write_text(called + code)
         done = cc(tmp_path, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
         assert (done.returncode, done.stderr) == (0, "")
 

@@ -53,7 +53,9 @@ def test_the_whole_interrupt_has_the_kernels_bits(tmp_path, target, real, style,
     found = check(exported(tmp_path, real, style, of=COUNTED), target, flags)
     assert [(c.name, c.rows, c.differ) for c in found] == [(n, CHECKED, 0) for n in COUNTED]
     if (target, style) == ("m4f", "unrolled"):
-        assert max(c.instructions[1] for c in found if c.instructions) <= 1250
+        most = {c.name: c.instructions[1] for c in found if c.instructions}
+        assert most.pop("third") <= 1050  # three states and a cascaded stage
+        assert max(most.values()) <= 900
 
 
 def test_the_rows_reach_what_they_are_for():

@@ -7,22 +7,36 @@ the controller's own frame; then p, q and V at the filter capacitor, Eq. (9)-(11
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import N_ADC, N_LEGS
+from gfm_runtime.signals import (
+    CHANNELS,
+    FULL_SCALES,
+    N_ADC,
+    N_LEGS,
+    Y_I_D,
+    Y_I_OD,
+    Y_I_OQ,
+    Y_OMEGA,
+    Y_P,
+    Y_Q,
+    Y_V,
+    Y_V_D,
+    Y_V_DC,
+    Y_V_Q,
+    Channel,
+    quantity,
+)
 from gfm_runtime.toml_file import TomlTable
-
-Channel = Literal["v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"]
-CHANNELS: tuple[Channel, ...] = get_args(Channel)
-"""In the order of the signal table's group ``adc``."""
 
 I_A, V_A, I_O_A = 1, 4, 7
 """Where the phases of each quantity begin."""
 
+_IN_TURN = 3  # each tick looks for faults of the sensors of one of the three quantities
 
 _STILL_ABOVE = 0.1  # p.u.
 
@@ -40,10 +54,14 @@ class Measure(TomlTable):
     """What the firmware takes its sensors and its A/D for; p.u. of a phase's nominal peak value."""
 
     bits: int = Field(12, ge=8, le=16, description="of the A/D")
-    v_dc: FullScale = Field((0.0, 2.0), description="full scale [lo, hi] of the DC voltage, p.u.")
-    i: FullScale = Field((-4.0, 4.0), description="full scale of the currents of L_f, p.u.")
-    v: FullScale = Field((-2.0, 2.0), description="full scale of the voltages of C_f, p.u.")
-    i_o: FullScale = Field((-4.0, 4.0), description="full scale of the currents of the line, p.u.")
+    v_dc: FullScale = Field(
+        FULL_SCALES["v_dc"], description="full scale [lo, hi] of the DC voltage, p.u."
+    )
+    i: FullScale = Field(FULL_SCALES["i"], description="full scale of the currents of L_f, p.u.")
+    v: FullScale = Field(FULL_SCALES["v"], description="full scale of the voltages of C_f, p.u.")
+    i_o: FullScale = Field(
+        FULL_SCALES["i_o"], description="full scale of the currents of the line, p.u."
+    )
     offset: dict[Channel, float] = Field(
         {}, description="that a channel is known to have, p.u.; it is taken off"
     )
@@ -73,19 +91,20 @@ class Measure(TomlTable):
         """The constants in ``law_dtype``, by name; T_s in s."""
         zero, per_count = [], []
         for name in CHANNELS:
-            low, high = getattr(self, name if name == "v_dc" else name[:-2])
+            low, high = getattr(self, quantity(name))
             lsb, gain = (high - low) / 2**self.bits, self.gain.get(name, 1.0)
             zero.append((self.offset.get(name, 0.0) - low) / lsb)
             per_count.append(lsb / gain)
         follow = -math.expm1(-2 * math.pi * self.f_y * T_s) if self.f_y > 0 else 1.0
+        apart = _IN_TURN * T_s
         return {
             "two": int(self.phases == 2),
             "adc_zero": zero,
             "adc_scale": per_count,
             "adc_top": 2.0**self.bits - 1,
             "sum_most": self.sum_most,
-            "sum_ticks": float(math.ceil(self.sum_s / T_s - 1e-6)),
-            "still_ticks": float(math.ceil(self.still_s / T_s - 1e-6)),
+            "sum_checks": float(math.ceil(self.sum_s / apart - 1e-6)),
+            "still_checks": float(math.ceil(self.still_s / apart - 1e-6)),
             "still_above": 1.5 * _STILL_ABOVE**2,
             "follow_y": follow,
         }
@@ -94,8 +113,7 @@ class Measure(TomlTable):
 @inlined
 def measure(law, state, adc, first):
     """y of this tick from counts: state.sensed; and the channel that is not plausible, or -1:
-    state.suspect. It is one that does not change; or of phases that do not add up one that has not
-    changed meanwhile, else the first.
+    state.suspect.
 
     Args:
         law, state: records of ``law_dtype`` and ``state_dtype``.
@@ -104,50 +122,60 @@ def measure(law, state, adc, first):
     y = state.sensed
     for j in range(N_ADC):
         state.phases[j] = adc[first + j]  # in the law's own precision
-        state.still[j] += law.one
-        if state.phases[j] != state.last[j]:
-            state.still[j] = law.zero
-        state.last[j] = state.phases[j]
         state.phases[j] = (state.phases[j] - law.adc_zero[j]) * law.adc_scale[j]
     if law.two != 0:
         state.phases[I_A + 2] = -state.phases[I_A] - state.phases[I_A + 1]
         state.phases[I_O_A + 2] = -state.phases[I_O_A] - state.phases[I_O_A + 1]
     state.suspect = -1
-    if state.still[0] >= law.still_ticks and (
-        state.last[0] <= law.zero or state.last[0] >= law.adc_top
-    ):
-        state.suspect = 0
-    for k in range(3):
-        at = I_A + 3 * k
+    state.turn += law.one
+    if state.turn >= law.in_turn:
+        state.turn = law.zero
+    for k in range(_IN_TURN):
+        at = I_A + N_LEGS * k
         a, b, c = state.phases[at], state.phases[at + 1], state.phases[at + 2]
-        state.odd[k] = _odd(law, state.odd[k], a + b + c)
-        if state.odd[k] > law.sum_ticks and state.suspect < 0:
-            state.suspect = at
-            for x in range(N_LEGS):
-                if state.still[at + x] >= law.sum_ticks:
-                    state.suspect = at + x
-        if a * a + b * b + c * c > law.still_above:
-            for x in range(N_LEGS):
-                if state.still[at + x] >= law.still_ticks:
-                    state.suspect = at + x
-        y[5 + 2 * k], y[6 + 2 * k] = _park(law, state, a, b, c)
-    p = y[7] * y[9] + y[8] * y[10]
-    q = y[8] * y[9] - y[7] * y[10]
-    V = math.sqrt(y[7] * y[7] + y[8] * y[8])
-    y[0] = _smoothed(law, y[0], state.phases[0])
-    y[1] = _smoothed(law, y[1], p)
-    y[2] = state.speed
-    y[3] = _smoothed(law, y[3], q)
-    y[4] = _smoothed(law, y[4], V)
+        if state.turn == k:
+            _check(law, state, adc, first, k)
+        y[Y_I_D + 2 * k], y[Y_I_D + 1 + 2 * k] = _park(law, state, a, b, c)
+    p = y[Y_V_D] * y[Y_I_OD] + y[Y_V_Q] * y[Y_I_OQ]
+    q = y[Y_V_Q] * y[Y_I_OD] - y[Y_V_D] * y[Y_I_OQ]
+    V = math.sqrt(y[Y_V_D] * y[Y_V_D] + y[Y_V_Q] * y[Y_V_Q])
+    y[Y_V_DC] = _smoothed(law, y[Y_V_DC], state.phases[0])
+    y[Y_P] = _smoothed(law, y[Y_P], p)
+    y[Y_OMEGA] = state.speed
+    y[Y_Q] = _smoothed(law, y[Y_Q], q)
+    y[Y_V] = _smoothed(law, y[Y_V], V)
 
 
 @inlined
-def _odd(law, ticks, total):
-    """For how many ticks the phases of a quantity have not added up to zero."""
-    ticks += law.one
-    if abs(total) <= law.sum_most:
-        ticks = law.zero
-    return ticks
+def _check(law, state, adc, first, k):
+    """Look for a channel of quantity k that is not plausible, with v_dc at the first. It is one
+    that does not change; or of phases that do not add up one that has not changed meanwhile, else
+    the first."""
+    at = I_A + N_LEGS * k
+    if k == 0:
+        at_end = adc[first] <= law.zero or adc[first] >= law.adc_top
+        state.still[0] = state.still[0] + law.one if at_end else law.zero
+        if state.still[0] > law.still_checks:
+            state.suspect = 0
+    for x in range(N_LEGS):
+        if x < N_LEGS - 1 or k == 1 or law.two == 0:  # else the sensor is not there
+            state.still[at + x] += law.one
+            if adc[first + at + x] != state.last[at + x]:
+                state.still[at + x] = law.zero
+            state.last[at + x] = adc[first + at + x]
+    a, b, c = state.phases[at], state.phases[at + 1], state.phases[at + 2]
+    state.odd[k] += law.one
+    if abs(a + b + c) <= law.sum_most:
+        state.odd[k] = law.zero
+    if state.odd[k] > law.sum_checks and state.suspect < 0:
+        state.suspect = at
+        for x in range(N_LEGS):
+            if state.still[at + x] >= law.sum_checks:
+                state.suspect = at + x
+    if a * a + b * b + c * c > law.still_above:
+        for x in range(N_LEGS):
+            if state.still[at + x] >= law.still_checks:
+                state.suspect = at + x
 
 
 @inlined
@@ -175,8 +203,8 @@ def align(law, state, adc, first):
         state.legs[j] = (state.legs[j] - law.adc_zero[V_A + j]) * law.adc_scale[V_A + j]
     a, b, c = state.legs[0], state.legs[1], state.legs[2]
     alpha, beta = (a + a - b - c) * law.per_3, (b - c) * law.per_root_3
-    cosine = alpha * state.sensed[7] + beta * state.sensed[8]
-    sine = beta * state.sensed[7] - alpha * state.sensed[8]
+    cosine = alpha * state.sensed[Y_V_D] + beta * state.sensed[Y_V_Q]
+    sine = beta * state.sensed[Y_V_D] - alpha * state.sensed[Y_V_Q]
     size = math.sqrt(cosine * cosine + sine * sine)
     if size > law.least_v:
         state.angle[0], state.angle[1] = cosine / size, sine / size

@@ -7,27 +7,22 @@ scenario puts in place of those of its laws; the shipped ones are in ``gfm_runti
 from __future__ import annotations
 
 import math
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from gfm_runtime.compiled import inlined
 from gfm_runtime.counts.measure import Measure
 from gfm_runtime.counts.modulate import Modulate
-from gfm_runtime.errors import LawError, meant
-from gfm_runtime.mistakes import lines
-from gfm_runtime.signals import N_ADC, N_LEGS, NY_INNER
-from gfm_runtime.toml_file import TomlTable, parse_toml, read_text
-
-NO_COUNTS = "none"
+from gfm_runtime.shipped import Shipped
+from gfm_runtime.signals import N_ADC, N_LEGS, NY_INNER, Y_OMEGA
+from gfm_runtime.toml_file import TomlTable
 
 _SERIES = {
     "zero": 0.0, "half": 0.5, "three_halves": 1.5, "per_3": 1 / 3, "per_root_3": 1 / math.sqrt(3),
     "half_root_3": math.sqrt(0.75), "per_6": 1 / 6, "per_24": 1 / 24, "per_120": 1 / 120,
-    "per_720": 1 / 720, "per_5040": 1 / 5040,
+    "in_turn": 3.0,
 }  # fmt: skip
 #: integers in ``law_dtype``; constants, by name and size; variables of an instance, and of a tick
 COUNTS_NUMBERS = tuple(
@@ -35,18 +30,19 @@ COUNTS_NUMBERS = tuple(
 )
 COUNTS_CONSTANTS = {
     **dict.fromkeys(_SERIES, 1), "adc_zero": N_ADC, "adc_scale": N_ADC,
-    **dict.fromkeys(("adc_top", "sum_most", "sum_ticks", "still_ticks", "still_above"), 1),
+    **dict.fromkeys(("adc_top", "sum_most", "sum_checks", "still_checks", "still_above"), 1),
     "follow_y": 1,
-    **dict.fromkeys(("turn", "turn_ahead", "per_leg", "top", "per_top", "ripple"), 1),
-    **dict.fromkeys(("dead", "per_band", "least"), 1),
+    **dict.fromkeys(("turn", "turn_ahead", "per_leg", "top", "ripple"), 1),
+    **dict.fromkeys(("dead", "half_dead", "per_band", "least"), 1),
 }  # fmt: skip
 COUNTS_STATE = (
     ("angle", 2, "unit phasor of the controller's frame in the phases' own"),
     ("sensed", NY_INNER, "y as measured, p.u."),
-    ("last", N_ADC, "counts of the last tick"),
-    ("still", N_ADC, "ticks for which a channel has read the same"),
+    ("last", N_ADC, "counts at the last check"),
+    ("still", N_ADC, "checks for which a channel has read the same"),
+    ("turn", 1, "whose sensors this tick checks: 0 i and v_dc, 1 v, 2 i_o"),
     ("speed", 1, "at which the frame has turned since the last tick, p.u."),
-    ("odd", 3, "ticks for which the phases of i, v and i_o have not added up to 0"),
+    ("odd", 3, "checks for which the phases of i, v and i_o have not added up to 0"),
 )
 _OF_A_TICK = (("phases", N_ADC), ("legs", N_LEGS), ("edges", N_LEGS), ("compare", N_LEGS))
 
@@ -58,38 +54,7 @@ class Counts(TomlTable):
     modulate: Modulate = Field(Modulate(), description="from u to compare counts")
 
 
-@cache
-def counts_names() -> tuple[str, ...]:
-    """The names of the shipped files, and ``none``."""
-    folder = files("gfm_runtime").joinpath("counts_files")
-    found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
-    return (NO_COUNTS, *sorted(found))
-
-
-def named_counts(name: str) -> Counts | None:
-    """The two tables of a shipped name, or of a path that ends in ``.toml``; None for ``none``.
-
-    Raises:
-        LawError: an unknown name, or every mistake of the file.
-    """
-    if name == NO_COUNTS:
-        return None
-    where, content = f"counts {name}", dict[str, Any]()
-    try:
-        if name.endswith(".toml"):
-            text = read_text(name)
-        elif name in counts_names():
-            folder = files("gfm_runtime").joinpath("counts_files")
-            text = folder.joinpath(f"{name}.toml").read_text(encoding="utf-8")
-        else:
-            known = list(counts_names())
-            raise ValueError(f"unknown; use a .toml file or one of {known}{meant(name, known)}")
-        content = parse_toml(text)
-        return Counts.model_validate(content)
-    except ValidationError as problem:
-        raise LawError(where, *lines(problem, Counts, content=content)) from None
-    except ValueError as problem:
-        raise LawError(where, str(problem)) from None
+named_counts = Shipped("counts", "counts_files", Counts, Counts.model_validate).named
 
 
 def _sized(name: str, f: np.dtype[Any], size: int) -> tuple[Any, ...]:
@@ -129,7 +94,7 @@ def pack_counts(counts: Counts | None, rec: Any, T_s: float, omega_b: float) -> 
 @inlined
 def go_on_with(new, old):
     """Let another law go on with the frame and the filters of the one before."""
-    new.speed = old.speed
+    new.speed, new.turn = old.speed, old.turn
     new.angle[0], new.angle[1] = old.angle[0], old.angle[1]
     for j in range(NY_INNER):
         new.sensed[j] = old.sensed[j]
@@ -149,4 +114,4 @@ def begin_counts(state: Any, y: Any, angle: complex) -> None:
         angle: unit phasor of the controller's frame.
     """
     state["angle"] = angle.real, angle.imag
-    state["sensed"], state["speed"] = y, y[2]
+    state["sensed"], state["speed"] = y, y[Y_OMEGA]

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -29,9 +30,16 @@ from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import BuiltLaw
 from gfm_runtime.signals import (
     INNER,
+    N_LEGS,
     NU,
     NY,
     TABLE_VERSION,
+    Y_I_D,
+    Y_OMEGA,
+    Y_P,
+    Y_Q,
+    Y_V,
+    Y_V_DC,
     Signal,
     carried_rows,
     command_rows,
@@ -228,6 +236,9 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         for m in modules:
             tick = m.fixed_tick if m.fixed else m.tick
             keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
+            if m.counts:
+                rows, which = carried_rows("y", INNER), not_bounded(m.record)
+                keys["PIN_CHECKS"] = _checks("y", rows, _literals(rows, m.real), which)
             text = written("interface.h", keys, m.choices)
             out[f"{m.prefix}.h"] = about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
             out[f"{m.prefix}.c"] = _shell(keys | tick.keys(m.prefix), m.choices)
@@ -354,10 +365,9 @@ def _keys(
             f"    {guard}_{name} = {code}{',' * (name != 'BAD_REF')} /* {text} */"
             for name, (code, text) in RESULTS.items()
         ),
-        "Y_CHECKS": _checks("y", y, [(literal(s.low, real), literal(s.high, real)) for s in y]),
-        "REF_CHECKS": _checks(
-            "ref", ref, [(literal(s.low, real), literal(s.high, real)) for s in ref]
-        ),
+        "Y_CHECKS": _checks("y", y, _literals(y, real)),
+        "PIN_CHECKS": _checks("y", y, _literals(y, real)),
+        "REF_CHECKS": _checks("ref", ref, _literals(ref, real)),
         "U_DEFAULT": literals([s.default for s in group("u")], real),
         "U_LOW": ", ".join(repr(s.low) for s in u),
         "U_HIGH": ", ".join(repr(s.high) for s in u),
@@ -402,10 +412,51 @@ def keys_of(m: Module) -> dict[str, str]:
     return keys
 
 
-def _checks(vector: str, signals: Sequence[Signal], ends: Sequence[tuple[Any, Any]]) -> str:
-    """An expression up to its last colon: the first signal that is NaN or out of range."""
+def not_bounded(law: np.void) -> list[int]:
+    """Places in y that may be out of range for some counts of the A/D, p and q always among them.
+
+    The vector of three phases is longest at a corner of what they read.
+    """
+    zero, scale = np.float64(law["adc_zero"]), np.float64(law["adc_scale"])
+    ends = np.array([-zero * scale, (law["adc_top"] - zero) * scale])
+    axes = np.exp(2j * np.pi / 3 * np.arange(N_LEGS)) / 1.5
+    out = {Y_P, Y_Q}
+    longest = list[float]()
+    for k in range(3):
+        corners = np.array(list(itertools.product(*ends[:, 1 + 3 * k : 4 + 3 * k].T)))
+        if law["two"] and k != 1:
+            corners[:, 2] = -corners[:, 0] - corners[:, 1]
+        longest.append(float(1.001 * np.abs(corners @ axes).max()))
+    ranges = {
+        Y_V_DC: (min(ends[:, 0]), max(ends[:, 0])),
+        Y_V: (0.0, longest[1]),
+        Y_OMEGA: (law["low"][1], law["high"][1]),
+        **{Y_I_D + j: (-longest[j // 2], longest[j // 2]) for j in range(6)},
+    }
+    for j, s in enumerate(carried_rows("y", INNER)):
+        low, high = ranges.get(j, (0.0, 0.0))
+        if not (s.low <= low and high <= s.high):
+            out.add(j)
+    return sorted(out)
+
+
+def _literals(signals: Sequence[Signal], real: np.dtype[Any]) -> list[tuple[str, str]]:
+    """The ends of their ranges in C."""
+    return [(literal(s.low, real), literal(s.high, real)) for s in signals]
+
+
+def _checks(
+    vector: str,
+    signals: Sequence[Signal],
+    ends: Sequence[tuple[Any, Any]],
+    which: Sequence[int] | None = None,
+) -> str:
+    """An expression up to its last colon: the first signal that is NaN or out of range; of those
+    in the places ``which``, or of all."""
     lines = []
     for j, (s, (low, high)) in enumerate(zip(signals, ends, strict=True)):
+        if which is not None and j not in which:
+            continue
         value = f"{vector}[{j}]"
         inside = f"{value} >= {low} && {value} <= {high}"
         if isinstance(high, str) and s.low == -s.high:

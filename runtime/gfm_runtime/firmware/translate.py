@@ -380,7 +380,9 @@ class Translator:
         made = (python, *bound, *(p.kind if isinstance(p, Array) else "" for p in parameters))
         if made not in self._made:
             doc = (ast.get_docstring(tree) or "").split("\n\n")[0]
-            one = CFunction(tree.name.lstrip("_"), plain(doc), parameters)
+            name = tree.name.lstrip("_")
+            again = sum(key[0] is python for key in self._made)
+            one = CFunction(name + f"_{again + 1}" * (again > 0), plain(doc), parameters)
             body = _Body(self, python, env, one)
             body.block(tree.body, one.body)
             tidy(one)

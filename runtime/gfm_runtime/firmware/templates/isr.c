@@ -6,7 +6,7 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 /* @end@ */
 {
     tick_t t;
-    return ticked(@law@s, ref, y, u, &t);
+    return ticked(@law@s, ref, y, u, &t, refused(s, ref, y, &s->channel));
 }
 
 /* @if own@ */
@@ -31,7 +31,8 @@ int @P@_isr(@LAW@@P@_t *s, const real ref[], const uint16_t adc[], real u[], uin
         s->reason = @GUARD@_BAD_SENSOR;
         return s->reason;
     }
-    reason = ticked(@law@s, ref, s->counts.sensed, u, &t);
+    reason = out_of_range(ref, s->counts.sensed, &s->channel);
+    reason = ticked(@law@s, ref, s->counts.sensed, u, &t, reason);
     if (reason == @GUARD@_OK) {
         @MODULATE@;
         for (i = 0; i < @GUARD@_NCMP; i++) {

@@ -83,6 +83,15 @@ static int32_t root(int64_t square)
 /* @end@ */
 /* @end@ */
 @FUNCTIONS@
+/* @if counts@ */
+static int bad_ref(const real ref[], int *channel)
+{
+    *channel = @REF_CHECKS@
+             : -1;
+    return *channel >= 0 ? @GUARD@_BAD_REF : @GUARD@_OK;
+}
+
+/* @end@ */
 /* 0, or the reason to refuse these inputs: the state, or the ranges of the signal table. */
 /* @if own@ */
 APART
@@ -98,10 +107,26 @@ static int refused(const @P@_t *s, const real ref[], const real y[], int *channe
     if (*channel >= 0) {
         return @GUARD@_BAD_Y;
     }
+/* @if counts@ */
+    return bad_ref(ref, channel);
+}
+
+/* @if own@ */
+/* Of what an A/D in its range gives, p and q alone can be out of theirs: the others are not checked. */
+APART
+/* @end@ */
+static int out_of_range(const real ref[], const real y[], int *channel)
+{
+    *channel = @PIN_CHECKS@
+             : -1;
+    return *channel >= 0 ? @GUARD@_BAD_Y : bad_ref(ref, channel);
+}
+/* @else@ */
     *channel = @REF_CHECKS@
              : -1;
     return *channel >= 0 ? @GUARD@_BAD_REF : @GUARD@_OK;
 }
+/* @end@ */
 
 void @P@_init(@P@_t *s)
 {
@@ -150,8 +175,8 @@ void @P@_reset(@P@_t *s)
 }
 
 /* @if counts@ */
-/* The part of a tick that is in p.u. */
-static int ticked(@LAW@@P@_t *s, const real ref[], const real y[], real u[], tick_t *t)
+/* The part of a tick that is in p.u., if there is no reason to refuse it. */
+static int ticked(@LAW@@P@_t *s, const real ref[], const real y[], real u[], tick_t *t, int reason)
 {
 /* @elif own@ */
 IN_PLACE int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
@@ -167,7 +192,11 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 /* @else@ */
     real out[@GUARD@_NU];
 /* @end@ */
+/* @if counts@ */
+    int i;
+/* @else@ */
     int i, reason = refused(s, ref, y, &s->channel);
+/* @end@ */
     if (reason != @GUARD@_OK) {
         s->reason = reason;
         return reason;
