@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gfm_plant.bridge import advance_bridges
+from gfm_plant.going_on import advance
 from gfm_plant.layout import field
-from gfm_plant.period import advance as advance_averages
 from gfm_plant.period import go_back, keep
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import circuit, enter, mirror_sources
@@ -56,15 +55,6 @@ def advance_clearing(plant: PlantRecords) -> None:
         keep(plant)
         begin = first
     advance(plant, begin, math.inf)
-
-
-@compiled
-def advance(plant: PlantRecords, begin: float, end: float) -> None:
-    """Go on between two instants of the period, s after its beginning; inf: to its end."""
-    if plant.net[0].n_units:
-        advance_bridges(plant, begin, end)
-    else:
-        advance_averages(plant, begin, end)
 
 
 @compiled

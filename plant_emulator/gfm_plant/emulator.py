@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.bridge import advance_bridges
 from gfm_plant.clearing import advance_clearing, begin_clearing
 from gfm_plant.components import every_at_rest, every_tick
 from gfm_plant.dc_link import limit_dc_source
+from gfm_plant.going_on import advance
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
@@ -112,7 +112,7 @@ def plant_step(plant: PlantRecords) -> None:
     if now.clearing:
         advance_clearing(plant)
     elif n.n_units:
-        advance_bridges(plant, 0.0, n.T_s)
+        advance(plant, 0.0, n.T_s)
     else:
         for part in range(n.n_parts):
             stretch(plant, part)

@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed, emf
 from gfm_plant.emulator import plant_start, reconnect
+from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, PlantRecords
@@ -47,7 +48,9 @@ class Network:
     @cached_property
     def records(self) -> PlantRecords:
         """The same memory, as the compiled functions take it."""
-        return PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+        records = PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+        self.net["advance"] = find_address(records)
+        return records
 
     @property
     def memory(self) -> tuple[Record, ...]:

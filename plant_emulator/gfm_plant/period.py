@@ -126,7 +126,7 @@ def stretch(plant: PlantRecords, part: int) -> None:
 
 
 @compiled
-def advance(plant: PlantRecords, begin: float, end: float) -> None:
+def advance_averages(plant: PlantRecords, begin: float, end: float) -> None:
     """Go on between two instants of the period, s after its beginning; inf: to its end."""
     n, starts = plant.net[0], 0.0
     for part in range(n.n_parts):

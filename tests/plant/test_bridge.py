@@ -20,7 +20,7 @@ from gfm_plant import (
     plant_equilibrium,
     plant_step,
 )
-from gfm_plant.bridge import advance_bridges, modulate
+from gfm_plant.bridge import modulate
 from gfm_plant.circuit import (
     Branch,
     Capacitor,
@@ -31,6 +31,7 @@ from gfm_plant.circuit import (
     find_rates,
 )
 from gfm_plant.components import NetworkParts
+from gfm_plant.going_on import advance
 from gfm_plant.model import V_DC
 from gfm_plant.options import Grid
 from gfm_plant.protection import trip
@@ -124,7 +125,7 @@ class Inside:
         st, step = self.plant.st, T_S / self.steps
         st["u"][0, 0, : len(self.u)] = self.u
         for k in range(self.steps):
-            advance_bridges(self.plant.records, k * step, (k + 1) * step)
+            advance(self.plant.records, k * step, (k + 1) * step)
             seen(self.plant, (k + 1) * step)
         st["tick"] += 1
 

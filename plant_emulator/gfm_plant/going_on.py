@@ -1,0 +1,60 @@
+"""How a plant goes on between two instants of a sampling period: averaged, or from edge to edge.
+
+A compiled function contains all that it calls, and LLVM optimises the callees again in each caller.
+Both ways are large and have several callers. So callers reach them by an address in the plant's
+records: each is compiled once, and the switched bridge only for a plant that has one.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from llvmlite import ir
+from numba import typeof, types
+from numba.core import cgutils
+
+from gfm_plant.bridge import advance_bridges
+from gfm_plant.layout import intrinsic
+from gfm_plant.period import advance_averages
+from gfm_plant.records import PlantRecords
+from gfm_runtime.compiled import FREE, callback, inlined
+
+
+def find_address(plant: PlantRecords) -> int:
+    """Compile, or load, the way of this plant, and return its address."""
+    return _compile(typeof(plant), bool(plant.net[0]["n_units"]))
+
+
+@cache
+def _compile(kind: Any, switched: bool) -> int:
+    way = _switched if switched else _averaged
+    signature = types.void(types.CPointer(kind), types.float64, types.float64)
+    address: Any = callback(way, signature, **FREE).address
+    return address
+
+
+def _averaged(plant: Any, begin: float, end: float) -> None:
+    advance_averages(plant[0], begin, end)
+
+
+def _switched(plant: Any, begin: float, end: float) -> None:
+    advance_bridges(plant[0], begin, end)
+
+
+@inlined
+def advance(plant: PlantRecords, begin: float, end: float) -> None:
+    """Go on between two instants of the period, s after its beginning; inf: to its end."""
+    _call(plant.net[0].advance, plant, begin, end)
+
+
+@intrinsic
+def _call(typingctx: Any, address: Any, plant: Any, begin: Any, end: Any) -> Any:
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        at, *others = arguments
+        others[0] = cgutils.alloca_once_value(builder, others[0])
+        kind = ir.FunctionType(ir.IntType(8).as_pointer(), [one.type for one in others])
+        builder.call(builder.inttoptr(at, kind.as_pointer()), others)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, plant, types.float64, types.float64), make
