@@ -190,14 +190,17 @@ def _network(
     cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
     lags = [name for _, name, one in dynamic if one.lag() is not None]
+    carry_zero = len(wiring.units) + len(wiring.branches) + 2  # with a split line and a fault's own
     net, now = make_net_and_now(
         len(par),
-        len(wiring.order) + 2,
+        len(wiring.order) + 2 + carry_zero,
         len(places) + 1,
         len(cuts) - 1,
         len(par) + len(lags),
         measured,
         units_of_carrier,
+        carry_zero,
+        len(wiring.breakers()) + 2,  # the grid's, and the second end of a line with a fault inside
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)

@@ -155,6 +155,21 @@ class _Reduced:
     K: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Assembled:
+    """The equations of a circuit before the currents at its nodes add up: see `_Reduced`.
+
+    Attributes:
+        meets: of each node without a source or a capacitor what each state takes away from it.
+    """
+
+    names: list[str]
+    M: NDArray[np.float64]
+    B: NDArray[np.float64]
+    root: NDArray[np.float64]
+    meets: dict[str, NDArray[np.float64]]
+
+
 @lru_cache(maxsize=256)
 def find_modes(circuit: Circuit, omega_b: float, order: tuple[str, ...]) -> Modes:
     """Return the modes of a circuit; those of the last circuits are kept, so that an event of a
@@ -208,6 +223,19 @@ def find_rates(circuit: Circuit, omega_b: float, order: Sequence[str]) -> Rates:
 
 
 def _reduce(circuit: Circuit) -> _Reduced:
+    one = assemble(circuit)
+    rows = list(one.meets.values())
+    K = null_space(np.array(rows) / one.root) if rows else np.eye(len(one.root))
+    return _Reduced(one.names, one.M, one.B, one.root, K)
+
+
+def assemble(circuit: Circuit, apart: str = "") -> Assembled:
+    """Return the equations of a circuit; errors as for ``find_modes``.
+
+    Args:
+        circuit: the circuit.
+        apart: a node at which something else ends too: its shunt is left out.
+    """
     branches, capacitors = circuit.branches, circuit.capacitors
     sources, sinks = circuit.sources, circuit.sinks
     stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
@@ -248,6 +276,8 @@ def _reduce(circuit: Circuit) -> _Reduced:
                 raise ValueError(f"node {node}: a shunt of R = {through[node]} on a capacitor")
             M[n_b + k, n_b + k] -= 1 / through[node]
     for node, row in list(meets.items()):
+        if node == apart:
+            continue
         if node in through:  # its voltage is R times the current that arrives
             M -= through[node] * np.outer(row, row)
             del meets[node]
@@ -255,9 +285,7 @@ def _reduce(circuit: Circuit) -> _Reduced:
             only = branches[int(np.flatnonzero(row)[0])]
             raise ValueError(f"node {node}: only {only.name} ends there")
 
-    root = np.sqrt(list(stored.values()))
-    K = null_space(np.array(list(meets.values())) / root) if meets else np.eye(n_b + n_c)
-    return _Reduced(list(stored), M, B, root, K)
+    return Assembled(list(stored), M, B, np.sqrt(list(stored.values())), meets)
 
 
 def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:
@@ -332,6 +360,16 @@ def find_voltage(
     DL = D / [branch.L for branch in branches]
     found = np.linalg.lstsq(DL @ D.T, DL @ right, rcond=None)[0][free.index(node)]
     return found[:n_w], found[n_w:]
+
+
+def without_ends(branches: list[Branch], held: set[str]) -> list[Branch]:
+    """Leave out what an open breaker has left hanging at one end, where no current can flow."""
+    while True:
+        met = [node for branch in branches for node in (branch.start, branch.end)]
+        kept = [b for b in branches if all(n in held or met.count(n) > 1 for n in (b.start, b.end))]
+        if len(kept) == len(branches):
+            return kept
+        branches = kept
 
 
 def _places(kind: str, parts: Sequence[VoltageSource | Capacitor]) -> dict[str, int]:

@@ -141,14 +141,16 @@ def fault(
         node=node, branch=inside, position=position or 0.0, R=R, kind=kind, phases=phases, Z_0=Z_0,
         clearing=clearing,
     )  # fmt: skip
-    changed = replace(wiring, fault=place, opening=None)
+    changed = replace(wiring, fault=place)
     if kind in ("LG", "LLG") and changed.zero_sequence() is None:
         raise ValueError(
             f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
             f" grid or of a transformer; an {kind} fault needs a path to ground"
         )
     plant.rewire(changed)
-    plant.now["contact"], plant.now["clearing"] = 1, 0
+    plant.now["contact"], plant.now["clearing"] = 1, bool(plant.wiring.opening)
+    plant.now["made"], plant.now["conducts"][0, 0] = 0, [p in phases for p in "abc"]
+    plant.now["opens"][0, 0] = 0
     plant.now["fault_left"] = math.inf if duration is None else duration
     reconnect(plant.records)
 
@@ -320,9 +322,8 @@ def line_breaker(plant: Network, name: str, closed: bool, clearing: str = "zero"
         name: Of the line or load, or of the converter whose line it is.
         closed: False opens it.
         clearing: "zero": each pole opens as soon as its current passes zero; "instant": all poles
-            open at once, and the flux that the current shared with others stays in them. At once
-            open also: resistors and constant powers, which hold no flux; every breaker during a
-            fault; and one whose poles still conduct when another one begins to open.
+            open at once, and the flux that the current shared with others stays in them.
+            Resistors and constant powers, which hold no flux, always open at once.
 
     Raises:
         ValueError: If there is no such breaker or clearing.
@@ -339,13 +340,15 @@ def line_breaker(plant: Network, name: str, closed: bool, clearing: str = "zero"
 def _switch(plant: Network, wiring: Wiring, name: str, closed: bool, clearing: str) -> None:
     """Go on with a breaker closed or open in the wiring, or with its poles as they open."""
     _require_clearing(clearing)
-    faulted = plant.now[0]["contact"] > 0 and wiring.opening is None
+    others = tuple(one for one in wiring.opening if one.name != name)
     at_once = name in [s.name for s in wiring.shunts] + [s.name for s in wiring.sinks]
-    if closed or clearing == "instant" or faulted or at_once:
-        plant.rewire(replace(wiring, opening=None))
+    if closed or clearing == "instant" or at_once:
+        plant.rewire(replace(wiring, opening=others))
         return
-    plant.rewire(replace(wiring, fault=None, opening=OpeningBreaker(name=name)))
-    plant.now["clearing"], plant.now["fault_left"] = 1, math.inf
+    fault = wiring.fault if plant.conducting().get("", ("", 0))[0] else None
+    plant.rewire(replace(wiring, fault=fault, opening=(*others, OpeningBreaker(name=name))))
+    if fault is None:
+        plant.now["fault_left"] = math.inf
 
 
 def _require_clearing(clearing: str) -> None:

@@ -52,27 +52,41 @@ _NET: _Arrays = {
     "n_modes": (int, ("n_c",)),
     "rate": (complex, ("n_c", "n_z")),  # 1/s
     "decay": (complex, ("n_c", "n_cuts", "n_z")),  # in half a piece of each cut
-    "drive": (complex, ("n_c", "n_z", "n_s")),
+    # by the sources and by w, and by the mirror images of both, see `circuit.Modes`
+    "drive": (complex, ("n_c", 2, "n_z", "n_s")),
     "states": (complex, ("n_c", "n_w", "n_z")),
-    "modes": (complex, ("n_c", "n_z", "n_w")),
+    "modes": (complex, ("n_c", 2, "n_z", "n_w")),
     "unbalanced": (int, ("n_c",)),
-    "mirror": (complex, ("n_c", "n_z")),  # see `circuit.Modes`
     # of the contacts: the current of each phase by w, and what is left when it opens (-1:
     # it carries none), see `Wiring.contacts`
     "contact_current": (complex, ("n_contacts", 3, "n_w")),
     "opens_to": (int, ("n_contacts", 3)),
+    "contact_of": (int, (8,)),  # the contact by its phases: 1 for a, 2 for b, 4 for c
+    # of several contacts, see `joint.Joint`: its matrices, in the order of their names, and the
+    # currents of each phase by w, as ``contact_current``
+    "flow": (float, (8, "n_q", "n_q")),
+    "fault_bars": (float, (8, 3, "n_q")),
+    "fault_carries": (complex, (8, 3, "n_w")),
+    "pole_bars": (float, ("n_poles", 3, "n_q")),
+    "pole_carries": (complex, ("n_poles", 3, "n_w")),
+    "zero_shares": (float, ("n_joint", "n_w")),  # w by the zero sequence of a contact's current
+    "to_w": (float, ("n_w", 2, "n_q")),
+    "from_w": (float, ("n_w", 2, "n_q")),
+    "from_s": (float, ("n_s", 2, "n_q")),
+    "node_q": (float, ("n_nodes", 2, 2, "n_q")),
     # of nodes whose voltage is looked at, the two sides of a synchro-check first and then the
     # connection points: their voltages by w and by the sources, and by the mirror images of both;
     # what turns the latter; and the place in w of the current that reaches the node
-    "node_w": (float, ("n_c", "n_nodes", 2, "n_w")),
-    "node_s": (float, ("n_c", "n_nodes", 2, "n_s")),
+    "node_w": (complex, ("n_c", "n_nodes", 2, "n_w")),
+    "node_s": (complex, ("n_c", "n_nodes", 2, "n_s")),
     "node_turn": (complex, ("n_c",)),
     "node_i": (int, ("n_nodes",)),
     # with switched bridges, see `series`: which cut of the period each unit of the carrier belongs
     # to; of each circuit e^(-j angle) of its axis alpha, the axes of the legs, its fastest rate,
     # 1/s; of each converter what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both
-    # axes, 1/s; the other entries of w' = A w + B s: how many, row and column, values on both axes;
-    # whether there are none but what the grid does to the only line
+    # axes, 1/s; the other entries of w' = A w + B s: how many, row and column, values on both axes,
+    # and what beta does to alpha and alpha to beta; whether there are none but what the grid does
+    # to the only line
     "unit_part": (int, ("n_units",)),
     "axis": (complex, ("n_rates",)),
     "leg_axis": (complex, ("n_rates", 3)),
@@ -81,7 +95,7 @@ _NET: _Arrays = {
     "n_links": (int, ("n_rates", 2)),
     "alone": (int, ("n_rates",)),
     "link_place": (int, ("n_rates", 2, "n_entries", 2)),
-    "link": (float, ("n_rates", 2, "n_entries", 2)),
+    "link": (float, ("n_rates", 2, "n_entries", 4)),
 }
 _NOW: _Arrays = {
     # modes, what drives them in the first and in the second half of the present piece, and states
@@ -113,6 +127,15 @@ _NOW: _Arrays = {
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),
+    # of several contacts, the fault first and then the poles: which phases conduct, whether each of
+    # them opens as soon as its current passes zero; and memory of `joint.make_joint`
+    "conducts": (int, ("n_joint", 3)),
+    "opens": (int, ("n_joint",)),
+    "carried": (float, (2, "n_joint", 3)),  # by each phase at the beginning and at the end
+    "bars": (float, ("n_q", "n_q")),
+    "square": (float, (2, "n_q", "n_q")),
+    "eigen": (float, (2, "n_q")),
+    "solved": (complex, (2, "n_q", "n_q")),
 }
 
 
@@ -141,6 +164,10 @@ net_dtype = _header(
         ("batteries", "i8"),
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
         ("contact_w", "i8"),  # place of the contact's own current, -1: it has none
+        # of several contacts: how many states, breakers' ends; whether the fault opens at zeros
+        ("reals", "i8"),
+        ("poles", "i8"),
+        ("at_zeros", "i8"),
         # of a synchro-check: the largest difference of voltage, p.u., speed, rad/s, and angle, rad;
         # for how long, s
         ("check_limits", "f8", (3,)),
@@ -151,7 +178,8 @@ net_dtype = _header(
 """Of the parameters of a network.
 
 Circuits come in groups, one for each of `Wiring.contacts`, the first of which is none: row 0 of a
-group as the converters are, and row 1 + k with the bridge of converter k blocked besides. Sources
+group as the converters are, and row 1 + k with the bridge of converter k blocked besides. The last
+circuit is made in the loop, for several contacts at a time. Sources
 are the bridges, then the positive and the negative sequence of the grid, then the voltages and the
 currents of components; in an unbalanced circuit their mirror images follow in the same order. Such
 a circuit has up to two modes a state.
@@ -181,6 +209,8 @@ now_dtype = _header(
         ("contact", "i8"),  # place in `Wiring.contacts`
         ("fault_left", "f8"),  # s until the fault is cleared
         ("clearing", "i8"),  # whether each of its phases opens as soon as its current passes zero
+        ("joint", "i8"),  # whether there is more than one contact, see `conducts`
+        ("made", "i8"),  # whether the circuit of several contacts is that of the present ones
         # of a synchro-check: see `synchro_check.NONE`; the differences now, in the order of
         # `check_limits`, for how long they have been within, and the time that is left, s; ticks in
         # a row in which both sides were alive
@@ -203,6 +233,8 @@ def make_net_and_now(
     lags: int,
     connections: bool,
     units: int = 0,
+    zeros: int = 0,
+    breakers: int = 0,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -214,13 +246,16 @@ def make_net_and_now(
         lags: first-order lags, one of each converter's sensors included.
         connections: whether p, q and V of the converters' connection points are looked at.
         units: of a switched bridge's carrier in a period, 0: none is switched.
+        zeros: states of a zero sequence among these, which have one axis.
+        breakers: how many ends of lines may open at a time.
     """
     lengths = {
-        "n_converters": converters, "n_w": states, "n_z": 2 * states, "n_s": sources,
+        "n_converters": converters, "n_w": states, "n_z": 2 * states - zeros, "n_s": sources,
         "n_phasors": 2 * sources, "n_contacts": MOST_CONTACTS,
-        "n_c": MOST_CONTACTS * (converters + 1), "n_parts": parts, "n_cuts": 2 * parts + 1,
+        "n_c": MOST_CONTACTS * (converters + 1) + 1, "n_parts": parts, "n_cuts": 2 * parts + 1,
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
-        "n_units": units, "n_rates": MOST_CONTACTS * (converters + 1) if units else 0,
+        "n_units": units, "n_rates": MOST_CONTACTS * (converters + 1) + 1 if units else 0,
+        "n_q": 2 * states - zeros, "n_poles": breakers, "n_joint": breakers + 1,
         "n_entries": states * max(states, sources), "n_terms": TERMS if units else 0,
         "n_slots": SLOTS if units and converters == 1 else 0,
     }  # fmt: skip

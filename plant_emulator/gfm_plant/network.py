@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -14,17 +15,19 @@ from scipy.linalg import expm
 
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed, emf
+from gfm_plant.contacts import OWN_PATH, join
 from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, PlantRecords
-from gfm_plant.wiring import CONTACT, GRID_SOURCE, Wiring
+from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _ROUNDS = 100  # of the search for the currents of components
+_ALL = ("abc", 1)  # phases of a breaker that begins to open
 _MOST = 500  # steps of the DC link, or intervals of Simpson's rule, in a period
 
 
@@ -151,23 +154,62 @@ class Network:
         Raises:
             ValueError: as ``connect``; the plant is then unchanged.
         """
-        before, w, now = self.wiring, self.now["w"][0].copy(), self.now
-        contact = before.contacts[int(now["contact"][0])]
-        if wiring.opening is not before.opening:
-            contact = wiring.opening
+        before, now = self.wiring, self.now
+        w = dict(zip(before.order, now["w"][0], strict=False))
+        conducting, (which, i_0) = self.conducting(), self._zero_current()
+        live = {name for name, part in wiring.poles if conducting.get(part, _ALL)[0]}
+        opening = tuple(one for one in wiring.opening if one.name in live)
+        wiring = replace(wiring, opening=opening)
         self.connect(wiring)
-        # what is left may be another kind, for want of a path of the zero sequence
-        phases = ["" if one is None else one.phases for one in (contact, *wiring.contacts)]
-        now["contact"] = phases.index(phases[0], 1) - 1 if phases[0] in phases[1:] else 0
-        now["clearing"] *= now["contact"] > 0
         if wiring.split is not None and wiring.split != before.split:
-            there = wiring.order.index(wiring.split)
-            self.now["w"][0, wiring.order.index("beyond")] = w[there]
-        if CONTACT in wiring.order and wiring.fault != before.fault:
-            self.now["w"][0, wiring.order.index(CONTACT)] = 0.0
+            for sequence in ("", ".0"):
+                w[f"beyond{sequence}"] = w.get(wiring.split + sequence, 0.0)
+            conducting["beyond"] = conducting.get(wiring.split, _ALL)
+        if wiring.fault != before.fault:
+            w[CONTACT] = w[OWN_PATH] = 0.0
+        now["w"][0, : len(wiring.order)] = [w.get(name, 0.0) for name in wiring.order]
+        parts = ["", *(part for _, part in wiring.poles)]
+        if wiring.joint and which in parts:
+            now["w"] += i_0 * self.net["zero_shares"][0, parts.index(which)]
+        now["joint"], now["made"] = wiring.joint, 0
+        for j, part in enumerate(parts):
+            phases, opens = conducting.get(part, _ALL if part else ("", 0))
+            now["conducts"][0, j], now["opens"][0, j] = [p in phases for p in "abc"], opens
+        # what is left may be another kind, for want of a path of the zero sequence
+        alone = "" if wiring.joint or not wiring.opening else wiring.opening[0].name
+        phases, opens = conducting.get(alone, _ALL if alone else ("", 0))
+        now["contact"] = self.net["contact_of"][0, sum(1 << "abc".index(p) for p in phases)]
+        now["clearing"] = bool(wiring.opening) or opens * (now["contact"][0] > 0)
         if before.grid is None and self._leader() is None:  # the last machine is gone
             self.now["omega_g_slope"] = 0.0
         reconnect(self.records)
+
+    def conducting(self) -> dict[str, tuple[str, int]]:
+        """The phases of each contact that conduct, and whether they open as their currents pass
+        zero: of the fault as "", of breakers by their branches."""
+        wiring, now = self.wiring, self.now[0]
+        found = {part: ("", 0) for _, part in wiring.poles}
+        if now["joint"]:
+            for j, part in enumerate(["", *(part for _, part in wiring.poles)]):
+                flags = zip("abc", now["conducts"][j], strict=True)
+                found[part] = "".join(p for p, one in flags if one), int(now["opens"][j])
+        elif (one := wiring.contacts[now["contact"]]) is not None:
+            part = "" if isinstance(one, FaultPlace) else wiring.opening[0].name
+            found[part] = one.phases, int(now["clearing"])
+        return found
+
+    def _zero_current(self) -> tuple[str, complex]:
+        """The only contact, as ``conducting`` calls it, and the zero sequence of its current, which
+        has no state yet, as a phasor in the common frame."""
+        wiring, now = self.wiring, self.now[0]
+        contact = None if now["joint"] else wiring.contacts[now["contact"]]
+        if contact is None:
+            return "", 0j
+        tick = int(self.st[0]["tick"])
+        turn = cmath.exp(1j * float(self.net[0]["omega_b"] * self.net[0]["T_s"]) * tick)
+        i = wiring.contact_current(contact) @ (now["w"][: len(wiring.order)] * turn)
+        name = "" if isinstance(contact, FaultPlace) else wiring.opening[0].name
+        return name, i.real.mean() / turn
 
     def connect(self, wiring: Wiring) -> None:
         """Set the modes of all circuits that a wiring gives.
@@ -209,7 +251,11 @@ def _connect(plant: Network, wiring: Wiring) -> None:
             which[k + (N + 1) * j] = blocked, contact
             found[k + (N + 1) * j] = wiring.modes(blocked, contact)
     _pack_contacts(net, wiring)
-    _pack_pieces(plant, max(np.abs(modes.rates.imag).max() for modes, _ in found.values()))
+    fastest = [np.abs(modes.rates.imag).max() for modes, _ in found.values()]
+    net["poles"] = 0
+    if wiring.joint:
+        fastest.append(_pack_joint(plant, wiring))
+    _pack_pieces(plant, max(fastest))
     places = wiring.sources()
     looked_at = _nodes(net, wiring)
     for circuit, (modes, sources) in found.items():
@@ -217,16 +263,17 @@ def _connect(plant: Network, wiring: Wiring) -> None:
         net["rate"][circuit, :n] = modes.rates
         net["decay"][circuit, :, :n] = np.exp(np.multiply.outer(net["half_h"], modes.rates))
         net["states"][circuit, : len(order), :n] = modes.states
-        net["modes"][circuit, :n, : len(order)] = modes.modes
-        net["mirror"][circuit, :n] = modes.mirror
         net["unbalanced"][circuit] = modes.mirror.any()
+        images = np.stack([np.ones(n), modes.mirror])
+        net["modes"][circuit, :, :n, : len(order)] = images[:, :, None] * modes.modes
         if net["n_units"]:
             _pack_rates(plant, wiring, circuit, *which[circuit])
         net["drive"][circuit] = 0.0
         for j, source in enumerate(sources):
-            net["drive"][circuit, :n, places[source]] = modes.drive[:, j]
+            driven = images * modes.drive[:, j]
+            net["drive"][circuit, :, :n, places[source]] = driven
             if source == GRID_SOURCE:  # its negative sequence
-                net["drive"][circuit, :n, places[source] + 1] = modes.drive[:, j]
+                net["drive"][circuit, :, :n, places[source] + 1] = driven
         for place, node in looked_at.items():
             if node == GRID_SOURCE:
                 net["node_s"][circuit, place, 0, places[node]] = 1.0
@@ -309,14 +356,60 @@ def _pack_contacts(net: Any, wiring: Wiring) -> None:
     zero_sequence = wiring.zero_sequence() is not None
     net["opens_to"] = -1
     net["contact_w"] = order.index(CONTACT) if CONTACT in order else -1
+    net["contact_of"] = 0
     for j, one in enumerate(contacts):
         if one is not None:
+            net["contact_of"][sum(1 << "abc".index(p) for p in one.phases)] = j
             net["contact_current"][j, :, : len(order)] = wiring.contact_current(one)
             for p, phase in enumerate("abc"):
                 carries = phase in one.phases and one.clearing == "zero"
                 net["opens_to"][j, p] = (
                     contacts.index(one.opened(phase, zero_sequence)) if carries else -1
                 )
+
+
+def _pack_joint(plant: Network, wiring: Wiring) -> float:
+    """Set the system of several contacts; returns its fastest mode, 1/s."""
+    net, order, places = plant.net[0], wiring.order, wiring.sources()
+    one = join(wiring, wiring.omega_b)
+    q, n_w = one.flow.shape[1], len(order)
+    net["reals"], net["poles"] = q, len(wiring.poles)
+    net["at_zeros"] = wiring.fault is not None and wiring.fault.clearing == "zero"
+    net["flow"][:, :q, :q] = one.flow
+    net["fault_bars"][..., :q] = one.fault_bars
+    net["pole_bars"][: len(wiring.poles), :, :q] = one.pole_bars
+    net["to_w"][:n_w, :, :q] = one.to_w.swapaxes(0, 1)
+    net["from_w"][:n_w, :, :q] = one.from_w.swapaxes(0, 1)
+    by_w = (
+        one.from_w[0] - 1j * one.from_w[1]
+    )  # of the real part of w in the frame that stands still
+    net["fault_carries"][..., :n_w] = one.fault_carries @ by_w.T
+    net["pole_carries"][: len(wiring.poles), :, :n_w] = math.sqrt(1.5) * one.pole_bars @ by_w.T
+    net["zero_shares"] = 0.0
+    each = one.fault_carries[7], *(math.sqrt(1.5) * one.pole_bars)
+    for j, zero in enumerate(np.mean(each, axis=1)):
+        if (size := zero @ zero) > 0:
+            net["zero_shares"][j, :n_w] = one.to_w[0] @ zero / size
+    net["from_s"] = 0.0
+    for j, source in enumerate(one.sources):
+        net["from_s"][places[source], :, :q] = one.from_s[:, j]
+        if source == GRID_SOURCE:
+            net["from_s"][places[source] + 1, :, :q] = one.from_s[:, j]
+    net["node_q"] = 0.0
+    pieces = {part.name: part for part in wiring.with_poles().whole(wiring.units_lines)}
+    for k, unit in enumerate(wiring.units if net["connections"] else ()):
+        direct, rate = net["node_q"][CHECK_SIDES + k, :, :, :q]
+        direct += one.to_w[:, order.index(unit.states[1])]
+        for name in (unit.line, *(["beyond"] * (wiring.split == unit.line))):
+            if unit.at_end and name in pieces:
+                i = one.to_w[:, order.index(name)]
+                direct -= pieces[name].R * i
+                rate -= pieces[name].L / wiring.omega_b * i
+    if net["n_units"]:
+        c, norm = net["n_c"] - 1, max(np.linalg.norm(flow, 2) for flow in one.flow)
+        net["axis"][c], net["leg_axis"][c] = 1.0, np.exp(2j * np.pi / 3 * np.arange(3))
+        net["fastest"][c] = max(_fastest_with_dc(r, float(norm)) for r in plant.par)
+    return max(float(np.abs(np.linalg.eigvals(flow).imag).max()) for flow in one.flow)
 
 
 def _pack_pieces(plant: Network, fastest: float) -> None:

@@ -199,7 +199,7 @@ def _may_peak(plant: PlantRecords, k: int, part: int) -> bool:
     n, now, r, s = plant.net[0], plant.now[0], plant.par[k], plant.st[k]
     if not r.i_peak < math.inf or s.trip != 0:
         return False
-    if now.contact:
+    if now.contact or now.joint:
         return True
     w, at = field(now, "w"), own(k)
     E = complex(s.E_commanded[0], s.E_commanded[1]) * field(now, "unit")[k] - w[at + V]

@@ -82,7 +82,7 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
         if not switched:
             s.x[0] = s.x[1] = 0.0
             field(now, "w")[i] = 0j
-            now.row = 1 + k
+            now.row, now.made = 1 + k, 0
             enter(n, now, plant.st[0].tick, circuit(n, now))
         s.u_now[0], s.u_now[1], s.u_now[2], s.u_now[3] = 0.0, now.omega_g, 0.0, 0.0
 

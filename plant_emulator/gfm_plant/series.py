@@ -311,14 +311,19 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
         for e in range(n_links[c, 0]):
             row, column = link_place[c, 0, e, 0], link_place[c, 0, e, 1]
             y = x[j - 1, column]
-            x[j, row] += complex(d * link[c, 0, e, 0] * y.real, d * link[c, 0, e, 1] * y.imag)
+            x[j, row] += _linked(link[c, 0, e], d, y)
         for e in range(n_links[c, 1]):
             row, column = link_place[c, 1, e, 0], link_place[c, 1, e, 1]
             y = s_term[column]
-            x[j, row] += complex(d * link[c, 1, e, 0] * y.real, d * link[c, 1, e, 1] * y.imag)
+            x[j, row] += _linked(link[c, 1, e], d, y)
         for k in range(n.n_converters, now.n_s):
             y, turn = s_term[k], d * s_speed[k]
             s_term[k] = complex(-turn * y.imag, turn * y.real)
+
+
+@inlined
+def _linked(by: Any, d: float, y: complex) -> complex:
+    return complex(d * by[0] * y.real + d * by[2] * y.imag, d * by[1] * y.imag + d * by[3] * y.real)
 
 
 @inlined

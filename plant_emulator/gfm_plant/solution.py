@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gfm_plant.joint import make_joint
 from gfm_plant.layout import field
 from gfm_plant.records import N_OWN
 from gfm_runtime.compiled import compiled, inlined
@@ -147,7 +148,7 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
     half a piece, per unit of its voltage; this stays the same while its speed does, as that of an
     ideal grid."""
     rate, decay, by_source = field(n, "rate"), field(n, "decay"), field(n, "drive")
-    mirror, gain, h = field(n, "mirror"), field(now, "gain"), field(n, "half_h")[part]
+    image, gain, h = 0 if k == source else 1, field(now, "gain"), field(n, "half_h")[part]
     speed = n.omega_b * (omega - 1.0)
     turn = turned(speed * h)
     for m in range(field(n, "n_modes")[c]):
@@ -163,8 +164,7 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
             f_i = z_i / 2.0 + z_r * z_i / 3.0
             a = complex(h * decay[c, part, m].real, h * decay[c, part, m].imag)
             g = a * complex(f_r, f_i)
-        b = by_source[c, m, source]
-        gain[part, k, m] = g * (b if k == source else b * mirror[c, m])
+        gain[part, k, m] = g * by_source[c, image, m, source]
     field(now, "turn")[part, k] = turn
     field(now, "gain_omega")[part, k] = omega
 
@@ -215,13 +215,12 @@ def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
     w, unit, emf = field(now, "w"), field(now, "unit"), field(now, "emf")
     by_w, by_source, v = field(n, "node_w"), field(n, "node_s"), 0j
     for i in range(n.n_states):
-        by = by_w[c, place, image, i]
-        v += complex(by * w[i].real, by * w[i].imag)
+        v += by_w[c, place, image, i] * w[i]
     g = grid_source(n)
     by = now.V_g * by_source[c, place, image, g]
     if by != 0.0:
         for k in range(2):  # its two sequences
-            v += complex(by * now.sequence[k].real, by * now.sequence[k].imag) * unit[g + k]
+            v += by * now.sequence[k] * unit[g + k]
     for k in range(g + 2, now.n_s):
         v += by_source[c, place, image, k] * emf[k] * unit[k]
     return v
@@ -229,7 +228,9 @@ def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
 
 @compiled
 def circuit(n: Any, now: Any) -> int:
-    """Return which circuit is in force."""
+    """Return which circuit is in force; the last one is that of several contacts, see `joint`."""
+    if now.joint:
+        return n.n_c - 1
     return now.row + (n.n_converters + 1) * now.contact
 
 
@@ -283,7 +284,9 @@ def integrals(x: float) -> tuple[float, float, float, float]:
 def enter(n: Any, now: Any, tick: float, c: int) -> None:
     """Start the modes of circuit c at a tick, or between two, from w, which is projected onto what
     that circuit can hold."""
-    known, modes, mirror = field(now, "gain_omega"), field(n, "modes"), field(n, "mirror")
+    if now.joint and not now.made:
+        make_joint(n, now)
+    known, modes = field(now, "gain_omega"), field(n, "modes")
     z, w = field(now, "z"), field(now, "w")
     for part in range(len(known)):
         for k in range(now.n_phasors):
@@ -291,12 +294,12 @@ def enter(n: Any, now: Any, tick: float, c: int) -> None:
     for m in range(field(n, "n_modes")[c]):
         z[m] = 0j
         for i in range(n.n_states):
-            z[m] += modes[c, m, i] * w[i]
+            z[m] += modes[c, 0, m, i] * w[i]
     if field(n, "unbalanced")[c]:
         turn = mirror_at(n, tick)
         for m in range(field(n, "n_modes")[c]):
             mirrored = 0j
             for i in range(n.n_states):
-                mirrored += modes[c, m, i] * w[i].conjugate()
-            z[m] += mirrored * (mirror[c, m] * turn)
+                mirrored += modes[c, 1, m, i] * w[i].conjugate()
+            z[m] += mirrored * turn
     read_states(n, now, c)

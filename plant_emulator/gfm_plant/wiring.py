@@ -28,8 +28,10 @@ from gfm_plant.circuit import (
     find_rates,
     find_voltage,
     join_axes,
+    without_ends,
 )
 from gfm_plant.components.part import Fed, emf
+from gfm_plant.contacts import zero_circuit
 from gfm_plant.names import FAULTED_PHASES
 
 GRID_SOURCE = "grid"
@@ -220,8 +222,7 @@ class Wiring:
         closed: whether the grid's breaker is closed.
         opened: names of branches whose breakers are open.
         fault: where one is, or may be again, or None.
-        opening: the breaker, open by ``closed`` or ``opened``, whose poles may still conduct; there
-            is no fault then.
+        opening: the breakers, open by ``closed`` or ``opened``, whose poles may still conduct.
         blocked: indices of converters whose bridges are out of every circuit.
         check: the synchro-check that waits to close a breaker, or None.
     """
@@ -236,7 +237,7 @@ class Wiring:
     closed: bool = True
     opened: frozenset[str] = frozenset()
     fault: FaultPlace | None = None
-    opening: OpeningBreaker | None = None
+    opening: tuple[OpeningBreaker, ...] = ()
     blocked: frozenset[int] = frozenset()
     check: Check | None = None
 
@@ -245,12 +246,14 @@ class Wiring:
         """Names of the states as w has them: three a converter, the branches, the banks' voltages,
         and what a fault adds: the current beyond it within a branch, and its own through the
         inductance of the zero sequence's path, which a fault of three phases has as they open; the
-        same of the grid's breaker."""
+        same of the grid's breaker; and the zero sequences of several contacts, see `contacts`."""
         own = tuple(name for unit in self.units for name in unit.states)
         beyond: tuple[str, ...] = () if self.split is None else ("beyond",)
         grounded = any(one is not None and one.kind in ("LG", "LLG") for one in self.contacts)
-        if grounded and (self.opening is None or self.opening.name == GRID_SOURCE):
+        if grounded and (self.fault or self.opening[0].name == GRID_SOURCE):
             beyond += (CONTACT,)
+        if self.joint:
+            beyond += tuple(branch.name for branch in zero_circuit(self.with_poles()).branches)
         others = [part.name for part in (*self.branches, *self.fed_branches)]
         others += [bank.name for bank in self.capacitors]
         return (*own, *others, *beyond)
@@ -265,6 +268,36 @@ class Wiring:
         ends += [sink.node for sink in self.sinks]
         within = {GROUND, *(unit.terminal for unit in self.units)}  # which a core may be at
         return tuple(dict.fromkeys(node for node in ends if node not in within))
+
+    @property
+    def joint(self) -> bool:
+        """Whether several contacts may each conduct in other phases, see `contacts`."""
+        return len(self.poles) + (self.fault is not None) > 1
+
+    @property
+    def poles(self) -> tuple[tuple[str, str], ...]:
+        """The breakers that open, by their names and the branches that they interrupt: a line with
+        a fault inside is one on each side of it."""
+        names = [one.name for one in self.opening]
+        each = ((n, part) for n in names for part in (n, *(["beyond"] * (n == self.split))))
+        return tuple(each)
+
+    def with_poles(self) -> Wiring:
+        """The wiring before its breakers began to open."""
+        names = {one.name for one in self.opening}
+        closed = self.closed or GRID_SOURCE in names
+        return replace(self, opened=self.opened - names, closed=closed, opening=())
+
+    def through_pole(self, name: str, part: str) -> dict[str, float]:
+        """What each state brings to the current through one of ``poles``, as a factor."""
+        return self.to_grid() if name == GRID_SOURCE else {part: 1.0}
+
+    @property
+    def fault_node(self) -> str:
+        """The node of the fault; "" if there is none."""
+        if self.fault is None:
+            return ""
+        return "beyond" if self.split else self.fault.node
 
     @property
     def split(self) -> str | None:
@@ -315,7 +348,7 @@ class Wiring:
         found: dict[str, float] = {}
         if self.grid is None or not self.closed:
             return found
-        for branch in self._whole((*self.units_lines, *self.branches, *self.fed_branches)):
+        for branch in self.whole((*self.units_lines, *self.branches, *self.fed_branches)):
             if self.grid in (branch.start, branch.end):
                 found[branch.name] = 1.0 if branch.end == self.grid else -1.0
         return found
@@ -344,7 +377,8 @@ class Wiring:
         """None, the fault or the opening breaker, and what may be left of it while its phases open
         one by one."""
         found: list[Contact | None] = [None]
-        waiting: list[Contact | None] = [self.opening or self.fault]
+        alone = None if self.joint else next(iter(self.opening), None)
+        waiting: list[Contact | None] = [self.fault or alone]
         zero_sequence = waiting != [None] and self.zero_sequence() is not None
         while waiting:
             one = waiting.pop(0)
@@ -374,16 +408,16 @@ class Wiring:
             return {contact.name: 1.0}
         if seen.imag > 0:
             return {CONTACT: 1.0}
-        circuit, _ = self._circuit(frozenset(), contact, axis)
+        circuit, _ = self.circuit(frozenset(), contact, axis)
         place, share = str(self.grid), -1.0  # towards the network
         if isinstance(contact, FaultPlace):
-            place = "beyond" if self.split else contact.node
+            place = self.fault_node
             bank = next((one.name for one in circuit.capacitors if one.node == place), None)
             if bank is not None:
                 return {bank: 1 / seen.real}
-            R = next(
-                one.R for one in circuit.shunts if one.node == place
-            )  # with what else is there
+            R = next((one.R for one in circuit.shunts if one.node == place), None)
+            if R is None:  # no line is left that leads there
+                return {}
             share = R / seen.real if seen.real > 0 else 1.0
         return {
             branch.name: share if branch.end == place else -share
@@ -401,7 +435,7 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
-        circuits = [self._circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
+        circuits = [self.circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
         if contact is None or contact.balanced:
             return find_modes(circuits[0], self.omega_b, self.order), circuits[0].names
         alpha, beta = (find_modes(one, self.omega_b, self.order) for one in circuits)
@@ -412,7 +446,7 @@ class Wiring:
     ) -> tuple[list[Rates], float, list[str]]:
         """The equations of a circuit on the axis alpha and on the axis beta, the angle of alpha,
         rad, and the names of the sources and sinks; arguments and errors as for ``modes``."""
-        circuits = [self._circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
+        circuits = [self.circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
         found = [find_rates(one, self.omega_b, self.order) for one in circuits]
         angle = 0.0 if contact is None or contact.balanced else contact.angle
         return found, angle, circuits[0].names
@@ -426,11 +460,12 @@ class Wiring:
         sequences. Converters, machines and loads have three wires: behind the delta winding of a
         transformer a zero sequence finds no path.
         """
-        if self.opening is not None:
-            if self.opening.name == GRID_SOURCE:
+        if self.fault is None and self.opening:
+            name = self.opening[0].name
+            if name == GRID_SOURCE:
                 return self._zero_sequence_between(str(self.grid), GROUND)
             lines = {one.name: one for one in self.branches if not one.earthed}
-            line = lines.get(self.opening.name)
+            line = lines.get(name)
             if line is None or line.end == GROUND:
                 return None
             at_ground = {self.grid} if self.closed else set()
@@ -439,19 +474,11 @@ class Wiring:
             return None if around is None else complex(line.R, line.L) + around
         if self.fault is None or self.fault.Z_0 is not None:
             return None if self.fault is None else self.fault.Z_0
-        return self._zero_sequence_between("beyond" if self.split else self.fault.node, GROUND)
+        return self._zero_sequence_between(self.fault_node, GROUND)
 
     def _zero_sequence_between(self, one: str, other: str) -> complex | None:
         """The impedance of closed lines and star points between two nodes."""
-        found = []
-        for branch in self._whole((*self.units_lines, *self.branches)):
-            if branch.end == GROUND or branch.earthed == "none":
-                continue
-            ends = {"end": {branch.start}, "start": {branch.end}}.get(
-                branch.earthed, {self.grid} if self.closed else set()
-            )  # which of its ends are at ground
-            a, b = (GROUND if end in ends else end for end in (branch.start, branch.end))
-            found.append((a, b, 1 / complex(branch.R, branch.L)))
+        found = [(*ends, 1 / complex(part.R, part.L)) for part, ends in self.zero_branches()]
         reached = {other}
         while more := {end for a, b, _ in found if {a, b} & reached for end in (a, b)} - reached:
             reached |= more
@@ -465,6 +492,17 @@ class Wiring:
                 sign = np.array([1.0, -1.0][: len(at)])
                 Y[np.ix_(at, at)] += np.outer(sign, sign) * y
         return complex(np.linalg.inv(Y)[nodes.index(one), nodes.index(one)])
+
+    def zero_branches(self) -> Iterator[tuple[Branch, tuple[str, str]]]:
+        """The closed lines and windings that carry a zero sequence, and between which nodes."""
+        for branch in self.whole((*self.units_lines, *self.branches)):
+            if branch.end == GROUND or branch.earthed == "none":
+                continue
+            ends = {"end": {branch.start}, "start": {branch.end}}.get(
+                branch.earthed, {self.grid} if self.closed else set()
+            )  # which of its ends are at ground
+            a, b = (GROUND if end in ends else end for end in (branch.start, branch.end))
+            yield branch, (a, b)
 
     def voltage(
         self, node: str, blocked: frozenset[int], contact: Contact | None
@@ -489,7 +527,7 @@ class Wiring:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The voltage of a node on an axis as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on."""
-        circuit, hanging = self._circuit(blocked, contact, axis)
+        circuit, hanging = self.circuit(blocked, contact, axis)
         there = {end for branch in circuit.branches for end in (branch.start, branch.end)}
         there |= {one.node for one in circuit.capacitors} | {one.node for one in circuit.sources}
         seen, reached = {node}, [node]
@@ -504,17 +542,17 @@ class Wiring:
                     seen.add(other)
         return np.zeros(len(self.order)), np.zeros(len(circuit.sources))
 
-    def _circuit(
-        self, blocked: frozenset[int], contact: Contact | None, axis: int
+    def circuit(
+        self, blocked: frozenset[int], contact: Contact | None, axis: int, place: str = GROUND
     ) -> tuple[Circuit, list[Branch]]:
         """A circuit, and the branches that an open breaker has left hanging; of an
-        unbalanced one those of an axis."""
+        unbalanced one those of an axis. At ``place`` no branch hangs."""
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         through, poles, grid = [], {}, self.grid if self.closed else None
         seen = None if contact is None else contact.seen(axis, self.zero_sequence())
         if isinstance(contact, FaultPlace) and seen is not None:
-            node = "beyond" if self.split else contact.node
+            node = self.fault_node
             if seen.imag > 0:
                 through.append(Branch(CONTACT, node, GROUND, seen.imag, seen.real))
             else:
@@ -532,9 +570,9 @@ class Wiring:
                 filters.append(Branch(i_f, unit.bridge, unit.terminal, unit.L_f, unit.R_f))
                 sources.append(VoltageSource(unit.bridge, unit.bridge))
         branches = [
-            *self._whole(self.units_lines, poles),
+            *self.whole(self.units_lines, poles),
             *filters,
-            *self._whole((*self.branches, *self.fed_branches), poles),
+            *self.whole((*self.branches, *self.fed_branches), poles),
             *through,
         ]
         sources += [VoltageSource(emf(name), emf(name)) for name, one in self.fed if one.is_voltage]
@@ -542,18 +580,18 @@ class Wiring:
         capacitors += self.capacitors
         if grid is not None:
             sources.append(VoltageSource(GRID_SOURCE, grid))
-        whole, held = branches, {GROUND} | {source.node for source in sources}
+        whole, held = branches, {GROUND, place} | {source.node for source in sources}
         held |= {one.node for one in capacitors} | {one.node for one in shunts}
         if self.closed and not self.opened:  # no line may hang, but a converter on an open bus may
             held |= {node for line in self.branches for node in (line.start, line.end)}
-        branches = _without_ends(branches, held)
+        branches = without_ends(branches, held)
         met = {node for branch in branches for node in (branch.start, branch.end)}
         shunts = [s for s in shunts if s.node in met]
         sinks = tuple(sink for sink in self.sinks if sink.name not in self.opened)
         circuit = Circuit(tuple(branches), tuple(capacitors), tuple(sources), tuple(shunts), sinks)
         return circuit, [branch for branch in whole if branch not in branches]
 
-    def _whole(
+    def whole(
         self, branches: Sequence[Branch], poles: Mapping[str, complex] = MappingProxyType({})
     ) -> Iterator[Branch]:
         """Those that are closed; a split one as two; and one whose poles still conduct, with the
@@ -581,13 +619,3 @@ def _in_parallel(shunts: Iterable[Shunt]) -> list[Shunt]:
             one = Shunt(one.name, one.node, R)
         found[one.node] = one
     return list(found.values())
-
-
-def _without_ends(branches: list[Branch], held: set[str]) -> list[Branch]:
-    """Leave out what an open breaker has left hanging at one end, where no current can flow."""
-    while True:
-        met = [node for branch in branches for node in (branch.start, branch.end)]
-        kept = [b for b in branches if all(n in held or met.count(n) > 1 for n in (b.start, b.end))]
-        if len(kept) == len(branches):
-            return kept
-        branches = kept

@@ -88,8 +88,8 @@ def test_an_earthed_transformer_carries_the_zero_sequence(rest, kind):
     for one in (own, told):
         one.advance(100)
     assert own.st["x"][0] == pytest.approx(told.st["x"][0], abs=1e-12)
-    breaker(own.plant, closed=False)
-    breaker(told.plant, closed=False)
+    breaker(own.plant, closed=False, clearing="instant")
+    breaker(told.plant, closed=False, clearing="instant")
     fault(own.plant, 0.0, 0.01, **at_once)
     fault(told.plant, 0.0, 0.01, Z_0=Z_t, **at_once)
     for one in (own, told):

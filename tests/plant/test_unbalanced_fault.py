@@ -333,7 +333,7 @@ def test_impossible_faults_change_nothing(rest, more, message):
 
 def test_an_island_needs_a_path_to_ground(rest):
     plant = rest(grid={"load_R": 50.0, "load_L": 0.05})
-    breaker(plant.plant, closed=False)
+    breaker(plant.plant, closed=False, clearing="instant")
     with pytest.raises(ValueError, match="X_0: not set, and no closed line leads from position"):
         fault(plant.plant, 0.5, 0.1, kind="LG")
     fault(plant.plant, 0.5, 0.1, kind="LG", Z_0=0.3j)

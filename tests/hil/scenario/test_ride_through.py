@@ -9,7 +9,7 @@ import pytest
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
-from gfm_hil.run.runner import run_in_memory
+from gfm_hil.run.runner import run_in_memory, run_network_in_memory
 from gfm_hil.scenario import check_scenario
 from gfm_hil.studies.conformity.sets import load_under_test
 
@@ -74,6 +74,33 @@ def test_no_clearing_on_the_line_stops_the_law():
                 stops.append((after, found.summary["reason"]))
     assert ended["zero"] == []
     assert len(ended["instant"]) > RANDOM_FAULTS / 4
+
+
+@pytest.mark.full
+def test_no_breakers_that_clear_a_fault_stop_the_law():
+    """Random faults on one of two lines, at both of whose ends the poles open at their zeros."""
+    chance = random.Random(7)
+    for _ in range(20):
+        delay, scr = chance.uniform(0.05, 0.15), 1.5 * 13.3 ** chance.random()
+        fault = {
+            "t": 0.2 + chance.uniform(0.0, 0.02), "type": "fault", "line": "first",
+            "kind": chance.choice(("3ph", "LG", "LL", "LLG")), "R": chance.choice((0.0, 0.01)),
+            "position": round(chance.uniform(0.05, 0.95), 4),
+        }  # fmt: skip
+        opens = {"t": fault["t"] + delay, "type": "breaker", "name": "first", "closed": False}
+        lines = {
+            name: {"start": "bus", "end": "hub", "L": 0.2, "R": 0.02} for name in ("first", "other")
+        }
+        lines["tie"] = {"start": "hub", "end": "far", "L": 1 / scr, "R": 0.1 / scr}
+        plant = {"i_peak": 2.5, "delay": {"samples": 1, "fraction": 0.3}}
+        network = {"grid": "far", "converters": {"A": {"node": "bus"}}, "lines": lines}
+        content = {
+            "title": "cleared", "duration": opens["t"] + 0.1, "law": "vsg-2", "plant": plant,
+            "inner": "virtual-stator", "references": {"P_ref": chance.uniform(-0.8, 0.8)},
+            "network": network, "events": [fault, opens],
+        }  # fmt: skip
+        found = run_network_in_memory(check_scenario(content, "test"))["A"]
+        assert found.summary["status"] == "completed", (fault, scr, found.summary["reason"])
 
 
 @pytest.mark.full
