@@ -159,6 +159,13 @@ def accept(c, y):
             _go_safe(c, BAD_Y, j)
             return False
         c.y[j] = y[j]
+    move_references(c)
+    return True
+
+
+@inlined
+def move_references(c):
+    """Move the references by one tick in which y is fresh."""
     c.stale = 0
     for j in range(NY):
         away = c.ref_target[j] - c.ref[j]
@@ -166,7 +173,6 @@ def accept(c, y):
             c.ref[j] = c.ref_target[j]
         else:
             c.ref[j] += math.copysign(c.ref_rate[j], away)
-    return True
 
 
 @inlined
@@ -223,7 +229,7 @@ def control(ctl, laws, states, est, y, u):
     if c.state != RUNNING:
         return
     counts, before = len(y) > NY_INNER, c.active
-    if not (_sense(c, laws[before], states[before], y) if counts else accept(c, y)):
+    if not (sense(c, laws[before], states[before], y) if counts else accept(c, y)):
         return
     _tick(c, laws, states, est, len(y) > NY, u)
     if counts:
@@ -236,7 +242,7 @@ def control(ctl, laws, states, est, y, u):
 
 
 @inlined
-def _sense(c, law, state, y):
+def sense(c, law, state, y):
     """Measure from the counts at the end of y (21,); whether all is plausible and in range."""
     if c.aligns:
         c.aligns = 0

@@ -22,10 +22,10 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import STYLES
 from gfm_runtime.signals import carried, command_rows, group, names
-from gfm_runtime.states import BAD_Y, RUNNING
+from gfm_runtime.states import BAD_SENSOR, BAD_Y, RUNNING
 from gfm_runtime.switchover import settle_into
 
-from ..support.firmware import STRICT, T_S, accepted, bench, cc
+from ..support.firmware import STRICT, T_S, accepted, bench, cc, from_pin_to_pin, turning_counts
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
@@ -114,6 +114,25 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Any:
         return found[law, inner, real]
 
     return build
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+def test_a_model_from_counts_to_counts_has_the_kernels_bits(tmp_path, real):
+    """Counts in, u and compare counts out; a phase that is lost ends in the safe state."""
+    command = ["firmware", "dll", "vsg-2", "--counts", "rig-dead-time", "--real", real]
+    assert main([*command, "-o", str(tmp_path)]) == 0
+    model, u, ref = Model(next(tmp_path.glob("*.so"))), [0.5, 1.0, 1.0, 0.05], [1, 0.5, 1, 0, 1]
+    names_of = [model.info.OutputPortsInfo[k].Name for k in range(model.info.NumOutputPorts)]
+    assert names_of[4:] == [b"cmp_a", b"cmp_b", b"cmp_c", b"reason"]
+    model.start(u)
+    counts = turning_counts(TICKS)
+    law = load_law("vsg-2", None, "rig-dead-time").laws[0]
+    for row, expected in zip(counts, from_pin_to_pin(law, real, ref, counts, u), strict=True):
+        assert model.tick(ref, row) == OK
+        assert [*model.outputs] == [*expected, 0.0]
+    lost = np.where(np.arange(10) == 5, 2048, counts[-1])
+    assert any(model.tick(ref, lost) == MESSAGE for _ in range(400))
+    assert model.outputs[-1] == BAD_SENSOR
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])

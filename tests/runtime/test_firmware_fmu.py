@@ -13,11 +13,12 @@ from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
 from gfm_hil.cli import main
+from gfm_runtime import load_law
 from gfm_runtime.firmware import FMI
 from gfm_runtime.signals import carried_rows, command_rows, group
 from gfm_runtime.states import BAD_Y, RUNNING
 
-from ..support.firmware import STRICT, T_S, accepted, bench, cc
+from ..support.firmware import STRICT, T_S, accepted, bench, cc, from_pin_to_pin, turning_counts
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
@@ -146,6 +147,20 @@ def test_the_unit_has_the_kernels_bits(built, law, inner, real, fmi):
     for unit, *_ in twins:
         unit.it.terminate()
         unit.it.freeInstance()
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_a_unit_from_counts_to_counts_has_the_kernels_bits(tmp_path, fmi):
+    file, ref = tmp_path / "law.fmu", [1, 0.5, 1, 0, 1]
+    command = ["firmware", "fmu", "vsg-2", "--counts", "rig", "--real", "float64", "--fmi", fmi]
+    assert main([*command, "-o", str(file)]) == 0
+    assert validate_fmu(str(file)) == []
+    unit, counts = Unit(fmpy.extract(str(file), str(tmp_path / "unpacked"))), turning_counts(TICKS)
+    unit.start(START)
+    law = load_law("vsg-2", None, "rig").laws[0]
+    kernel = from_pin_to_pin(law, "float64", ref, counts, START)
+    for row, expected in zip(counts, kernel, strict=True):
+        assert unit.tick(ref, row) == expected
 
 
 @pytest.mark.parametrize("fmi", FMI)

@@ -1,21 +1,24 @@
 """Exported firmware to compile in tests, and the compilers."""
 
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gfm_runtime import BuiltLaw, LawSet, load_law
+from gfm_runtime import BuiltLaw, LawSet, discretise, load_law, pack_law, state_dtype
 from gfm_runtime.assembly import Controller
+from gfm_runtime.counts import align, measure, modulate
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
+from gfm_runtime.firmware.module import at_rest
 from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
+from gfm_runtime.kernel import advance_with_inner, look_with_inner
 from gfm_runtime.signals import NU, carried_rows, group
-from gfm_runtime.switchover import settle_into
+from gfm_runtime.switchover import settle_into, settle_with_inner
 
 from .laws import LAWS
 
@@ -87,3 +90,41 @@ def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controll
     if one.inner:
         settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
     return one
+
+
+def turning_counts(ticks: int) -> np.ndarray:
+    """Counts of a 12-bit A/D in its default ranges (ticks, 10): three phases at 51 Hz and a swing
+    of their current."""
+    turn = np.exp(2j * np.pi * (51e-4 * np.arange(ticks) + 0.1))
+    swing = 0.5 + 0.1 * np.sin(np.arange(ticks) / 40)
+    axes = np.exp(-2j * np.pi * np.arange(3) / 3)
+    scaled = [
+        (turn * of * angle)[:, None] * axes
+        for of, angle in ((swing / 4, np.exp(0.1j)), (0.5, 1.0), (swing / 4, 1.0))
+    ]
+    values = np.hstack([np.zeros((ticks, 1)), np.hstack(scaled).real])
+    return np.floor(2048 * (1 + values) + 0.5).clip(0, 4095)
+
+
+def from_pin_to_pin(
+    law: BuiltLaw, real: str, ref: Any, counts: np.ndarray, u: Any
+) -> Iterator[list[float]]:
+    """What the kernel gives for counts (ticks, 10), beginning at u (4,): u, and compare counts."""
+    record, state = pack_law(discretise(law, T_S), real), np.zeros(1, state_dtype(real))
+    s, ref = state[0], np.asarray(ref, real)
+    s["u"] = [signal.default for signal in group("u")]
+    s["omega_pll"], s["pll"], s["e"], s["speed"] = 1.0, (1.0, 0.0), u[2:], 1.0
+    s["angle"], s["sensed"] = (1.0, 0.0), at_rest()
+    rows = counts.astype(real)
+    align(record[0], s, rows[0], 0)
+    first = state.copy()
+    measure(record[0], first[0], rows[0], 0)
+    own, none, out = np.array(u[:3], real), np.zeros(3, real), np.zeros(4, real)
+    e_d, e_q = np.array(u[2:], real)
+    settle_with_inner(record[0], s, ref, first[0]["sensed"], own, none, e_d, e_q)
+    for row in rows:
+        measure(record[0], s, row, 0)
+        look_with_inner(record[0], s, ref, s["sensed"], out)
+        advance_with_inner(record[0], s)
+        modulate(record[0], s)
+        yield [*out.astype(float), *s["compare"].astype(int).astype(float)]

@@ -102,7 +102,6 @@ def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
-    add_counts(command)
     _add_how(command, reals)
 
 
@@ -112,6 +111,7 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
         "--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s (1e-4)"
     )
     add_inner(command)
+    add_counts(command)
     command.add_argument(
         "--f_n", type=float, default=50.0, metavar="HZ",
         help="nominal frequency of the converter, for an inner stage (50)",
@@ -148,7 +148,7 @@ def call_export(options: argparse.Namespace) -> int:
 
 
 def call_dll(options: argparse.Namespace) -> int:
-    law = load_law(options.law, options.inner)
+    law = load_law(options.law, options.inner, options.counts)
     files = dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
     options.out.mkdir(parents=True, exist_ok=True)
     for file, text in files.items():
@@ -158,7 +158,7 @@ def call_dll(options: argparse.Namespace) -> int:
 
 
 def call_fmu(options: argparse.Namespace) -> int:
-    law = load_law(options.law, options.inner)
+    law = load_law(options.law, options.inner, options.counts)
     omega_b = _omega_b(options.f_n)
     packed = fmu(law, options.T_s, options.real, options.fmi, omega_b)
     with replacing(options.out) as part:

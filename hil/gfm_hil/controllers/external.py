@@ -123,12 +123,12 @@ def refuse_source(text: str) -> None:
 
 def check_currents(text: str, inner: int) -> None:
     """Check that a run carries what a controller takes, see ``Scenario.carries``. Raises UserError:
-    the run has counts; or ``text`` is ``c:FILE``, and the run has no inner stage."""
+    ``text`` is ``c:FILE``, and the run has counts or no inner stage."""
     refuse_source(text)
-    if inner == COUNTS:
+    if text.startswith("c:") and inner == COUNTS:
         raise UserError(
-            f"controller {text}: takes y in p.u., and the scenario's laws measure and modulate"
-            " themselves; set counts = 'none'"
+            f"controller {text}: takes voltages and currents, and the scenario's laws counts of an"
+            " A/D; set counts = 'none'"
         )
     if text.startswith("c:") and not inner:
         raise UserError(

@@ -89,7 +89,7 @@ class FmuController(MappedController):
             if not self._fresh:
                 self._it.reset()
             self._fresh = False
-            for v, value in [*zip(self._begins, u, strict=True), *self._fixed]:
+            for v, value in [*zip(self._begins, u, strict=False), *self._fixed]:
                 if v is not None:
                     self._set(v.type, [v.valueReference], [value])
             if self._two:

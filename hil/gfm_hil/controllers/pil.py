@@ -28,19 +28,30 @@ from gfm_hil.core.roles import our_controller_on
 from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
 from gfm_runtime.children import end_now, guarded
+from gfm_runtime.counts import COUNTS_STATE
 from gfm_runtime.firmware.check import TARGETS, need_tools
 from gfm_runtime.firmware.golden import SHIPPED, Golden, golden
-from gfm_runtime.firmware.loop import CHANGE, CHECK, FROM, START, TICK, TO, LoopProgram, build_loop
+from gfm_runtime.firmware.loop import (
+    ALIGN,
+    CHANGE,
+    CHECK,
+    FROM,
+    START,
+    TICK,
+    TO,
+    LoopProgram,
+    build_loop,
+)
 from gfm_runtime.firmware.module import RESULTS, Module
-from gfm_runtime.signals import REF_NAMES, carried
-from gfm_runtime.states import BAD_U, BAD_Y, OK
+from gfm_runtime.signals import COUNTS, N_ADC, REF_NAMES, carried, names
+from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 
 if TYPE_CHECKING:
     from gfm_hil.controllers.external import Retuned
 
 _START_S, _LOOK_S = 30.0, 0.05
 _LINES, _BYTES = 3, 2000  # of what QEMU says, at most
-_SIGNALS = {BAD_Y: carried("y", True), RESULTS["BAD_REF"][0]: REF_NAMES}
+_SIGNALS = {BAD_Y: carried("y", True), BAD_SENSOR: names("adc"), RESULTS["BAD_REF"][0]: REF_NAMES}
 _SAID = dict(RESULTS.values())
 
 
@@ -72,6 +83,7 @@ class PilController(ExternalController):
             raise UserError(f"controller pil: {problem}") from None
         self.name = our_controller_on(target)
         self._starts: select.poll | None = None
+        self._rests: tuple[int, np.void] | None = None  # the law at the start, and its state
         self._target = target
         self._ends = contextlib.ExitStack()
 
@@ -85,7 +97,13 @@ class PilController(ExternalController):
         #: law of the program by its numbers
         self._places = {_numbers(record): k for k, (_, record) in enumerate(ready)}
         modules = [
-            Module(f"{k} {discrete.law.name}", discrete.law, record, controller.inner > 0)
+            Module(
+                f"{k} {discrete.law.name}",
+                discrete.law,
+                record,
+                controller.inner > 0,
+                controller.inner == COUNTS,
+            )
             for k, (discrete, record) in enumerate(ready)
         ]
         try:
@@ -152,14 +170,19 @@ class PilController(ExternalController):
         os.set_blocking(self._from, True)
 
     def start(self, u: Vector) -> None:
-        """Load the controller's active law in its present state, in which u is."""
-        c = self._controller
-        k = int(c.ctl["active"][0])
+        """Load the controller's active law in its state at rest, in which u is; at a reset, too,
+        when the controller has measured already."""
+        c, self._aligns = self._controller, self._rests is not None
+        if self._rests is None:
+            active = int(c.ctl["active"][0])
+            self._rests = active, c.states[active].copy()
+        k, rests = self._rests
+        self._aligns &= c.inner == COUNTS
         request, state = self._request, self._state
         request["what"], request["law"] = START, self._place(k)
-        request["limited"] = c.states["limited"][k]
+        request["limited"] = rests["limited"]
         for name in state.dtype.names or ():
-            state[name] = c.states[name][k]
+            state[name] = rests[name]
         self._send(request)
         self._send(state)
 
@@ -168,11 +191,14 @@ class PilController(ExternalController):
         is not finite."""
         ctl, states = self._controller.ctl, self._controller.states
         request, answer = self._request, self._answer
-        request["what"] = TICK
+        request["what"], self._aligns = ALIGN if self._aligns else TICK, False
         if changed >= 0:
             request["what"], request["law"] = CHANGE, self._place(changed)
         request["ref"] = ctl["ref"]
-        request["y"] = ctl["y"][:, : request["y"].shape[1]]
+        if counts := len(u) > ctl["out"].shape[1]:
+            request["y"], request["measured"] = y[-N_ADC:], ctl["y"]
+        else:
+            request["y"] = ctl["y"][:, : request["y"].shape[1]]
         self._send(request)
         self._receive()
         one = answer[0]
@@ -185,7 +211,9 @@ class PilController(ExternalController):
         if one["result"] == BAD_U:
             u[one["channel"]] = np.nan
         k = changed if changed >= 0 else int(ctl["active"][0])
-        ctl["u"], ctl["out"][0, : len(u)] = one["own"], u
+        ctl["u"], ctl["out"][0, : len(u)] = one["own"], u[: ctl["out"].shape[1]]
+        for name, *_ in COUNTS_STATE if counts else ():
+            states[name][k] = one[name]
         states["i_ref"][k], states["limited"][k] = one["i_ref"], one["limited"]
         if changed >= 0:
             ctl["bump"] = one["bump"]

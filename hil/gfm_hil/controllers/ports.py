@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.schema import StrictSchema
-from gfm_runtime.signals import carried, command_rows, names
+from gfm_runtime.signals import COUNTS, carried, command_rows, names
 
 #: the groups that an FMU of ours puts before its names
 _GROUP = re.compile(r"^(ref|y|u)\.")
@@ -116,6 +116,7 @@ def wire(
     a port or a signal that is not there, a port without a signal, or a signal of u that comes from
     nowhere or twice."""
     known, u = [*names("ref"), *carried("y", inner)], [s.name for s in command_rows(inner)]
+    u += names("compare") if inner == COUNTS else ()
     for table, there in (("inputs", inputs), ("outputs", outputs)):
         for port in getattr(ports, table):
             if port not in there:

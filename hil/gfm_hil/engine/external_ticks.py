@@ -24,9 +24,17 @@ from gfm_hil.recording.log import Status
 from gfm_hil.scenario.events.base import Event
 from gfm_hil.scenario.events.gains import GainChange, ready_gains
 from gfm_runtime.assembly import Controller
-from gfm_runtime.compiled import compiled
-from gfm_runtime.controller import accept, bad_output, follow_plant, measured, next_law
-from gfm_runtime.signals import NY
+from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.controller import (
+    accept,
+    bad_output,
+    follow_plant,
+    measured,
+    move_references,
+    next_law,
+    sense,
+)
+from gfm_runtime.signals import NY, NY_INNER
 from gfm_runtime.states import READY, RUNNING
 
 if TYPE_CHECKING:
@@ -156,10 +164,22 @@ def receive_tick(end, records, controller, event, has_laws):
         return why, REFUSED, -1
     before = ctl[0].state
     follow_plant(ctl, plant_tripped(end, records.loop[0]))
-    if ctl[0].state != RUNNING or not accept(ctl[0], records.y):
+    if ctl[0].state != RUNNING or not _takes(ctl[0], records.y, controller, has_laws):
         return why, REFUSED, -1
     changed = next_law(ctl[0], controller.est[0], ctl[0].y) if has_laws else -1
     return why, RESTARTED if before == READY else ACCEPTED, changed
+
+
+@inlined
+def _takes(c, y, controller, has_laws):
+    """Whether y is to be given to the external controller. One that has a law of its own and takes
+    counts judges itself."""
+    if len(y) <= NY_INNER:
+        return accept(c, y)
+    if has_laws:
+        return sense(c, controller.laws[c.active], controller.states[c.active], y)
+    move_references(c)
+    return True
 
 
 @compiled

@@ -15,11 +15,11 @@ import numpy as np
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import identifier, plain, written
+from gfm_runtime.firmware.c_text import Choices, identifier, plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
-from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
+from gfm_runtime.signals import TABLE_VERSION, Signal, command_rows, group, table_hash
 
 _INTERFACE = "IEEE_Cigre_DLLInterface.h"
 
@@ -40,6 +40,7 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
     assert m.law is not None
     schedule = laws.schedule is not None
     u = command_rows(m.stages)
+    choices: Choices = {**m.choices, "schedule": schedule}
     single = m.real == np.float32
     keys = keys_of(m) | {
         "NAME": _string(m.name),
@@ -49,8 +50,8 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
         "T_S": repr(float(T_s)),
         "FIRST_INT": "limited" if m.stages else "reason",
         "REAL64": "IEEE_Cigre_DLLInterface_DataType_real64_T",
-        "INPUTS": _ports((*group("ref"), *carried_rows("y", m.stages))),
-        "OUTPUTS": _ports(u),
+        "INPUTS": _ports((*group("ref"), *m.inputs)),
+        "OUTPUTS": _ports(m.outputs),
         "REASON": _string(RESULT_TEXT),
         "STATES": "FloatStates" if single else "DoubleStates",
         "FLOATS": "REALS" if single and not schedule else "0",
@@ -58,10 +59,11 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
         "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
         "E_IN_USE": ", &u[2]" * m.stages,
     }
+    keys["FIRST"] = written("first.c", keys, choices)
     return {
         **code,
         _INTERFACE: written(_INTERFACE, keys),
-        "model.c": written("model.c", keys, {**m.choices, "schedule": schedule}),
+        "model.c": written("model.c", keys, choices),
     }
 
 

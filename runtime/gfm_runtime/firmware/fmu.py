@@ -26,7 +26,7 @@ from gfm_runtime.firmware.check import FLAGS, OPTIMISED
 from gfm_runtime.firmware.dll import build_library
 from gfm_runtime.firmware.module import RESULT_TEXT, Module, keys_of
 from gfm_runtime.firmware.schedule import one_module
-from gfm_runtime.signals import TABLE_VERSION, Signal, carried_rows, command_rows, group, table_hash
+from gfm_runtime.signals import TABLE_VERSION, Signal, command_rows, group, table_hash
 
 Fmi = Literal["2", "3"]
 FMI: tuple[Fmi, ...] = get_args(Fmi)
@@ -89,7 +89,7 @@ def _sources(
     """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
     follows from both."""
     u, two = command_rows(m.stages), fmi == "2"
-    inside = (*group("ref"), *carried_rows("y", m.stages))
+    inside = (*group("ref"), *m.inputs)
     keys = (
         keys_of(m)
         | _NAMES[fmi]
@@ -97,11 +97,12 @@ def _sources(
             "T_S": repr(float(T_s)),
             "U_START": ", ".join(repr(s.default) for s in u),
             "IN_START": ", ".join(repr(s.default) for s in inside),
-            "E_IN_USE": ", &s->u[2]" * m.stages,
+            "E_IN_USE": ", &u[2]" * m.stages,
             "REFUSALS": "@REFUSALS@",
             "TOKEN": "@TOKEN@",
         }
     )
+    keys["FIRST"] = written("first.c", keys, m.choices)
     interface = written("fmi.c", keys, {"fmi2": two})
     code = {
         **own,
@@ -125,11 +126,11 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
     """What modelDescription.xml says of the variables; the value reference of each is its place
     among all, from 1. No output follows an input within a tick; where one begins is a parameter."""
     inside = [("ref", s) for s in group("ref")]
-    inside += [("y", s) for s in carried_rows("y", m.stages)]
+    inside += [("y", s) for s in m.inputs]
     u = command_rows(m.stages)
     rows: list[tuple[str, str, str, Signal | None]] = [
         *((f"{v}.{s.name}", "input", f"{s.description}, of {s.base}", s) for v, s in inside),
-        *((f"u.{s.name}", "output", f"{s.description}, of {s.base}", s) for s in u),
+        *((f"u.{s.name}", "output", f"{s.description}, of {s.base}", s) for s in m.outputs),
         ("reason", "output", RESULT_TEXT, None),  # of a tick, an integer
         *((f"start.{s.name}", "parameter", f"where u.{s.name} begins, of {s.base}", s) for s in u),
     ]
@@ -147,9 +148,11 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
             else [f"    <{kind}{_attributes(base | number)} />"]
         )  # fmt: skip
     first = len(inside) + 1
-    last = first + len(u)
+    last = first + len(m.outputs)
     tags = ("  <Unknown index", "  <Unknown index") if two else _OF_FMI_3
-    begins = [str(k + len(u) + 1) if k < last else "" for k in range(first, last + 1)]
+    begins = [
+        str(k - first + last + 1) if k < first + len(u) else "" for k in range(first, last + 1)
+    ]
     return {
         "UNITS": "\n".join(f"    <Unit name={_quoted(x)} />" for x in sorted(units)),
         "VARIABLES": "\n".join(lines),

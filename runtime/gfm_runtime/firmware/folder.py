@@ -78,7 +78,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
     adapters, table, own = [], [], style == "unrolled"
     parts: tuple[str, ...] = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
-    parts += ("go_on",) * modules[0].counts
+    parts += ("go_on", "align") * modules[0].counts
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     counts = modules[0].counts

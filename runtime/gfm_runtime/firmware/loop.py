@@ -13,17 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from gfm_runtime.counts import COUNTS_STATE
 from gfm_runtime.firmware.check import HARNESS, Target, build, need_tools
 from gfm_runtime.firmware.folder import selftest
 from gfm_runtime.firmware.module import Module, check_modules, sources
 from gfm_runtime.firmware.tick import SIZE
 from gfm_runtime.inner import INNER_STATE
 from gfm_runtime.kernel import N_MAX
-from gfm_runtime.signals import NU, NY, carried
+from gfm_runtime.signals import COUNTS, N_ADC, NU, NY, NY_INNER, carried
 
-#: what a request asks for before its tick: nothing, a change to its law; or to start at a state, or
-#: to step through a golden row
-TICK, START, CHANGE, CHECK = range(4)
+#: what a request asks for before its tick: nothing, a change to its law, that its frame be aligned;
+#: or to start at a state, or to step through a golden row
+TICK, START, CHANGE, CHECK, ALIGN = range(5)
 #: the pipes in the program's folder, by which it gets requests and gives answers
 TO, FROM = "to", "from"
 
@@ -65,7 +66,9 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
     real, word = (
         dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
     )
-    y, u = len(carried("y", stages)), len(carried("u", stages))
+    counts = modules[0].counts
+    y = N_ADC if counts else len(carried("y", stages))
+    u = len(carried("u", COUNTS if counts else stages))
     request: list[Any] = [("what", word), ("law", word), ("limited", word), ("ref", real, (NY,))]
     answer: list[Any] = [("result", word), ("channel", word), ("limited", word), ("count", word)]
     state: list[Any] = [
@@ -74,7 +77,9 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
     ]
     answer += [("u", real, (u,)), ("own", real, (NU,)), ("bump", real), ("i_ref", real, (2,))]
     state += [(name, real, (size,)) for name, size, _ in INNER_STATE if stages]
-    dtypes = [np.dtype(fields) for fields in ([*request, ("y", real, (y,))], state, answer)]
+    kept = [(name, real, (size,) if size > 1 else ()) for name, size, _ in COUNTS_STATE if counts]
+    request += [("y", real, (y,)), *[("measured", real, (NY_INNER,))] * counts]
+    dtypes = [np.dtype(fields) for fields in (request, state + kept, answer + kept)]
     return LoopProgram(where, folder, *dtypes)
 
 
@@ -85,9 +90,12 @@ def _states(modules: Sequence[Module]) -> str:
     end = N_MAX + 3 * NU
     if stages:
         parts, end = parts | {"stage": end}, end + SIZE
+    if modules[0].counts:
+        parts, end = parts | {"counts": end}, end + sum(size for _, size, _ in COUNTS_STATE)
     lines = [
         f"enum {{ STATE_REALS = {end} }};",
         f"#define STAGES {int(stages)}",
+        f"#define COUNTS {int(modules[0].counts)}",
         f"#define NOW_E {', now.e' * stages}",
     ]
     for m in modules:

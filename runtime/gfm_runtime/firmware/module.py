@@ -119,6 +119,16 @@ class Module:
         return f"gfm_{identifier(self.name)}"
 
     @property
+    def inputs(self) -> tuple[Signal, ...]:
+        """What a step takes beside the references: y, or counts of the A/D."""
+        return group("adc") if self.counts else carried_rows("y", self.stages)
+
+    @property
+    def outputs(self) -> tuple[Signal, ...]:
+        """What it gives: u, and compare counts after it."""
+        return (*command_rows(self.stages), *(group("compare") if self.counts else ()))
+
+    @property
     def n(self) -> int:
         """States of the law."""
         return int(self.record["n"])

@@ -13,6 +13,7 @@ import numpy as np
 from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.controller import choose
+from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literals, plain, written
 from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources
 from gfm_runtime.firmware.tick import place
@@ -36,6 +37,9 @@ def one_module(
     Raises:
         LawError: as ``make_modules``.
     """
+    if laws.schedule and laws.laws[0].counts:
+        why = "is scheduled, which has no interrupt from counts; use its stages, or --counts none"
+        raise LawError(f"law {laws.name!r}", why)
     modules = make_modules(dict(zip(stage_names(laws), laws.laws, strict=True)), T_s, real, omega_b)
     code = sources(modules, T_s, "unrolled")
     if laws.schedule is None:

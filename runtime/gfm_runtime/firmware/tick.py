@@ -178,7 +178,7 @@ class Tick:
         at = "t" if self._counts else "&t"  # one tick may be part of another function
         names = ("MEASURE", "MODULATE", "ALIGN")[: len(self._counts)]
         counts = {
-            name: call(one, adc="counts", first="0")
+            name: call(one, "t" if name == "MEASURE" else "&t", adc="counts", first="0")
             for name, one in zip(names, self._counts, strict=True)
         }
         return counts | {

@@ -37,6 +37,15 @@ STEP = {"tick": 100, "type": "reference", "P_ref": 0.8, "ramp_s": 0.01}
 GAINS = {"tick": 150, "type": "gains", "values": {"D_p": 0.02}}
 CHANGE = {"tick": 300, "type": "law", "law": "mimo-gfm"}
 BACK = {"tick": 400, "type": "law", "law": "vsg-2"}
+COUNTS = {
+    "counts": "rig-dead-time",
+    "plant": {
+        "bridge": {"kind": "two-level", "dead_time_s": 2e-6},
+        "delay": {"samples": 1},
+        "dc_source": {"mode": "regulated"},
+    },
+}
+LOST = {"counts": "rig", "plant": {"phases": {"gain": {"v_b": 0.0}}, "delay": {"samples": 1}}}
 DIP = [{"tick": 100, "type": "grid-voltage", "V_g": 0.0}, {"tick": 300, "type": "reset"}]
 
 
@@ -77,6 +86,9 @@ def assert_same(found: Run, near: Run) -> None:
         ("m4f", {"inner": "cascaded", "events": [STEP, CHANGE]}),
         ("m7", {"inner": "virtual-stator", "events": DIP, "after_trip": "wait"}),
         ("host", {"law": "mimo-gfm-scheduled", "events": [STEP]}),
+        ("m4f", {**COUNTS, "events": [STEP, CHANGE, BACK]}),
+        ("m7", {**COUNTS, "events": DIP, "after_trip": "wait"}),
+        ("host", LOST),
     ],
 )
 def test_a_run_has_the_bits_of_the_kernel(target, content, tmp_path, monkeypatch):

@@ -11,16 +11,22 @@
 #include "board.h"
 #include "states.h"
 
-enum { TICK, START, CHANGE, CHECK };
+enum { TICK, START, CHANGE, CHECK, ALIGN };
 
 static struct {
     golden_word what, law, limited;
     golden_real ref[5], y[GOLDEN_NY];
+#if COUNTS
+    golden_real measured[11];
+#endif
 } request;
 
 static struct {
     golden_word result, channel, limited, count;
     golden_real u[GOLDEN_NU], own[3], bump, i_ref[2];
+#if COUNTS
+    golden_real counts[GOLDEN_COUNTS];
+#endif
 } answer;
 
 static golden_real state[STATE_REALS];
@@ -34,6 +40,9 @@ static void look_at(int law, int k)
 #if STAGES
     memcpy(answer.i_ref, now.stage, sizeof answer.i_ref);
     answer.limited = (golden_word)now.limited;
+#endif
+#if COUNTS
+    memcpy(answer.counts, now.counts, sizeof answer.counts);
 #endif
     answer.channel = (golden_word)states[law].channel(k);
 }
@@ -73,13 +82,25 @@ int main(void)
         }
         answer.bump = 0;
         if (request.what == CHANGE) {
+#if COUNTS
+            const golden_real *y = request.measured; /* by the old law; the new one measures it anew */
+#else
+            const golden_real *y = request.y;
+#endif
             now = laws[law].view(k);
-            laws[law].look(k, request.ref, request.y, answer.own);
+            laws[law].look(k, request.ref, y, answer.own);
             law = (int)request.law;
             k = 1 - k;
             laws[law].init(k);
-            laws[law].change(k, request.ref, request.y, answer.own, now.trend NOW_E, &answer.bump);
+            laws[law].change(k, request.ref, y, answer.own, now.trend NOW_E, &answer.bump);
+#if COUNTS
+            laws[law].go_on(k, now.counts);
+#endif
         }
+#if COUNTS
+        if (request.what == ALIGN)
+            laws[law].align(k, request.y);
+#endif
         answer.result = (golden_word)laws[law].step(k, request.ref, request.y, answer.u);
         answer.count = (golden_word)ELAPSED(golden_elapsed);
         look_at(law, k);

@@ -10,6 +10,16 @@ static void @P@_do_reset(int k)
     @T@_reset(&@P@_of[k]);
 }
 
+/* @if counts@ */
+static void @P@_to_adc(const golden_real *y, uint16_t *adc)
+{
+    int i;
+    for (i = 0; i < GOLDEN_NY; i++) {
+        adc[i] = (uint16_t)y[i];
+    }
+}
+
+/* @end@ */
 static int @P@_do_step(int k, const golden_real *ref, const golden_real *y, golden_real *u)
 {
     @T@_t *s = &@P@_of[k];
@@ -18,9 +28,7 @@ static int @P@_do_step(int k, const golden_real *ref, const golden_real *y, gold
 /* @if counts@ */
     uint16_t adc[GOLDEN_NY], cmp[4];
     int i;
-    for (i = 0; i < GOLDEN_NY; i++) {
-        adc[i] = (uint16_t)y[i];
-    }
+    @P@_to_adc(y, adc);
     start = GOLDEN_CLOCK();
     result = @T@_isr(@ARGUMENT@s, ref, adc, u, cmp);
     golden_elapsed = GOLDEN_CLOCK() - start - reading; /* of the call, not of the clock */
@@ -82,6 +90,13 @@ static view_t @P@_do_view(int k)
 }
 
 /* @if counts@ */
+static void @P@_do_align(int k, const golden_real *y)
+{
+    uint16_t adc[GOLDEN_NY];
+    @P@_to_adc(y, adc);
+    @T@_align(@ARGUMENT@&@P@_of[k], adc);
+}
+
 static void @P@_do_go_on(int k, const golden_real *counts)
 {
     memcpy(&@P@_of[k].counts, counts, sizeof @P@_of[k].counts);

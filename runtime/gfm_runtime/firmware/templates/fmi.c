@@ -15,16 +15,18 @@ typedef @P@_real real;
 
 /* Value references: 0 is the time; then the inputs (references, measurements), the outputs, the result
  * of the last tick, and where the outputs begin. */
-enum { NREF = @GUARD@_NREF, NY = @GUARD@_NY, NU = @GUARD@_NU, NIN = NREF + NY };
-enum { TIME, IN, OUT = IN + NIN, REASON = OUT + NU, START, END = START + NU };
+enum { NREF = @GUARD@_NREF, NY = @GUARD@_NY, NU = @GUARD@_NU };
+
+@FIRST@
+enum { TIME, IN, OUT = IN + NREF + NIN, REASON = OUT + NOUT, START, END = START + NU };
 enum { INSTANTIATED, INITIALIZATION, STEPPING };
 
 /* All that changes in an instance. It is copied as a whole, and holds no pointer. */
 typedef struct {
     char token[sizeof TOKEN]; /* so that another FMU's state is refused */
     law_t law;
-    real u[NU];
-    double in[NIN], start[NU];
+    real u[NOUT];
+    double in[NREF + NIN], start[NU];
     double begin, ticks; /* time of tick 0, s, and ticks since */
     int reason, started, mode;
 } state_t;
@@ -53,23 +55,20 @@ static double time_of(const state_t *s)
  * start values; until then they stay there, and the reason says what is wrong. */
 static void tick(state_t *s)
 {
-    static const real trend[@N_ROWS@] = {0};
-    real ref[NREF], y[NY], own[@N_ROWS@];
+    real ref[NREF], y[NIN];
     int i;
     for (i = 0; i < NREF; i++)
         ref[i] = (real)s->in[i];
-    for (i = 0; i < NY; i++)
+    for (i = 0; i < NIN; i++)
         y[i] = (real)s->in[NREF + i];
     s->ticks += 1;
     if (!s->started) {
-        for (i = 0; i < @N_ROWS@; i++)
-            own[i] = s->u[i];
-        s->reason = @P@_settle(&s->law, ref, y, own, trend@E_IN_USE@);
+        s->reason = begin(&s->law, ref, y, s->u);
         if (s->reason != @GUARD@_OK)
             return;
         s->started = 1;
     }
-    s->reason = @P@_step(&s->law, ref, y, s->u);
+    s->reason = go_on(&s->law, ref, y, s->u);
 }
 
 /* The ticks of a communication step of h seconds at time t; NULL, or why there are none. */
@@ -95,7 +94,7 @@ static const char *get_number(const state_t *s, unsigned k, double *value)
     if (k >= START)
         *value = s->start[k - START];
     else if (k >= OUT)
-        *value = s->mode == STEPPING ? (double)s->u[k - OUT] : s->start[k - OUT];
+        *value = s->mode == STEPPING || k >= OUT + NU ? (double)s->u[k - OUT] : s->start[k - OUT];
     else
         *value = k >= IN ? s->in[k - IN] : time_of(s);
     return NULL;

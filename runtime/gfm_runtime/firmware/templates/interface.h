@@ -46,10 +46,10 @@ typedef struct {
     @P@_real trend[@N_ROWS@];  /* p.u. per tick, filtered u[k] - u[k-1] */
 /* @if stages@ */
     @P@_stage_t stage;
-    int limited;                /* whether the stage limited the current in this tick */
-/* @end@ */
 /* @if counts@ */
     @P@_counts_t counts;
+/* @end@ */
+    int limited;                /* whether the stage limited the current in this tick */
 /* @end@ */
 /* @if fixed@ */
     int64_t rest[@GUARD@_NREST]; /* of the offset, the trend and x: their lower bits */
@@ -113,6 +113,10 @@ int @P@_switch(@LAW@@P@_t *s, const @P@_real ref[], const @P@_real y[],
  * may switch. They act from the next tick on. In the safe state it is 0, and u and cmp stay. */
 int @P@_isr(@LAW@@P@_t *s, const @P@_real ref[], const uint16_t adc[],
     @P@_real u[], uint16_t cmp[]);
+
+/* The measurement of isr alone, to counts.sensed: for settle before the first tick and switch before the
+ * next one. Give it a copy of the instance if isr gets the same counts afterwards. */
+int @P@_sense(@LAW@@P@_t *s, const uint16_t adc[]);
 
 /* Before the first tick, and before the one after reset: sets the frame's angle from the measured
  * voltage, which then has the components counts.sensed of it: along d, if nothing was written there. */

@@ -9,6 +9,30 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
     return ticked(@law@s, ref, y, u, &t, refused(s, ref, y, &s->channel));
 }
 
+static int sensed(@LAW@@P@_t *s, const uint16_t adc[], tick_t *t)
+{
+    real counts[@GUARD@_NADC];
+    int i;
+    if (s->reason != @GUARD@_OK) {
+        return s->reason;
+    }
+    for (i = 0; i < @GUARD@_NADC; i++) {
+        counts[i] = (real)adc[i];
+    }
+    @MEASURE@;
+    if (t->suspect >= 0) {
+        s->channel = t->suspect;
+        s->reason = @GUARD@_BAD_SENSOR;
+    }
+    return s->reason;
+}
+
+int @P@_sense(@LAW@@P@_t *s, const uint16_t adc[])
+{
+    tick_t t;
+    return sensed(@law@s, adc, &t);
+}
+
 /* @if own@ */
 IN_PLACE int @P@_isr(@LAW@@P@_t *s, const real ref[], const uint16_t adc[], real u[], uint16_t cmp[])
 /* @else@ */
@@ -16,20 +40,10 @@ int @P@_isr(@LAW@@P@_t *s, const real ref[], const uint16_t adc[], real u[], uin
 /* @end@ */
 {
     tick_t t;
-    real counts[@GUARD@_NADC];
-    int i, reason = s->reason;
+    int i, reason = sensed(@law@s, adc, &t);
     cmp[@GUARD@_NCMP] = 0;
     if (reason != @GUARD@_OK) {
         return reason;
-    }
-    for (i = 0; i < @GUARD@_NADC; i++) {
-        counts[i] = (real)adc[i];
-    }
-    @MEASURE@;
-    if (t.suspect >= 0) {
-        s->channel = t.suspect;
-        s->reason = @GUARD@_BAD_SENSOR;
-        return s->reason;
     }
     reason = out_of_range(ref, s->counts.sensed, &s->channel);
     reason = ticked(@law@s, ref, s->counts.sensed, u, &t, reason);

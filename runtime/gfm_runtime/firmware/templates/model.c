@@ -13,16 +13,18 @@ typedef @P@_t law_t;
 typedef @P@_real real;
 
 enum { NREF = @GUARD@_NREF, NY = @GUARD@_NY, NU = @GUARD@_NU };
+
+@FIRST@
 /* @if schedule@ */
 /* the instance as a whole, and the u in use, are kept as words */
 typedef struct {
     law_t law;
-    real u[NU];
+    real u[NOUT];
 } kept_t;
 enum { STARTED, KEPT, INTS = KEPT + (sizeof(kept_t) + sizeof(int32_T) - 1) / sizeof(int32_T) };
 /* @else@ */
 /* real states: those of the law, which are the first members of its instance, and the u in use */
-enum { LAW_REALS = offsetof(law_t, @FIRST_INT@) / sizeof(real), REALS = LAW_REALS + NU };
+enum { LAW_REALS = offsetof(law_t, @FIRST_INT@) / sizeof(real), REALS = LAW_REALS + NOUT };
 enum { STARTED, REASON, CHANNEL, LIMITED, INTS };
 /* @end@ */
 
@@ -49,9 +51,9 @@ static const IEEE_Cigre_DLLInterface_Model_Info info = {
     .ModelModifiedHistory = "",
     .FixedStepBaseSampleTime = @T_S@,
     .EMT_RMS_Mode = 1,
-    .NumInputPorts = NREF + NY,
+    .NumInputPorts = NREF + NIN,
     .InputPortsInfo = inputs,
-    .NumOutputPorts = NU + 1,
+    .NumOutputPorts = NOUT + 1,
     .OutputPortsInfo = outputs,
     .NumParameters = 0,
     .ParametersInfo = NULL,
@@ -93,7 +95,7 @@ static void load(const IEEE_Cigre_DLLInterface_Instance *instance, law_t *s, rea
 /* @else@ */
     const real *states = instance->@STATES@;
     memcpy(s, states, LAW_REALS * sizeof(real));
-    memcpy(u, states + LAW_REALS, NU * sizeof(real));
+    memcpy(u, states + LAW_REALS, NOUT * sizeof(real));
     s->reason = instance->IntStates[REASON];
     s->channel = instance->IntStates[CHANNEL];
 /* @if stages@ */
@@ -112,7 +114,7 @@ static void store(const IEEE_Cigre_DLLInterface_Instance *instance, const law_t 
 /* @else@ */
     real *states = instance->@STATES@;
     memcpy(states, s, LAW_REALS * sizeof(real));
-    memcpy(states + LAW_REALS, u, NU * sizeof(real));
+    memcpy(states + LAW_REALS, u, NOUT * sizeof(real));
     instance->IntStates[REASON] = s->reason;
     instance->IntStates[CHANNEL] = s->channel;
 /* @if stages@ */
@@ -125,9 +127,9 @@ static void give(IEEE_Cigre_DLLInterface_Instance *instance, const real u[], int
 {
     real64_T *out = instance->ExternalOutputs;
     int i;
-    for (i = 0; i < NU; i++)
+    for (i = 0; i < NOUT; i++)
         out[i] = (real64_T)u[i];
-    out[NU] = reason;
+    out[NOUT] = reason;
 }
 
 /* The tool gives in ExternalOutputs where the outputs shall begin. If they are not in the ranges of the
@@ -138,7 +140,7 @@ int32_T Model_Initialize(IEEE_Cigre_DLLInterface_Instance *instance)
     static const real start[] = {@U_START@};
     const real64_T *out = instance->ExternalOutputs;
     law_t s;
-    real u[NU];
+    real u[NOUT] = {0};
     int i, good = 1;
     for (i = 0; i < NU; i++)
         good = good && out[i] >= low[i] && out[i] <= high[i];
@@ -159,20 +161,17 @@ int32_T Model_Initialize(IEEE_Cigre_DLLInterface_Instance *instance)
  * Model_Initialize was told; until then they stay there, and reason says what is wrong. */
 int32_T Model_Outputs(IEEE_Cigre_DLLInterface_Instance *instance)
 {
-    static const real trend[@N_ROWS@] = {0};
     const real64_T *in = instance->ExternalInputs;
     law_t s;
-    real ref[NREF], y[NY], u[NU], own[@N_ROWS@];
+    real ref[NREF], y[NIN], u[NOUT];
     int i, before, reason;
     for (i = 0; i < NREF; i++)
         ref[i] = (real)in[i];
-    for (i = 0; i < NY; i++)
+    for (i = 0; i < NIN; i++)
         y[i] = (real)in[NREF + i];
     load(instance, &s, u);
     if (!instance->IntStates[STARTED]) {
-        for (i = 0; i < @N_ROWS@; i++)
-            own[i] = u[i];
-        reason = @P@_settle(&s, ref, y, own, trend@E_IN_USE@);
+        reason = begin(&s, ref, y, u);
         if (reason != @GUARD@_OK) {
             give(instance, u, reason);
             return IEEE_Cigre_DLLInterface_Return_OK;
@@ -180,7 +179,7 @@ int32_T Model_Outputs(IEEE_Cigre_DLLInterface_Instance *instance)
         instance->IntStates[STARTED] = 1;
     }
     before = s.reason;
-    reason = @P@_step(&s, ref, y, u);
+    reason = go_on(&s, ref, y, u);
     store(instance, &s, u);
     give(instance, u, reason);
     if (reason != before) {

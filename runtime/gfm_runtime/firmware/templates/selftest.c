@@ -48,6 +48,7 @@ typedef struct {
     void (*spoil)(int k, int stage);
 /* @if counts@ */
     void (*go_on)(int k, const golden_real *counts);
+    void (*align)(int k, const golden_real *y);
 /* @end@ */
 } law_t;
 
