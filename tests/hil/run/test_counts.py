@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.cli import main
+from gfm_hil.controllers import check_currents
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import load_scenario
+from gfm_runtime.signals import COUNTS as COUNTS_CARRIED
 
 COUNTS = "[measure]\nbits = 16\n"
 
@@ -109,6 +112,26 @@ def test_a_link_carries_counts_with_the_same_bits(tmp_path, link):
     other = rig(duration=0.2, link__type=link, folder=tmp_path / "run")
     for name in ("y_adc_i_a", "u_cmp_b", "m_p", "true_v_re"):
         assert np.array_equal(one.signals[name], other.signals[name]), name
+
+
+@pytest.mark.processes
+@pytest.mark.compilers
+def test_a_dll_from_counts_to_counts_is_a_controller(tmp_path):
+    """It aligns its frame by what it measures: near the run with the law itself, not its bits."""
+    command = ["firmware", "dll", "mimo-gfm", "--counts", "rig-dead-time", "--real", "float64"]
+    assert main([*command, "-o", str(tmp_path)]) == 0
+    controller = f"dll:{tmp_path / 'gfm_mimo_gfm.so'}"
+    command = ["run", "rig_switched", "--link", "shm", "--controller", controller, "--no-figures"]
+    assert main([*command, "--duration", "1.2", "--out", str(tmp_path / "run"), "--quiet"]) in (
+        0,
+        3,
+    )
+    found, own = gfmhil.Run.load(tmp_path / "run"), gfmhil.run("rig_switched", duration=1.2)
+    for name, most in (("y_p", 0.04), ("y_v_dc", 1e-3), ("y_V", 1e-3)):
+        apart = np.subtract(found.signals[name], own.signals[name])[2000:].reshape(-1, 200)
+        assert np.abs(apart.mean(axis=1)).max() < most, name  # of a period: the ripple differs
+    with pytest.raises(UserError, match=r"takes voltages and currents, and the scenario's laws co"):
+        check_currents("c:own.so", COUNTS_CARRIED)
 
 
 @pytest.mark.parametrize(
