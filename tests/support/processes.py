@@ -29,7 +29,7 @@ def places(folder: Path) -> set[Path]:
     return found
 
 
-PATIENCE_S = 100.0
+PATIENCE_S = 400.0  # the first to need a loop compiles it
 GFMHIL = [sys.executable, "-m", "gfm_hil"]
 
 

@@ -5,8 +5,10 @@ It neither encrypts nor knows its peer, so no run uses it.
 
 from __future__ import annotations
 
+import os
 import select
 import socket
+import struct
 from contextlib import suppress
 from typing import Any
 
@@ -23,6 +25,7 @@ _transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
 _send: Any = types.ExternalFunction("send", _transfer)
 _recv: Any = types.ExternalFunction("recv", _transfer)
 _SPINS = 1000
+_PATIENCE = struct.pack("ll", 0, 1000)  # struct timeval: s, µs
 
 
 @free_port_function
@@ -32,7 +35,7 @@ def _port_send(handle, message):
 
 @free_port_function
 def _port_receive(handle, message):
-    return max(0, _recv(handle[0], message.ctypes.data, len(message), _DONTWAIT))
+    return max(0, _recv(handle[0], message.ctypes.data, len(message), handle[1]))
 
 
 class UdpLink:
@@ -42,7 +45,7 @@ class UdpLink:
     def __init__(self, role: Role, endpoint: str) -> None:
         host, _, port = endpoint.removeprefix("udp://").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _PATIENCE)
         self._serves = role == "controller"
         try:
             place = self._socket.bind if self._serves else self._socket.connect
@@ -50,16 +53,19 @@ class UdpLink:
         except OSError as problem:
             self.close()
             raise UserError(f"{endpoint}: cannot be used: {problem.strerror}") from None
-        self.port = Port(np.array([self._socket.fileno()]), _port_send, _port_receive, _SPINS)
+        # on one processor a side that polls keeps all others waiting, the kernel's too
+        how = _DONTWAIT if (os.cpu_count() or 1) > 1 else 0
+        handle = np.array([self._socket.fileno(), how])
+        self.port = Port(handle, _port_send, _port_receive, _SPINS)
 
     def send(self, message: bytes) -> bool:
         with suppress(OSError):  # the other side has not opened its port yet
-            return self._socket.send(message) > 0
+            return self._socket.send(message, _DONTWAIT) > 0
         return False
 
     def receive(self) -> bytes | None:
         try:
-            message, sender = self._socket.recvfrom(LONGEST + 1)
+            message, sender = self._socket.recvfrom(LONGEST + 1, _DONTWAIT)
         except OSError:
             return None
         if self._serves:

@@ -40,7 +40,7 @@ _END_S = 1.5  # a loop that gets no answer ends after a second
 _role: Role = "plant"
 _ends: dict[str, PingPong] = {}
 _took = np.zeros(0, np.int64)
-_stop = np.zeros(2, np.int64)
+_stop = np.zeros(3, np.int64)
 
 
 class Pair:
@@ -65,7 +65,7 @@ class Pair:
         self, contender: Contender, period_ns: int, seconds: float, how: int = HYBRID
     ) -> NDArray[np.int64]:
         """Times of the round trips of one round in ns; none if the peer stopped answering."""
-        self._stop[:] = 0, how
+        self._stop[:] = 0, how, period_ns
         answers = self._pools["controller"].submit(_pong, contender.name)
         name, duration_ns = contender.name, int(seconds * 1e9)
         try:
@@ -94,7 +94,7 @@ def _wait(future: Future[Any]) -> Any:
 def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     """Start both; ``place`` is a folder in memory."""
     path = place / "stop"
-    path.write_bytes(bytes(16))
+    path.write_bytes(bytes(24))
     context = multiprocessing.get_context("spawn")
     pools = {
         role: ProcessPoolExecutor(

@@ -13,6 +13,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,7 @@ class _Caller:
         """One round. Raises UserError: the other side left, or the link is gone."""
         port, stamps = self.link.port, self._stamps[: min(len(took), self._most - self._tick)]
         assert port is not None
+        port.paced(period_ns > 0)
         n = send_all(
             port.handle, port.send, port.receive, port.spins, self._y, self._u, self._values,
             period_ns, _LOST_NS, duration_ns, self._tick, stamps,
@@ -285,8 +287,10 @@ def answer(
     Raises:
         UserError: the endpoint cannot be used.
     """
-    open_end("controller", endpoint, options).close()
     tai_ns = tai_offset(ptp_us) if ptp_us else 0
+    with closing(datagram.UdpLink("controller", "udp://127.0.0.1:0")) as nobody:
+        _answer_all(nobody, 0, 0.0, np.ones(1, np.int64))  # compiles: no bench would wait for it
+    open_end("controller", endpoint, options).close()
     say(f"answering at {endpoint}; Ctrl-C ends it")
     scenario = scenario_of()
     patient = {"start_timeout_s": 604800.0, "endpoint": endpoint}
@@ -309,17 +313,23 @@ def answer(
                 link.close()
 
 
-def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) -> str:
-    """Answer until the bench ends; returns how it did."""
-    port, stop, why = link.port, np.zeros(1, np.int64), [0]
+def _answer_all(link: Link, tai_ns: int, error_ns: float, stop: Numbers) -> int:
+    port, clocks = link.port, np.array([0, 0, int(error_ns)])
     assert port is not None
-    clocks = np.array([0, 0, int(error_ns)])
-
-    def work() -> None:
-        why[0] = answer_all(
+    return int(
+        answer_all(
             port.handle, port.send, port.receive, port.spins, frames("y"),
             frames("u", clocks=True), clocks, tai_ns, _SILENCE_NS, stop,
-        )  # fmt: skip
+        )
+    )  # fmt: skip
+
+
+def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) -> str:
+    """Answer until the bench ends; returns how it did."""
+    stop, why = np.zeros(1, np.int64), [0]
+
+    def work() -> None:
+        why[0] = _answer_all(link, tai_ns, error_ns, stop)
 
     getattr(link, "start", lambda: None)()
     thread = threading.Thread(target=work)

@@ -6,8 +6,8 @@ called through its Python methods. ``contenders/pingpong.h`` is the same in C.
 A loop fills ``took`` (capacity,) with the ns of its round trips and returns their number, or -1 if
 the peer stopped answering. With ``period_ns`` 0 they follow each other. Else one begins every
 period, at absolute deadlines, and its time counts from the deadline, so that a late start is
-included. ``stop`` are two numbers in memory that both processes share: not 0 to stop, and how to
-wait for a deadline.
+included. ``stop`` are three numbers in memory that both processes share: not 0 to stop, how to
+wait for a deadline, and ``period_ns``.
 """
 
 from __future__ import annotations
@@ -129,7 +129,13 @@ def over_link(link: Any, own: Messages) -> PingPong:
     """The end of an open link: a ``gfm_hil.links.Link``, of which ``wait`` is not needed."""
     if (port := link.port) is not None:
         call = (port.handle, port.send, port.receive, port.spins, own)
-        return PingPong(partial(ping_port, *call), partial(pong_port, *call), link.close, True)
+
+        def paced(loop: Callable[..., int], stop: Numbers, *more: Any) -> int:
+            port.paced(bool(stop[2]))
+            return loop(*call, stop, *more)
+
+        ping, pong = partial(paced, ping_port), partial(paced, pong_port)
+        return PingPong(ping, pong, link.close, True)
     sent = [row.tobytes() for row in own]
     return PingPong(
         partial(_ping_python, link, sent), partial(_pong_python, link, sent), link.close, False

@@ -78,7 +78,7 @@ def own_share_us(code: str, of_frames: bool) -> float:
     if not of_frames:
         took = np.zeros(_TIMES, np.int64)
         end = over_link(_Mirror(code == "compiled", False), messages("y"))
-        n = end.ping(np.zeros(2, np.int64), 0, _ROUND_NS, took)
+        n = end.ping(np.zeros(3, np.int64), 0, _ROUND_NS, took)
         return round(float(np.median(took[:n])) / 1e3, 4)
     port, stamps = _Mirror(True, True).port, np.zeros((_TIMES, 5), np.int64)
     assert port is not None

@@ -79,6 +79,7 @@ class _End:
         every = getattr(link, "every", 1)
         self.reader = limited_reader(role, scenario, hold, every)
         self.loop = make_loop(scenario, 0 if plant else -1, t0_ns, hold, every)
+        port.paced(scenario.mode == "realtime")
         sleeps_soon = share.crowded and port.patient is not None
         self.loop["spin_limit"] = _SOON if sleeps_soon else port.spin_limit
         w, r = self.writer, self.reader
@@ -252,12 +253,13 @@ def part_from(
     """Send the frames that end a run and wait a moment for the other side's.
 
     A side that closed at once could lose its last frames: libzmq drops what a peer that is 64
-    frames behind has not read yet.
+    frames behind has not read yet. A peer that has heard the first of them may close before the
+    second.
     """
-    send_last(link, writer, tick, state, reason, values)
-    give_up = time.monotonic_ns() + _LAST_NS
     unused = np.empty(len(names(reader.group)))
     with contextlib.suppress(PeerLost):
+        send_last(link, writer, tick, state, reason, values)
+        give_up = time.monotonic_ns() + _LAST_NS
         while reader.state not in (SAFE, STOPPED) and time.monotonic_ns() < give_up:
             message = link.receive()
             if message is None:

@@ -40,6 +40,7 @@ class Port:
             briefly instead.
         spin_limit: empty polls after which a loop in lockstep may sleep: some hundred
             microseconds, so that loops sleep only on a crowded machine.
+        paced: tells the link whether there are pauses between the messages, as in real time.
     """
 
     handle: NDArray[np.int64]
@@ -48,6 +49,7 @@ class Port:
     spins: int
     patient: Any = None
     spin_limit: int = 5000
+    paced: Callable[[bool], object] = bool
 
     def __post_init__(self) -> None:
         """Have the functions compiled before a loop calls them."""

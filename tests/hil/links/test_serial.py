@@ -17,11 +17,14 @@ from hypothesis import strategies as st
 
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.drive import part_from
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.links.serial import link as module
 from gfm_hil.links.serial.framing import stuffed
+from gfm_runtime.signals import NY
+from gfm_runtime.states import STOPPED
 
 from ...support.links import PATIENT, Unstuffer, assert_same, run_pair
 
@@ -254,4 +257,6 @@ def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint):
         with pytest.raises(PeerLost, match=r"the serial line .*line is gone: Input/output"):
             plant.send(b"a")
     assert plant.receive() is None
+    # at the end of a run: it closed once it had heard the first of several goodbyes
+    part_from(plant, FrameWriter("y"), FrameReader("u"), 0, STOPPED, 0, np.zeros(NY))
     plant.close()

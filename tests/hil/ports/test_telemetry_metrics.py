@@ -86,10 +86,10 @@ def recorded(tmp_path: Path) -> Follower:
     part.times[: ticks - 100_000, 3] = due[: ticks - 100_000] + 90_000  # more than 10 s ago
     part.times[ticks - 500 : ticks, 3] = -1
     part.times[ticks - 600, 3] = due[ticks - 600] + 95_000
-    part.progress[:] = ticks, 500
+    part.progress[:2] = ticks, 500
     controller = RolePart.create(tmp_path, "controller", ticks + 10)
     controller.signals[ticks - 1, -3:] = 1.0, 3.0, 0.5
-    controller.progress[:] = ticks, 0
+    controller.progress[0] = ticks
     return Follower(tmp_path)
 
 

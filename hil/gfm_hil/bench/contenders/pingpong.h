@@ -3,7 +3,7 @@
  * A transport includes this file at its end. Before, it defines YIELDS (1: give the processor away
  * after a poll without a message; 0: pause), LONGEST (bytes), end_t, `open_end` (makes an end of
  * numbers and addresses), `transmit` (sends a whole message) and `receive` (takes one if it has
- * arrived; 0: none).
+ * arrived; 0: none). It may define PACED(yes): whether there are pauses between the messages.
  */
 #include <sched.h>
 #include <stdatomic.h>
@@ -11,6 +11,10 @@
 #include <time.h>
 
 enum { AHEAD_NS = 40000, SILENCE_NS = 1000000000 };
+
+#ifndef PACED
+#define PACED(yes) ((void)(yes))
+#endif
 
 static int64_t now_ns(void)
 {
@@ -50,6 +54,7 @@ int64_t ping(const int64_t *opened, int64_t size, int64_t period, int64_t durati
 {
     end_t e = open_end(opened);
     char out[LONGEST] = {1}, in[LONGEST];
+    PACED(period != 0);
     while (receive(&e, in)) /* late answers of an aborted round */
         ;
     int64_t begin = now_ns(), end = begin + duration, n = 0;
@@ -72,11 +77,12 @@ int64_t ping(const int64_t *opened, int64_t size, int64_t period, int64_t durati
     return n;
 }
 
-/* Answers until *stop is set. */
+/* Answers until stop[0] is set; stop[2] is the period. */
 void pong(const int64_t *opened, int64_t size, atomic_int_fast64_t *stop)
 {
     end_t e = open_end(opened);
     char out[LONGEST] = {2}, in[LONGEST];
+    PACED(stop[2] != 0);
     while (!atomic_load_explicit(stop, memory_order_acquire))
         if (receive(&e, in))
             transmit(&e, out, size);

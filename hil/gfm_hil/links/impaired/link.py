@@ -99,7 +99,8 @@ def _pointer(typingctx, address):
 def _port(inner: Port, stage: np.ndarray) -> Port:
     """The port of an impaired link: its handle is the stage, which points to the inner handle."""
     stage[INNER], stage[INNER_WORDS] = inner.handle.ctypes.data, len(inner.handle)
-    return Port(stage, *_functions(inner.send, inner.receive), inner.spins, None, inner.spin_limit)
+    calls = _functions(inner.send, inner.receive)
+    return Port(stage, *calls, inner.spins, None, inner.spin_limit, inner.paced)
 
 
 @cache

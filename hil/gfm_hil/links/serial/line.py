@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import select
 import termios
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from gfm_runtime.compiled import cached
 
 #: numbers of the handle: the open line (-1: none), counts, errno of a line that is gone, ends
 (FD, COUNT_DAMAGED, DROPPED, GONE, _CAME_AT, _CAME_END, _PIECE_END, _REST_AT, _REST_END, _POLL,
- _WAITING) = range(11)  # fmt: skip
+ _WAITING, _EMPTY, _MOST_EMPTY, _NAP, _NAP_NS) = range(15)  # fmt: skip
 _NUMBERS = 16
 _WORD = 8
 _AT_ONCE = 4096  # bytes of a read
@@ -39,20 +40,32 @@ _NONE_NOW = (errno.EAGAIN, errno.EINTR)
 _TIOCOUTQ = termios.TIOCOUTQ
 _EVENTS = 32  # bit offset of ``events`` in struct pollfd
 _PATIENCE_MS = 1
-_SPINS = 200  # the reader itself moves the bytes of a pseudo terminal, see n_tty_read of Linux
+# A worker of the kernel, of ordinary priority, moves the bytes (flush_to_ldisc of Linux): two loops
+# of SCHED_FIFO that only read leave it no processor. So they read so often, and then sleep: in
+# lockstep seldom, since a read moves the bytes too (n_tty_read) if both sides read at once.
+_LOOKS, _LOOKS_PACED, _SLEEP_NS = 100, 2, 20_000
 
-# read(2), write(2) and ioctl(2) of libc; addresses are int64
+# read(2), write(2), ppoll(2) and ioctl(2) of libc; addresses are int64
 _transfer = types.int64(types.int32, types.int64, types.int64)
 _read: Any = types.ExternalFunction("read", _transfer)
 _write: Any = types.ExternalFunction("write", _transfer)
+_ppoll: Any = types.ExternalFunction(
+    "ppoll", types.int32(types.int64, types.int64, types.int64, types.int64)
+)
 _ioctl: Any = types.ExternalFunction("ioctl", types.int32(types.int32, types.int64, types.int64))
 
 
 def make_line() -> NDArray[np.int64]:
     """The handle of a line that is not open yet."""
     h = np.zeros(_SIZE, np.int64)
-    h[FD] = -1
+    h[FD], h[_NAP_NS] = -1, _SLEEP_NS
+    set_paced(h, False)
     return h
+
+
+def set_paced(h: NDArray[np.int64], paced: bool) -> None:
+    """Say whether there are pauses between the messages."""
+    h[_MOST_EMPTY] = _LOOKS_PACED if paced else _LOOKS
 
 
 def set_line(h: NDArray[np.int64], fd: int) -> None:
@@ -155,7 +168,13 @@ def _port_send(handle, message):
 
 @port_function
 def _port_receive(handle, message):
-    return receive(handle, message)
+    size = receive(handle, message)
+    if size == 0 and handle[_EMPTY] >= handle[_MOST_EMPTY]:
+        at = handle.ctypes.data
+        _ppoll(at + _WORD * _POLL, 1, at + _WORD * _NAP, 0)
+        size = receive(handle, message)
+    handle[_EMPTY] = handle[_EMPTY] + 1 if size == 0 else 0
+    return size
 
 
 @port_function
@@ -169,7 +188,7 @@ def _port_await(handle, message):
 
 def line_port(h: NDArray[np.int64]) -> Port:
     """The port of a line."""
-    return Port(h, _port_send, _port_receive, _SPINS, _port_await)
+    return Port(h, _port_send, _port_receive, _LOOKS, _port_await, _LOOKS, partial(set_paced, h))
 
 
 def warm_up() -> None:
