@@ -1,4 +1,4 @@
-"""A kernel with CAN as a process: user-mode Linux on the host's files, which runs one job."""
+"""A kernel with CAN and netem as a process: user-mode Linux on the host's files, with one job."""
 
 import os
 import shlex
@@ -12,12 +12,12 @@ from gfm_hil.links import link_kind
 
 ROOT = Path(__file__).resolve().parents[2]
 INIT = ROOT / "tests" / "uml" / "init.sh"
-TESTS = "tests/hil/links/can_inside_uml.py"
+TESTS = ("tests/hil/links/can_inside_uml.py", "tests/hil/bench/netem_inside_uml.py")
 PACKAGES = ("hil", "runtime", "plant_emulator", "design")
 
 
 class Kernel:
-    """Boots and runs ``can_inside_uml.py`` under pytest; takes some minutes.
+    """Boots and runs ``TESTS`` under pytest; takes some minutes.
 
     So it starts before the other tests, and its result is checked after them. Inside, where system
     calls are slow, compiling would take ten minutes; a bus on the loopback device needs the same
@@ -40,7 +40,7 @@ class Kernel:
             "MPLBACKEND": "Agg",
             "OPENBLAS_NUM_THREADS": "1",
         }
-        test = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", TESTS]
+        test = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *TESTS]
         # in the host's folder, the host would remove files that none of its processes owns
         inside = {**settings, "TMPDIR": "/dev/shm"}
         lines = [
@@ -50,7 +50,8 @@ class Kernel:
             + f" >{shlex.quote(str(self._log))} 2>&1",
         ]
         job.write_text("\n".join(lines) + "\n")
-        compiling = [*test, "-k", "in_process_in_counts", "--basetemp", str(folder / "first")]
+        first = "in_process_in_counts or netem"
+        compiling = [*test, "-k", first, "--basetemp", str(folder / "first")]
         kernel = ["linux.uml", "mem=2G", "rootfstype=hostfs", "rootflags=/", "rw", "quiet",
                   f"init={INIT}", f"UML_JOB={job}", f"UML_STATUS={self._status}",
                   "con0=null,fd:1", "con=null"]  # fmt: skip

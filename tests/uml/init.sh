@@ -9,7 +9,8 @@ mount -t devtmpfs dev /dev
 mkdir -p /dev/shm
 mount -t tmpfs shm /dev/shm
 kernel="/usr/lib/uml/modules/$(uname -r)/kernel"
-for module in drivers/net/can/dev/can-dev net/can/can net/can/can-raw drivers/net/can/vcan; do
+for module in drivers/net/can/dev/can-dev net/can/can net/can/can-raw drivers/net/can/vcan \
+    drivers/net/veth net/sched/sch_netem; do
   insmod "$kernel/$module.ko"
 done
 ip link set lo up

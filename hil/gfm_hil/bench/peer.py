@@ -288,7 +288,7 @@ def answer(
         UserError: the endpoint cannot be used.
     """
     tai_ns = tai_offset(ptp_us) if ptp_us else 0
-    with closing(datagram.UdpLink("controller", "udp://127.0.0.1:0")) as nobody:
+    with closing(datagram.UdpLink("controller", "udp://0.0.0.0:0")) as nobody:
         _answer_all(nobody, 0, 0.0, np.ones(1, np.int64))  # compiles: no bench would wait for it
     open_end("controller", endpoint, options).close()
     say(f"answering at {endpoint}; Ctrl-C ends it")

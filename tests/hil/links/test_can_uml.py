@@ -1,4 +1,4 @@
-"""Real SocketCAN, in a kernel that has it: user-mode Linux, booted on the host's files.
+"""Real SocketCAN and netem, in a kernel that has them: user-mode Linux, booted on the host's files.
 
 Needs Debian's packages ``user-mode-linux``, ``kmod`` and ``iproute2``. The kernel is a process of
 the user, but the tests inside write to the host's files, so they run only with GFMHIL_UML=1.
@@ -14,9 +14,9 @@ pytestmark = [pytest.mark.apt, pytest.mark.uml]
 @pytest.mark.skipif(
     "GFMHIL_UML" not in os.environ, reason="boots a kernel; GFMHIL_UML=1 asks for it"
 )
-@pytest.mark.timeout(1200)
-def test_socketcan_inside_user_mode_linux(uml_kernel):
-    status, said = uml_kernel.result(timeout=1150)
+@pytest.mark.timeout(1500)
+def test_socketcan_and_netem_inside_user_mode_linux(uml_kernel):
+    status, said = uml_kernel.result(timeout=1450)
     assert status == "0", said
     assert " passed" in said
     print(said)
