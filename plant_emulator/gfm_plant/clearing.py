@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from gfm_plant.going_on import advance
-from gfm_plant.joint import fault_phases
+from gfm_plant.joint import drop_dead, fault_phases
 from gfm_plant.layout import field
 from gfm_plant.period import go_back, keep
 from gfm_plant.records import PlantRecords
@@ -159,6 +159,7 @@ def _open_joint(plant: PlantRecords, j: int, p: int, at: float) -> None:
     n, now = plant.net[0], plant.now[0]
     conducts, opens = field(now, "conducts"), field(now, "opens")
     conducts[j, p], now.made = 0, 0
+    drop_dead(n, now)
     now.clearing, now.joint = 0, 0
     for i in range(n.poles + 1):
         for x in range(3):

@@ -81,6 +81,16 @@ def _find_bars(n: Any, now: Any) -> int:
 
 
 @compiled
+def drop_dead(n: Any, now: Any) -> None:
+    """Open the poles whose currents the open ones leave no path."""
+    conducts, of_poles, count = field(now, "conducts"), field(n, "pole_bars"), _find_bars(n, now)
+    for j in range(n.poles):
+        for p in range(3):
+            if count == n.reals or _add(n, now, of_poles[j, p], count) == count:
+                conducts[1 + j, p] = 0
+
+
+@compiled
 def _add(n: Any, now: Any, vector: Any, count: int) -> int:
     """Add what a vector has besides the basis to it, by Gram and Schmidt, twice."""
     bars, size = field(now, "bars"), 0.0
