@@ -29,7 +29,7 @@ FOLDERS = {
 }
 RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
-_FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "toml_file")
+_FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "shipped", "toml_file")
 _STAGES = ("dual_sequence", "kinds", "stage", "virtual_stator", "voltage_loop")  # their options
 _COUNTS = ("measure", "modulate", "pair")  # likewise
 BESIDE_THE_LOOP = {
