@@ -29,9 +29,6 @@ enum { PRIORITY = 50, ANSWER_EVERY_MS = 100, LAST_TIMES = 3 };
 
 #define NAME "droop in C" /* what the plant's report calls this controller */
 
-/* The signal table that this program was written for; the plant sends its own. */
-#define TABLE "\"fb7ec5b6\""
-
 /* ---- the law ----------------------------------------------------------------------------- */
 
 typedef struct {
@@ -70,7 +67,7 @@ static double answer_hello(link_t *link, const char *hello) {
         !gfmhil_field(hello, "table", table, sizeof table) ||
         !gfmhil_field(hello, "T_s", T_s, sizeof T_s))
         return 0;
-    if (atoi(version) != GFMHIL_TABLE_VERSION || strcmp(table, TABLE) != 0) {
+    if (atoi(version) != GFMHIL_TABLE_VERSION || strcmp(table, GFMHIL_TABLE) != 0) {
         fprintf(stderr, "the plant has another signal table: version %s, %s\n", version, table);
         return 0;
     }

@@ -24,6 +24,7 @@
 #endif
 
 enum { GFMHIL_MAGIC = 0x4647, GFMHIL_TABLE_VERSION = 3, GFMHIL_Y_ID = 1, GFMHIL_U_ID = 2 };
+#define GFMHIL_TABLE "\"c061c2eb\"" /* hash of the signal table, as a greeting has it */
 enum { GFMHIL_INIT, GFMHIL_READY, GFMHIL_RUNNING, GFMHIL_SAFE, GFMHIL_STOPPED }; /* state */
 enum { GFMHIL_OK, GFMHIL_BAD_Y, GFMHIL_BAD_U, GFMHIL_STALE, GFMHIL_LOST_PEER, GFMHIL_PLANT_TRIP,
        GFMHIL_OPERATOR, GFMHIL_BAD_SENSOR }; /* reason */

@@ -1,6 +1,7 @@
 """Frames: each arrives unchanged or not at all, every fault counts under its name; their CRC."""
 
 import zlib
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from gfm_hil.links.crc import crc32, crc32_by_tables
 from gfm_hil.links.frame import FAULTS, FrameError, FrameReader, FrameWriter, frame_dtype
-from gfm_runtime.signals import TABLE_VERSION, names
+from gfm_runtime.signals import TABLE_VERSION, names, table_hash
 from gfm_runtime.states import REASONS, STOPPED
 
 from ...support.frames import resealed
@@ -155,3 +156,9 @@ def test_the_crc_of_every_length_and_the_published_check(crc):
     for count in range(600):
         assert crc(noise, count) == zlib.crc32(noise[:count].tobytes())
     assert crc(np.frombuffer(b"123456789", np.uint8), 9) == 0xCBF43926  # of CRC-32/ISO-HDLC
+
+
+def test_the_header_for_c_is_of_this_signal_table():
+    header = files("gfm_hil.controllers").joinpath("gfmhil_frames.h").read_text("utf-8")
+    assert f"GFMHIL_TABLE_VERSION = {TABLE_VERSION}," in header
+    assert f'#define GFMHIL_TABLE "\\"{table_hash()}\\""' in header
