@@ -91,7 +91,8 @@ def run(
         law: name, law file or ``Law``; the scenario's own if None.
         folder: run folder, new or empty; None for a run in memory.
         controller: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``, which computes u in place of the law;
-            or ``pil:TARGET``, the law on a processor in QEMU. It takes a folder and a link.
+            or ``pil:TARGET``, the law on a processor in QEMU, or ``pil:TARGET:FOLDER`` with a
+            firmware around it. It takes a folder and a link.
         ports: file of the map of its ports.
         figures: in the folder, figures and report.html.
         progress: is called with the ticks done and the misses so far; with a folder.

@@ -31,7 +31,8 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--controller", metavar="KIND:NAME",
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"
-        " or pil:TARGET, the law on a processor in QEMU, see gfmhil firmware check",
+        " or pil:TARGET, the law on a processor in QEMU, see gfmhil firmware check, or"
+        " pil:TARGET:FOLDER with a firmware around it",
     )  # fmt: skip
     common.add_map(command, "--controller")
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")

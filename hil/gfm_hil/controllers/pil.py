@@ -15,6 +15,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,15 +60,19 @@ class PilController(ExternalController):
     """The laws of a run on a target; a context in which its program runs.
 
     Args:
-        target: one of ``gfm_runtime.firmware.TARGETS``.
+        target: one of ``gfm_runtime.firmware.TARGETS``, or ``TARGET:FOLDER`` with a firmware that
+            calls the laws, see ``loop.h``.
 
     Raises:
-        UserError: there is no such target, or its tools are missing (the packages are named).
+        UserError: there is no such target or firmware, or its tools are missing (the packages are
+            named).
     """
 
     has_laws = True
 
     def __init__(self, target: str) -> None:
+        target, _, firmware = target.partition(":")
+        self._firmware = Path(firmware) if firmware else None
         if target not in TARGETS:
             raise UserError(
                 f"controller pil:{target}: must be pil: and one of {', '.join(TARGETS)}"
@@ -77,6 +82,8 @@ class PilController(ExternalController):
                 f"controller pil:{target}: has the other order of bytes than a run's frames; "
                 f"gfmhil firmware check DIR --target {target} steps it through golden rows"
             )
+        if self._firmware is not None and not any(self._firmware.glob("*.c")):
+            raise UserError(f"controller pil:{target}:{firmware}: is no folder with C sources")
         try:
             self.real = need_tools(target).real
         except LawError as problem:
@@ -98,7 +105,8 @@ class PilController(ExternalController):
         self._places = {_numbers(record): k for k, (_, record) in enumerate(ready)}
         modules = [
             Module(
-                f"{k} {discrete.law.name}",
+                # a firmware calls a law by its name
+                f"{k} {discrete.law.name}" if self._firmware is None else discrete.law.name,
                 discrete.law,
                 record,
                 controller.inner > 0,
@@ -108,7 +116,8 @@ class PilController(ExternalController):
         ]
         try:
             folder = self._ends.enter_context(scratch.temporary("gfmhil-pil-"))
-            self._run(build_loop(modules, controller.T_s, self._target, folder))
+            program = build_loop(modules, controller.T_s, self._target, folder, self._firmware)
+            self._run(program)
             self._check(modules, golden(modules, SHIPPED))
         except (LawError, ControllerError) as problem:
             self.close()
@@ -160,7 +169,8 @@ class PilController(ExternalController):
                 raise self._problem(f"answers a golden row with {differ[-1]}, which no law does")
         if any(differ):
             first = np.flatnonzero(differ)[0]
-            name = modules[int(rows.words[first, 1])].name.partition(" ")[2]
+            name = modules[int(rows.words[first, 1])].name
+            name = name.partition(" ")[2] or name
             raise self._problem(
                 f"its program does not compute the kernel's bits: {sum(differ):,} words differ in"
                 f" {len(differ):,} golden rows, the first in law {name}; a compiler that fuses"

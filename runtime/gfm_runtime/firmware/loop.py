@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gfm_runtime.counts import COUNTS_STATE
+from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.check import HARNESS, Target, build, need_tools
 from gfm_runtime.firmware.folder import selftest
 from gfm_runtime.firmware.module import Module, check_modules, sources
@@ -42,7 +43,9 @@ class LoopProgram:
     answer: np.dtype[Any]
 
 
-def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path) -> LoopProgram:
+def build_loop(
+    modules: Sequence[Module], T_s: float, target: str, folder: Path, firmware: Path | None = None
+) -> LoopProgram:
     """Build the program of a target for a run's laws; law k of a request is ``modules[k]``.
 
     Args:
@@ -50,10 +53,11 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
         T_s: sampling time, s.
         target: one of ``gfm_runtime.firmware.TARGETS``.
         folder: empty.
+        firmware: with C sources that have the functions of ``loop.h``, in place of the bare laws.
 
     Raises:
-        LawError: a law that C cannot hold, a missing tool (the apt packages are named), or a
-            build that fails.
+        LawError: laws without counts for a firmware, a law that C cannot hold, a missing tool (the
+            apt packages are named), or a build that fails.
     """
     where = need_tools(target)
     check_modules(modules)
@@ -61,8 +65,13 @@ def build_loop(modules: Sequence[Module], T_s: float, target: str, folder: Path)
     texts = {**sources(modules, T_s, "unrolled"), **selftest(modules, "unrolled")}
     for name, text in (texts | {"states.h": _states(modules)}).items():
         (folder / name).write_text(text, encoding="utf-8")
-    program = str(HARNESS.joinpath("loop.c"))
-    build(folder, folder, where, [m.prefix for m in modules], [program])
+    program = [str(HARNESS.joinpath("loop.c"))]
+    if firmware is not None:
+        if not modules[0].counts:
+            raise LawError("counts", f"missing; the interrupt of {firmware} begins with them")
+        program += [str(file.absolute()) for file in sorted(firmware.glob("*.c"))]
+        program += ["-DLOOP_FIRMWARE", f"-I{HARNESS}", f"-I{firmware.absolute()}"]
+    build(folder, folder, where, [m.prefix for m in modules], program)
     real, word = (
         dtype.newbyteorder(where.order) for dtype in (real, np.dtype(f"i{real.itemsize}"))
     )
@@ -112,10 +121,15 @@ static void {m.prefix}_load(int k, const golden_real *from, int limited)
 static int {m.prefix}_channel(int k)
 {{
     return {m.prefix}_of[k].channel;
+}}
+static void *{m.prefix}_at(int k)
+{{
+    return &{m.prefix}_of[k];
 }}""")
     lines += ["static const struct {",
               "    void (*load)(int k, const golden_real *from, int limited);",
               "    int (*channel)(int k);",
+              "    void *(*at)(int k);",
               "} states[] = {"]  # fmt: skip
-    lines += [f"    {{{m.prefix}_load, {m.prefix}_channel}}," for m in modules]
+    lines += [f"    {{{m.prefix}_load, {m.prefix}_channel, {m.prefix}_at}}," for m in modules]
     return "\n".join([*lines, "};", ""])

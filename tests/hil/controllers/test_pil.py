@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -24,7 +25,10 @@ from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
 from gfm_hil.scenario import find_scenario, load_scenario
 from gfm_runtime.firmware import TARGETS
+from gfm_runtime.firmware.check import HARNESS
+from gfm_runtime.signals import FULL_SCALES
 
+from ...support.firmware import STRICT
 from ...support.processes import write
 
 
@@ -45,6 +49,8 @@ COUNTS = {
         "dc_source": {"mode": "regulated"},
     },
 }
+CORTEX_M = Path(__file__).parents[3] / "examples" / "firmware_cortex_m"
+STATES = Path(__file__).parents[2] / "support" / "firmware_c" / "states.c"
 LOST = {"counts": "rig", "plant": {"phases": {"gain": {"v_b": 0.0}}, "delay": {"samples": 1}}}
 DIP = [{"tick": 100, "type": "grid-voltage", "V_g": 0.0}, {"tick": 300, "type": "reset"}]
 
@@ -126,6 +132,69 @@ def test_the_shipped_experiments_have_the_bits_of_the_float32_kernel(name, tmp_p
     exact = runner.run_in_memory(found.scenario)  # the negative control
     assert found.columns["u_omega_u"][:].tobytes() != exact.columns["u_omega_u"][:].tobytes()
     assert_same(found, in_process(found, "float32", monkeypatch))
+
+
+@qemu
+@pytest.mark.parametrize("target", ["m4f", "m7", "host"])
+def test_the_firmware_of_the_example_switches_laws_with_the_bits_of_the_kernel(
+    target, tmp_path, monkeypatch
+):
+    """From the interrupt to the compare registers, until the plant trips."""
+    folder = tmp_path / "run"
+    monkeypatch.chdir(CORTEX_M)
+    command = ["run", "scenario.toml", "--controller", f"pil:{target}:."]
+    assert main([*command, "--out", str(folder), "--quiet", "--no-figures"]) == 0
+    found = Run.load(folder)
+    assert found.summary["laws"] == ["mimo-gfm", "vsg-2"]
+    assert 10_000 < found.summary["ticks"] < 40_000
+    assert_same(found, in_process(found, TARGETS[target].real, monkeypatch))
+
+
+@pytest.mark.compilers
+def test_the_firmware_of_the_example_enables_blocks_and_resets_as_it_should(tmp_path):
+    """Through its registers: the trip input, a lost channel, a reset that must not come first."""
+    laws = ["mimo-gfm", "vsg-2", "--counts", str(CORTEX_M / "board.toml")]
+    assert main(["firmware", "export", *laws, "-o", str(tmp_path)]) == 0
+    ones = {
+        name: 2**12 / (FULL_SCALES[of][1] - FULL_SCALES[of][0])
+        for name, of in {"V_1": "v", "V_DC_1": "v_dc"}.items()
+    }
+    sources = [*CORTEX_M.glob("[fi]*.c"), STATES, *tmp_path.glob("*.c")]
+    command = ["gcc", *STRICT, "-ffp-contract=off", "-DGOLDEN_NO_MAIN", "-o", tmp_path / "states"]
+    command += [f"-D{name}={value}" for name, value in ones.items()]
+    command += [f"-I{folder}" for folder in (CORTEX_M, HARNESS, tmp_path)]
+    subprocess.run([*command, *sources, "-lm"], check=True)
+    said = subprocess.run([tmp_path / "states"], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines() == [
+        "power: START 0 0",
+        "no v_dc: START 0 0",
+        "charged: READY 0 0",
+        "enabled: RUN 1 0",
+        "runs: RUN 1 0",
+        "1",
+        "disabled: READY 0 0",
+        "trip: SAFE 0 100",
+        "reset while enabled: SAFE 0 100",
+        "reset: READY 0 0",
+        "again: RUN 1 0",
+        "lost v_a: SAFE 0 7",
+        "v_a is back: SAFE 0 7",
+    ]
+
+
+@qemu
+@pytest.mark.parametrize(
+    ("content", "where", "said"),
+    [
+        ({"counts": "rig"}, "none", r"controller pil:host:.*none: is no folder with C sources"),
+        ({}, "", r"controller pil: counts: missing; the interrupt of .* begins with them"),
+    ],
+)
+def test_a_firmware_that_cannot_run_is_refused(content, where, said, tmp_path, capsys):
+    file = write(tmp_path, **{"law": "vsg-2", "link": SHM, "plant": LOST["plant"], **content})
+    command = ["run", file, "--controller", f"pil:host:{CORTEX_M / where}", "--quiet"]
+    assert main([*command, "--out", str(tmp_path / "run"), "--no-figures"]) == 2
+    assert re.search(said, capsys.readouterr().err)
 
 
 @qemu

@@ -10,6 +10,9 @@
 
 #include "board.h"
 #include "states.h"
+#ifdef LOOP_FIRMWARE
+#include "loop.h"
+#endif
 
 enum { TICK, START, CHANGE, CHECK, ALIGN };
 
@@ -47,6 +50,44 @@ static void look_at(int law, int k)
     answer.channel = (golden_word)states[law].channel(k);
 }
 
+#ifdef LOOP_FIRMWARE
+/* A tick of the firmware: changes of law are its own. */
+static int tick_firmware(int law)
+{
+    const char *name = golden_names[law];
+    uint16_t adc[GOLDEN_NY];
+    int i, result;
+    for (i = 0; i < GOLDEN_NY; i++)
+        adc[i] = (uint16_t)request.y[i];
+    if (request.what == ALIGN) {
+        laws[law].align(0, request.y);
+        memcpy(loop_instance(name), states[law].at(0), golden_sizes[law]);
+    }
+    result = loop_tick(name, request.ref, adc, answer.u, &answer.bump);
+    memcpy(states[law].at(0), loop_instance(name), golden_sizes[law]);
+    return result;
+}
+#else
+/* Changes to the request's law, between the instances k and 1 - k. */
+static void change(int *law, int *k)
+{
+#if COUNTS
+    const golden_real *y = request.measured; /* by the old law; the new one measures it anew */
+#else
+    const golden_real *y = request.y;
+#endif
+    const view_t now = laws[*law].view(*k);
+    laws[*law].look(*k, request.ref, y, answer.own);
+    *law = (int)request.law;
+    *k = 1 - *k;
+    laws[*law].init(*k);
+    laws[*law].change(*k, request.ref, y, answer.own, now.trend NOW_E, &answer.bump);
+#if COUNTS
+    laws[*law].go_on(*k, now.counts);
+#endif
+}
+#endif
+
 static int whole(long file, void *at, unsigned long size)
 {
     unsigned long got = 0, more;
@@ -60,7 +101,6 @@ int main(void)
     const long to = board_open("to", 2, BOARD_READ), from = board_open("from", 4, BOARD_WRITE);
     const unsigned long before = clock_now();
     int law = 0, k = 0;
-    view_t now;
     answer.count = (golden_word)ELAPSED(clock_now() - before);
     board_write(from, &answer, sizeof answer);
     while (whole(to, &request, sizeof request) && request.law < GOLDEN_LAWS) {
@@ -71,6 +111,13 @@ int main(void)
             k = 0;
             laws[law].init(k);
             states[law].load(k, state, (int)request.limited);
+#ifdef LOOP_FIRMWARE
+            if (!loop_start(golden_names[law], states[law].at(k))) {
+                board_say("the firmware has no law ");
+                board_say(golden_names[law]);
+                break;
+            }
+#endif
             continue;
         }
         if (request.what == CHECK) {
@@ -81,27 +128,18 @@ int main(void)
             continue;
         }
         answer.bump = 0;
-        if (request.what == CHANGE) {
-#if COUNTS
-            const golden_real *y = request.measured; /* by the old law; the new one measures it anew */
+#ifdef LOOP_FIRMWARE
+        law = (int)request.law;
+        answer.result = (golden_word)tick_firmware(law);
 #else
-            const golden_real *y = request.y;
-#endif
-            now = laws[law].view(k);
-            laws[law].look(k, request.ref, y, answer.own);
-            law = (int)request.law;
-            k = 1 - k;
-            laws[law].init(k);
-            laws[law].change(k, request.ref, y, answer.own, now.trend NOW_E, &answer.bump);
-#if COUNTS
-            laws[law].go_on(k, now.counts);
-#endif
-        }
+        if (request.what == CHANGE)
+            change(&law, &k);
 #if COUNTS
         if (request.what == ALIGN)
             laws[law].align(k, request.y);
 #endif
         answer.result = (golden_word)laws[law].step(k, request.ref, request.y, answer.u);
+#endif
         answer.count = (golden_word)ELAPSED(golden_elapsed);
         look_at(law, k);
         board_write(from, &answer, sizeof answer);
