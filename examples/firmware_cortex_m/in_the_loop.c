@@ -59,7 +59,6 @@ static void convert(const uint16_t adc[])
     }
     ADC1->JDR4 = adc[GFM_VSG_2_ADC_V_DC];
     ADC1->SR |= ADC_SR_JEOC;
-    interrupt(ADC_IRQn);
 }
 
 /* The timer's update, which sets MOE if it may. */
@@ -105,8 +104,9 @@ int loop_tick(const char *law, const golden_real ref[], const uint16_t adc[], go
     for (i = 0; i < GFM_VSG_2_NREF; i++)
         command.ref[i] = ref[i];
     firmware.bump = 0;
-    before = clock_now();
     convert(adc);
+    before = clock_now();
+    interrupt(ADC_IRQn);
     golden_elapsed = clock_now() - before - reading;
     update();
     for (i = 0; i < GFM_VSG_2_NU; i++)
