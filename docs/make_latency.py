@@ -3,11 +3,12 @@
 For every law of the catalogue on the plant of `pref_step` and on that of `rig_pref_step` (without
 noise and rounding, so that two runs can be compared), it takes the unstable word with the fewest
 misses, n + 1, and the worst word of n, and runs both on the bench: a trace says which ticks are
-missed. Two runs that differ by a millionth of P_ref show whether a difference grows. Writes
+missed. Two runs that differ by a millionth of P_ref show whether a difference grows. They last the
+longer the slower it would, but a minute at most. Writes
 
     docs/tables/latency_words.md        what laws bear by the linear loop, and by the bench
 
-Usage: python docs/make_latency.py [LAW ...]    (all laws: 10 minutes)
+Usage: python docs/make_latency.py [LAW ...]    (all laws: half an hour beside other work)
 """
 
 from __future__ import annotations
@@ -30,14 +31,17 @@ from gfm_hil.studies.linear_loop import scenario_loop
 from gfm_runtime import law_names
 
 DOCS = Path(__file__).resolve().parent
-SECONDS, FIRST = 8.0, 10  # of a run; tick at which the words begin
+SECONDS, FIRST = (8.0, 60.0), 10  # of a run, least and most; tick at which the words begin
+TIMES = 8.0  # the factors of e by which a difference should grow or shrink in a run
 STEP, GREW, SMALL = 1e-6, 1e-3, 1e-13  # of P_ref; of a difference, p.u.
 BACK, PARTS = 300, 24  # tick at which P_ref is as before; windows of the difference
 SHOWN = ("true_p", "true_q", "true_V", "true_v_dc")
 SETTINGS = {"ideal": "pref_step", "rig": "rig_pref_step"}
 
 
-def setting(name: str, law: str, trace: str | None, step: float) -> Scenario:
+def setting(
+    name: str, law: str, trace: str | None, step: float, seconds: float = SECONDS[0]
+) -> Scenario:
     """A scenario of ``SETTINGS`` without noise, rounding and its events; P_ref has a pulse at its
     start."""
     content: dict[str, Any] = load_scenario(SETTINGS[name]).model_dump(
@@ -47,7 +51,7 @@ def setting(name: str, law: str, trace: str | None, step: float) -> Scenario:
     for key in ("adc", "dac"):
         plant.pop(key, None)
     plant.get("sensors", {}).pop("noise_std", None)
-    content |= {"law": law, "duration": SECONDS, "mode": "lockstep", "expect": "completed"}
+    content |= {"law": law, "duration": seconds, "mode": "lockstep", "expect": "completed"}
     content |= {"late_policy": {"hold": 10**6}, "link": {"type": "inproc"}, "compare": []}
     pulse = ((5, 0.5 + step), (BACK, 0.5))
     content["events"] = [{"tick": k, "type": "reference", "P_ref": P} for k, P in pulse]
@@ -56,9 +60,9 @@ def setting(name: str, law: str, trace: str | None, step: float) -> Scenario:
     return check_scenario(content, name)
 
 
-def write_trace(path: Path, word: Word, case: Meanwhile) -> None:
+def write_trace(path: Path, word: Word, case: Meanwhile, seconds: float) -> None:
     """The word, again and again: its misses, then its hits."""
-    n = round(SECONDS / 1e-4)
+    n = round(seconds / 1e-4)
     acts, steps = np.arange(n), np.ones(n, np.int64)
     for begin in range(FIRST, n, word.misses + word.hits):
         missed = slice(begin, min(begin + word.misses, n))
@@ -67,9 +71,11 @@ def write_trace(path: Path, word: Word, case: Meanwhile) -> None:
     np.savez(path, acts=acts, steps=steps)
 
 
-def rate(name: str, law: str, trace: str) -> float:
-    """How fast the difference of two runs grows, 1/s: until it is large, over the later half."""
-    runs = [gfmhil.run(setting(name, law, trace, step)).signals for step in (STEP, 2 * STEP)]
+def rate(name: str, law: str, trace: str, seconds: float) -> float:
+    """How fast the difference of two runs grows, 1/s: until it is large, or over the last third."""
+    runs = [
+        gfmhil.run(setting(name, law, trace, step, seconds)).signals for step in (STEP, 2 * STEP)
+    ]
     count = min(len(one["true_p"]) for one in runs)
     apart = np.array([[one[s][:count] for s in SHOWN] for one in runs])
     d = np.abs(apart[1] - apart[0]).max(axis=0)[BACK:]
@@ -81,7 +87,8 @@ def rate(name: str, law: str, trace: str) -> float:
     small = np.flatnonzero(tops < SMALL)
     if len(small):  # below it there is rounding
         return float(np.log(SMALL / STEP) / (small[0] * every))
-    return float(np.polyfit(every * np.arange(PARTS // 2), np.log(tops[PARTS // 2 :]), 1)[0])
+    last = np.log(tops[-PARTS // 3 :])
+    return float(np.polyfit(every * np.arange(len(last)), last, 1)[0])
 
 
 def cell(loop: ClosedLoop, name: str, law: str, case: Meanwhile, place: Path) -> str:
@@ -92,8 +99,9 @@ def cell(loop: ClosedLoop, name: str, law: str, case: Meanwhile, place: Path) ->
         return "≥ 1000"
 
     def grows(word: Word) -> bool:
-        write_trace(file, word, case)
-        seen = rate(name, law, str(file))
+        seconds = min(max(SECONDS[0], TIMES / abs(word.sigma)), SECONDS[1])
+        write_trace(file, word, case, seconds)
+        seen = rate(name, law, str(file), seconds)
         print(
             f"{law:24} {name:6} {case:13} {word!s:24} {word.sigma:+9.3f} {seen:+9.3f}", flush=True
         )
