@@ -7,6 +7,7 @@ u. The other side is ``gfmhil bench answer``, or any controller of docs/own-cont
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import socket
 import subprocess
@@ -258,12 +259,17 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     return PingPong(caller.ping, nothing, caller.close, compiled, lambda: caller.sides)
 
 
+def _leave_real_time() -> None:
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def _started(c: Contender) -> Callable[[], None]:
-    """Start the controller of a contender; returns what ends it."""
+    """Start the controller of a contender on our processor, as the other side's spins; returns what
+    ends it."""
     with Path(c.options["log"]).open("wb") as log:
         process = subprocess.Popen(
             guarded(c.options["program"], bounded=True), stdout=log, stderr=log,
-            start_new_session=True, preexec_fn=restore_priority,
+            start_new_session=True, preexec_fn=_leave_real_time,
         )  # fmt: skip
 
     def close() -> None:
