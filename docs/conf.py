@@ -28,7 +28,7 @@ myst_heading_anchors = 3
 # The notebook and the gallery run while the pages are built, and an error in them ends the build.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120  # s a cell
+nb_execution_timeout = 900  # s a cell; a machine may be slow
 os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"  # of the kernels
 
 autodoc_typehints = "description"
