@@ -38,9 +38,14 @@ def page(going: Rig) -> Iterator[Browser]:
     """A page with the token and moving traces."""
     with Browser() as browser:
         browser.driver.get(going.control)
-        wait_for(lambda: browser.text("#state") in ("RUNNING", "SAFE"))
+        wait_for_state(browser)
         yield browser
         assert browser.complaints() == []
+
+
+def wait_for_state(page: Browser) -> None:
+    """Wait until the page shows the run, which ends in SAFE on a machine that stood still."""
+    wait_for(lambda: page.text("#state") in ("RUNNING", "SAFE"))
 
 
 def said(page: Browser, title: str) -> str:
@@ -214,7 +219,7 @@ def test_signals_can_be_chosen(page):
 def test_it_fits(going, width, height, dark):
     with Browser(width, height, dark=dark, phone=width < 500) as page:
         page.driver.get(going.control)
-        wait_for(lambda: page.text("#state") == "RUNNING")
+        wait_for_state(page)
         moves(page)
         assert page.js(FALLEN_OUT) == []
         ground: Any = page.js("return getComputedStyle(document.body).backgroundColor")
