@@ -1,12 +1,15 @@
 """The elements of Table II and their algebra.
 
 P ``k``, I ``1/(Ts)``, D ``Ts``, PI ``k(1+1/(Ts))``, PD ``k(1+Ts)``, IF ``k/(Ts+1)``,
-O ``k/(T^2 s^2+2T xi s+1)`` (note below Table II), and their sums and products.
+O ``k/(T^2 s^2+2T xi s+1)`` (note below Table II), and their sums and products; beside them any
+fraction ``TF`` and any state space ``SS`` of one input and output.
 
 An element is kept as a numerator polynomial over a *product of named factors*, not over an
 expanded polynomial: ``s``, ``T s+1`` and ``T^2 s^2+2T xi s+1``. Equal factors are then recognised
 exactly, which is what makes shared denominators share states (``gfm_runtime.realisation``) and
-cancelling ones disappear. Polynomials are tuples of coefficients in ascending powers of s.
+cancelling ones disappear. The denominator of a TF is one factor beside its integrators, so a TF
+with the numbers of a named element is that element. Polynomials are tuples of coefficients in
+ascending powers of s; those of a law file are in descending ones, as control programs have them.
 
 A coefficient is a number, or an array of N numbers: the same element N times. The first of the N
 then decides which factors are equal and which cancel. So one set of functions serves a law and a
@@ -36,7 +39,8 @@ if TYPE_CHECKING:
 else:
     Coefficient = float | NDArray[np.float64]  # shape (N,)
 Polynomial = tuple[Coefficient, ...]
-#: One factor of a denominator, as its polynomial: (0,1) is s, (1,T) is Ts+1, (1,2Txi,T^2) is O's.
+#: One factor of a denominator, as its polynomial: (0,1) is s, (1,T) is Ts+1, (1,2Txi,T^2) is O's,
+#: and that of a TF, whose constant coefficient is 1 too, may be longer.
 Factor = tuple[Coefficient, ...]
 
 INTEGRATOR: Factor = (0.0, 1.0)
@@ -44,7 +48,8 @@ _CANCELS = 1e-12  # relative remainder below which a factor divides a numerator
 # Least and most of an element's numbers: times (s), a damping ratio, gains. What is outside is a
 # typing error and would overflow.
 _TIME, _DAMPING, _GAIN = (1e-9, 1e9), (5e-324, 1e12), (-1e12, 1e12)
-_BOUNDS = {"T": _TIME, "T_f": _TIME, "xi": _DAMPING}
+_ANY = (-1e100, 1e100)  # a coefficient of an expanded polynomial
+_BOUNDS = {"T": _TIME, "T_f": _TIME, "xi": _DAMPING} | dict.fromkeys(("num", "den", *"ABC"), _ANY)
 #: by name in a law file: by the names of the numbers that it takes, the function
 KINDS: dict[str, dict[tuple[str, ...], Callable[..., Element]]] = {}
 
@@ -190,10 +195,11 @@ def element(kind: str) -> Callable[[Callable[..., Element]], Callable[..., Eleme
         def checked(*values: Coefficient, **named: Coefficient) -> Element:
             numbers = dict(zip(names, values, strict=False)) | named
             for name, value in numbers.items():
-                if np.ndim(value) == 0 and not usable({name: value}):
-                    low, high = _BOUNDS.get(name, _GAIN)
-                    allowed = "> 0" if low == _DAMPING[0] else f"from {low:g} to {high:g}"
-                    raise LawError(kind, f"{name} = {value:g} must be {allowed}")
+                low, high = _BOUNDS.get(name, _GAIN)
+                for one in _flat(value):
+                    if np.ndim(one) == 0 and not low <= one <= high:
+                        allowed = "> 0" if low == _DAMPING[0] else f"from {low:g} to {high:g}"
+                        raise LawError(kind, f"{name} = {one:g} must be {allowed}")
             return function(**numbers)
 
         KINDS.setdefault(kind, {})[names] = checked
@@ -202,13 +208,38 @@ def element(kind: str) -> Callable[[Callable[..., Element]], Callable[..., Eleme
     return register
 
 
-def usable(numbers: Mapping[str, Coefficient]) -> Any:
-    """Whether the numbers of an element lie within their bounds; of arrays, for each of the N."""
+def _flat(value: Any) -> list[Any]:
+    """The numbers of a polynomial or a matrix, or a number alone."""
+    return [c for part in value for c in _flat(part)] if isinstance(value, tuple) else [value]
+
+
+def usable(numbers: Mapping[str, Any]) -> Any:
+    """Whether the numbers of an element lie within their bounds, and a denominator is stable; of
+    arrays, for each of the N."""
     inside: Any = True
     for name, value in numbers.items():
         low, high = _BOUNDS.get(name, _GAIN)
-        inside &= (low <= value) & (value <= high)
+        for one in _flat(value):
+            inside = inside & (low <= one) & (one <= high)
+        if name == "den":
+            inside = inside & stable(_split(value)[1])
     return inside
+
+
+@np.errstate(all="ignore")  # what is not finite is not stable
+def stable(factor: Factor) -> Any:
+    """Whether all zeros of a polynomial have negative real parts; of arrays, for each of the N."""
+    c = np.stack(np.broadcast_arrays(*factor), axis=-1)
+    c = c / c[..., -1:]
+    good = np.isfinite(c).all(axis=-1) & (c > 0.0).all(axis=-1)  # enough up to the second degree
+    m = len(factor) - 1
+    if m > 2:
+        companion = np.zeros((*good.shape, m, m))
+        companion[..., :-1, 1:] = np.eye(m - 1)
+        companion[..., -1, :] = np.where(good[..., None], -c[..., :-1], 0.0)
+        zeros = np.linalg.eigvals(companion)
+        good = good & (zeros.real < -_CANCELS * np.abs(zeros)).all(axis=-1)
+    return good
 
 
 @element("P")
@@ -265,13 +296,113 @@ def O(k: Coefficient, T: Coefficient, xi: Coefficient) -> Element:  # noqa: E743
     return Element.of((k,), ((1.0, 2.0 * T * xi, T * T),))
 
 
+@element("TF")
+def TF(num: Polynomial, den: Polynomial) -> Element:
+    """Any fraction num(s)/den(s), coefficients in descending powers of s; stable, but for s."""
+    return _of_fraction("TF", num, den)
+
+
+def _of_fraction(kind: str, num: Polynomial, den: Polynomial) -> Element:
+    zeros, rest = _split(den)
+    if not len(rest):
+        raise LawError(kind, "den is 0")
+    if all(np.ndim(c) == 0 for c in rest) and not stable(rest):
+        pole = max(np.roots(rest[::-1]), key=lambda root: root.real)
+        real = pole.real if abs(pole.real) > _CANCELS * abs(pole) else 0.0
+        at = f"{complex(real, pole.imag):.3g}" if pole.imag else f"{real:.3g}"
+        raise LawError(kind, f"unstable: a pole at s = {at} rad/s")
+    unit = rest[0]  # its constant coefficient becomes 1, as the named factors have it
+    below = tuple(c / unit for c in rest)
+    factors = (INTEGRATOR,) * zeros + ((below,) if len(below) > 1 else ())
+    return Element.of(tuple(c / unit for c in num[::-1]), factors)
+
+
+def _split(den: Polynomial) -> tuple[int, Factor]:
+    """A denominator in descending powers: how often it has the factor s, and the rest in ascending
+    powers; the rest of 0 is ()."""
+    below = _trimmed(den[::-1])
+    zeros = 0
+    while zeros < len(below) and not np.any(below[zeros]):
+        zeros += 1
+    return zeros, below[zeros:]
+
+
+@element("TF")
+def TF_gain(k: Coefficient, num: Polynomial, den: Polynomial) -> Element:
+    """Any fraction times a gain, k num(s)/den(s)."""
+    return P(k) * TF(num, den)
+
+
+@element("SS")
+def SS(
+    A: tuple[tuple[float, ...], ...], B: tuple[float, ...], C: tuple[float, ...], D: float
+) -> Element:
+    """The state space dx/dt = A x + B e, u = C x + D e of one e and one u, A row by row."""
+    n = len(A)
+    if not all(len(part) == n for part in (*A, B, C)):
+        raise LawError("SS", f"A has {n} rows, so that each of them, B and C must have {n} numbers")
+    return _of_fraction("SS", *fraction(np.array(A).reshape(n, n), np.array(B), np.array(C), D))
+
+
 if TYPE_CHECKING:
     Kind = str
 else:
-    Kind = Literal[tuple(KINDS)]
+    Kind = Literal[(*KINDS, "sum")]
+
+_INTEGRATES = 1e-9  # rad/s; a pole below is rounding's, T being at most 1e9 s
 
 
-def make(where: str, kind: Kind, numbers: Mapping[str, Coefficient]) -> Element:
+def fraction(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], D: float
+) -> tuple[Polynomial, Polynomial]:
+    """num and den, in descending powers of s, of c (s - A)^-1 b + D; A (n,n), b and c (n,).
+
+    States that b does not reach or c does not see are left out first (Kalman).
+
+    Raises:
+        LawError: the poles are too far apart for polynomials in double precision.
+    """
+    A_c, c_c, b_c = _reached(A.T, c, b)  # what c sees
+    A_m, b_m, c_m = _reached(A_c.T, b_c, c_c)
+    poles = np.linalg.eigvals(A_m)
+    poles[np.abs(poles) < _INTEGRATES] = 0.0
+    zeros = np.linalg.eigvals(A_m - np.outer(b_m, c_m))  # of 1 more than it is without D
+    below, above = (np.atleast_1d(np.poly(roots)).real for roots in (poles, zeros))
+    above = above + (D - 1.0) * below
+    above[0] = D
+    x = b_m
+    for k in range(1, len(above)):  # the first Markov parameters are 0 where poles outnumber zeros
+        if above[:k].any() or abs(c_m @ x) > _CANCELS * np.linalg.norm(c_m) * np.linalg.norm(x):
+            break
+        above[k], x = 0.0, A_m @ x
+    for w in np.abs(poles[np.abs(poles) > 0.0]):
+        exact = c @ np.linalg.solve(1j * w * np.eye(len(A)) - A, b) + D
+        got = np.polyval(above, 1j * w) / np.polyval(below, 1j * w)
+        if abs(got - exact) > 1e-6 * abs(exact) + 1e-9 * abs(D):
+            raise LawError("SS", "its poles are too far apart for one element; split it")
+    return tuple(map(float, above)), tuple(map(float, below))
+
+
+def _reached(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """A, b and c in the states that b reaches, by Arnoldi's method."""
+    basis = np.zeros((len(A), 0))
+    v, size = b, float(np.linalg.norm(b))
+    while basis.shape[1] < len(A) and size > 0.0:
+        r = v
+        for _ in range(2):  # once more against rounding
+            r = r - basis @ (basis.T @ r)
+        norm = float(np.linalg.norm(r))
+        if norm <= 1e-11 * size:
+            break
+        basis = np.column_stack([basis, r / norm])
+        v = A @ basis[:, -1]
+        size = float(np.linalg.norm(v))
+    return basis.T @ A @ basis, basis.T @ b, basis.T @ c
+
+
+def make(where: str, kind: Kind, numbers: Mapping[str, Any]) -> Element:
     """An element by its kind and its numbers; ``T_f`` multiplies any kind by 1/(T_f s + 1).
 
     Raises:

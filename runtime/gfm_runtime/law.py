@@ -18,7 +18,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from gfm_runtime.counts import Counts
-from gfm_runtime.elements import INTEGRATOR, ZERO, Element
+from gfm_runtime.elements import INTEGRATOR, ZERO, Element, stable
 from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.inner import InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
@@ -160,8 +160,7 @@ def _check(where: str, element: Element) -> None:
             f"{element.order}; give a filter T_f to D or PD, or multiply by an IF",
         )
     for factor in element.den:
-        # of degree one or two: stable when, and only when, all its coefficients are positive
-        if factor != INTEGRATOR and not (len(factor) in (2, 3) and min(factor) > 0.0):
+        if factor != INTEGRATOR and not stable(factor):
             raise LawError(where, f"unstable factor {factor} (ascending powers of s)")
     if element.den.count(INTEGRATOR) > 1:
         raise LawError(where, "unstable: a double integrator 1/s^2")

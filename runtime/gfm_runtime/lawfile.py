@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -36,7 +36,12 @@ def _stage(value: Any) -> Any:
     return named_inner(value) if isinstance(value, str) else value
 
 
+_MOST = 48  # order of a cell before its rows are put together: longer ones only cost time
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+
+
+Polynomial = Annotated[list[Number], Field(min_length=1, max_length=13)]
+Vector = Annotated[list[float], Field(max_length=12)]
 
 
 class ElementSpec(TomlTable):
@@ -48,6 +53,19 @@ class ElementSpec(TomlTable):
     T: Number | None = Field(None, description="time constant, s")
     xi: Number | None = Field(None, description="damping ratio of O")
     T_f: Number | None = Field(None, description="s; multiplies by 1/(T_f s + 1)")
+    num: Polynomial | None = Field(
+        None, description="of TF: numerator, coefficients in descending powers of s"
+    )
+    den: Polynomial | None = Field(None, description="of TF: denominator, likewise")
+    A: Annotated[list[Vector], Field(max_length=12)] | None = Field(
+        None, description="of SS: n rows of n numbers, 1/s"
+    )
+    B: Vector | None = Field(None, description="of SS: n numbers")
+    C: Vector | None = Field(None, description="of SS: n numbers")
+    D: float | None = Field(None, description="of SS: a number")
+    terms: Annotated[list[Factors], Field(min_length=1, max_length=8)] | None = Field(
+        None, description="of sum: elements, or lists of them for products"
+    )
 
 
 # the factors of one cell; a single one may stand without its list
@@ -221,10 +239,43 @@ class LawFile(TomlTable):
     )
 
 
-def element_numbers(where: str, spec: ElementSpec, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The numbers of a factor by name, its expressions evaluated; the parameters may be arrays."""
-    given = spec.model_dump(exclude={"type"}, exclude_none=True)
-    return {name: evaluate(f"{where}.{name}", value, parameters) for name, value in given.items()}
+def element_of(
+    where: str, specs: Sequence[ElementSpec], parameters: Mapping[str, Any]
+) -> tuple[Element, Any]:
+    """The product of the factors of a cell, its expressions evaluated, and whether it is usable.
+
+    The parameters may be arrays of N numbers: the product holds N elements then, of which each is
+    usable or not.
+
+    Raises:
+        LawError: naming ``where``: an expression or an element is wrong.
+    """
+
+    def valued(name: str, value: Any) -> Any:
+        if isinstance(value, list):
+            return tuple(valued(name, one) for one in value)
+        return evaluate(f"{where}.{name}", value, parameters)
+
+    product, good = elements.P(1.0), True
+    for spec in specs:
+        own = spec.model_dump(exclude={"type", "terms"}, exclude_none=True)
+        if spec.type == "sum":
+            if own or spec.terms is None:
+                raise LawError(where, f"sum takes ['terms'] alone, not {sorted(own)}")
+            factor, fine = elements.ZERO, True
+            for term in spec.terms:
+                one, usable = element_of(where, term, parameters)
+                factor, fine = factor + one, fine & usable
+        elif spec.terms is not None:
+            raise LawError(where, f"terms belongs to sum, not to {spec.type}")
+        else:
+            numbers = {name: valued(name, value) for name, value in own.items()}
+            factor = elements.make(where, spec.type, numbers)
+            fine = elements.usable(numbers)
+        product, good = product * factor, good & fine
+        if product.order > _MOST:
+            raise LawError(where, f"its order is above {_MOST}; a whole law has at most 12 states")
+    return product, good
 
 
 def _cells(
@@ -239,12 +290,7 @@ def _cells(
             if len(key) != 2 or key[0] not in "123" or key[1] not in "12345":
                 raise LawError(f"{matrix}.{key}", "a cell is row 1..3 and column 1..5, e.g. 22")
             cell = (int(key[0]) - 1, int(key[1]) - 1)
-            product = elements.P(1.0)
-            for factor in spec:
-                where = cell_name(matrix, cell)
-                own = element_numbers(where, factor, numbers)
-                product = product * elements.make(where, factor.type, own)
-            cells[cell] = product
+            cells[cell], _ = element_of(cell_name(matrix, cell), spec, numbers)
     return cells
 
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from gfm_design.model.linear import LinearLaw, closed_law, error_map_slopes, linearise_law
 from gfm_design.model.operating_point import OperatingPoint
-from gfm_runtime.elements import ZERO, Element, P, make, usable
+from gfm_runtime.elements import ZERO, Element
 from gfm_runtime.errors import LawError
 from gfm_runtime.expressions import evaluate
-from gfm_runtime.lawfile import LawFile, build_law, element_numbers, tied
+from gfm_runtime.lawfile import LawFile, build_law, element_of, tied
 from gfm_runtime.realisation import LawStateSpace, assemble, realise, row_of
 from gfm_runtime.signals import NU, NY, U_NAMES
 
@@ -230,12 +230,8 @@ def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
     cells: dict[str, dict[str, Element]] = {"phi": {}, "psi": {}}
     for matrix, of in (("phi", file.phi), ("psi", file.psi)):
         for key, specs in of.items():
-            product = P(1.0)
-            for spec in specs:
-                own = element_numbers(f"{matrix}_{key}", spec, numbers)
-                good &= usable(own)
-                product = product * make(f"{matrix}_{key}", spec.type, own)
-            cells[matrix][key] = product
+            cells[matrix][key], fine = element_of(f"{matrix}_{key}", specs, numbers)
+            good &= fine
     rows = []
     for i in range(NU):
         phi, psi = ([of.get(f"{i + 1}{j + 1}", ZERO) for j in range(NY)] for of in cells.values())
