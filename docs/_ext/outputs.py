@@ -54,6 +54,10 @@ MISTAKES = (
     ("limits that do not ascend", "i_u = [-5.0, 5.0]", "i_u = [5.0, -5.0]"),
     ("a double integrator", '35 = { type = "PI", k = "k_v", T = "T_v" }',
      '35 = [{ type = "PI", k = "k_v", T = "T_v" }, { type = "I", T = 1.0 }]'),
+    ("a fraction that is unstable", '{ type = "P", k = "k_23" }',
+     '{ type = "TF", num = [1.0], den = [1.0, -2.0] }'),
+    ("a fraction with more zeros than poles", '{ type = "P", k = "k_23" }',
+     '{ type = "TF", num = [1.0, 0.0, 0.0], den = [0.1, 1.0] }'),
     ("an ω_u loop of gain one or more", "value = 0.25", "value = -1.25"),
 )  # fmt: skip
 

@@ -105,6 +105,26 @@ def _trimmed(polynomial: Sequence[Coefficient]) -> Polynomial:
     return tuple(polynomial[:size])
 
 
+def _text(polynomial: tuple[float, ...]) -> str:
+    """A polynomial with the highest power first, e.g. ``0.1 s² - s + 3``."""
+    text = ""
+    for power, c in reversed([*enumerate(polynomial)]):
+        if c != 0.0 or (not power and not text):
+            s = "" if power == 0 else "s" if power == 1 else "s" + _digits(power)
+            number = "" if s and abs(c) == 1.0 else f"{abs(c):.4g}"
+            sign = (" - " if c < 0.0 else " + ") if text else "-" if c < 0.0 else ""
+            text += sign + " ".join(part for part in (number, s) if part)
+    return text
+
+
+def _digits(power: int) -> str:
+    return str(power).translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def _bracketed(text: str) -> str:
+    return f"({text})" if " " in text else text
+
+
 @dataclass(frozen=True)
 class Element:
     """A scalar transfer function num(s) / prod(den)."""
@@ -141,6 +161,16 @@ class Element:
     def is_proper(self) -> bool:
         """Degree of the numerator does not exceed the denominator's."""
         return len(self.num) - 1 <= self.order
+
+    def __str__(self) -> str:
+        """Its formula with four digits, e.g. ``0.01/(0.167 s + 1)``."""
+        above = _text(first(self.num))
+        parts = [_text(first(factor)) for factor in self.den]
+        if not parts:
+            return above
+        below = parts[0] if len(parts) == 1 else " ".join(_bracketed(part) for part in parts)
+        above = _bracketed(above) if len([*filter(None, first(self.num))]) > 1 else above
+        return f"{above}/{_bracketed(below)}"
 
     def __mul__(self, other: Element) -> Element:
         return Element.of(poly_mul(self.num, other.num), self.den + other.den)
@@ -299,18 +329,11 @@ def O(k: Coefficient, T: Coefficient, xi: Coefficient) -> Element:  # noqa: E743
 @element("TF")
 def TF(num: Polynomial, den: Polynomial) -> Element:
     """Any fraction num(s)/den(s), coefficients in descending powers of s; stable, but for s."""
-    return _of_fraction("TF", num, den)
-
-
-def _of_fraction(kind: str, num: Polynomial, den: Polynomial) -> Element:
     zeros, rest = _split(den)
     if not len(rest):
-        raise LawError(kind, "den is 0")
+        raise LawError("TF", "den is 0")
     if all(np.ndim(c) == 0 for c in rest) and not stable(rest):
-        pole = max(np.roots(rest[::-1]), key=lambda root: root.real)
-        real = pole.real if abs(pole.real) > _CANCELS * abs(pole) else 0.0
-        at = f"{complex(real, pole.imag):.3g}" if pole.imag else f"{real:.3g}"
-        raise LawError(kind, f"unstable: a pole at s = {at} rad/s")
+        _refuse_unstable("TF", max(np.roots(rest[::-1]), key=lambda root: root.real), False)
     unit = rest[0]  # its constant coefficient becomes 1, as the named factors have it
     below = tuple(c / unit for c in rest)
     factors = (INTEGRATOR,) * zeros + ((below,) if len(below) > 1 else ())
@@ -341,7 +364,9 @@ def SS(
     n = len(A)
     if not all(len(part) == n for part in (*A, B, C)):
         raise LawError("SS", f"A has {n} rows, so that each of them, B and C must have {n} numbers")
-    return _of_fraction("SS", *fraction(np.array(A).reshape(n, n), np.array(B), np.array(C), D))
+    parts = (np.array(part, dtype=float) for part in (A, B, C, D))
+    shapes = ((n, n), (n, 1), (1, n), (1, 1))
+    return transfer(*(m.reshape(shape) for m, shape in zip(parts, shapes, strict=True)))[0][0]
 
 
 if TYPE_CHECKING:
@@ -349,43 +374,90 @@ if TYPE_CHECKING:
 else:
     Kind = Literal[(*KINDS, "sum")]
 
+Matrix = NDArray[np.float64]
 _INTEGRATES = 1e-9  # rad/s; a pole below is rounding's, T being at most 1e9 s
+_SAME_POLE = 1e-7  # relative distance of a pole of a cell from one of A: a double one moves by 1e-8
 
 
-def fraction(
-    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], D: float
-) -> tuple[Polynomial, Polynomial]:
-    """num and den, in descending powers of s, of c (s - A)^-1 b + D; A (n,n), b and c (n,).
+def transfer(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> list[list[Element]]:
+    """The elements of C (s - A)^-1 B + D, in lowest terms; equal poles are equal factors.
 
-    States that b does not reach or c does not see are left out first (Kalman).
+    Shapes: A (n,n), B (n,m), C (p,n), D (p,m); p rows of m elements.
 
     Raises:
-        LawError: the poles are too far apart for polynomials in double precision.
+        LawError: unstable, or the poles are too far apart for polynomials in double precision.
     """
-    A_c, c_c, b_c = _reached(A.T, c, b)  # what c sees
-    A_m, b_m, c_m = _reached(A_c.T, b_c, c_c)
-    poles = np.linalg.eigvals(A_m)
+    known = _poles(A)
+    return [
+        [_cell(A, B, j, C[i], float(D[i, j]), known) for j in range(B.shape[1])]
+        for i in range(len(C))
+    ]
+
+
+def _poles(A: Matrix) -> NDArray[np.complex128]:
+    poles = np.linalg.eigvals(A).astype(complex)
     poles[np.abs(poles) < _INTEGRATES] = 0.0
-    zeros = np.linalg.eigvals(A_m - np.outer(b_m, c_m))  # of 1 more than it is without D
-    below, above = (np.atleast_1d(np.poly(roots)).real for roots in (poles, zeros))
+    return poles
+
+
+def _cell(
+    A: Matrix, B: Matrix, j: int, c: Matrix, D: float, known: NDArray[np.complex128]
+) -> Element:
+    """The element of column j; states that it does not reach or c does not see are left out
+    (Kalman)."""
+    A_c, c_c, b_c = _reached(A.T, c, B[:, j])
+    A_m, b_m, c_m = _reached(A_c.T, b_c, c_c)
+    poles = _poles(A_m)
+    free = list(known)
+    for k, pole in enumerate(poles):
+        near = min(free, key=lambda other: abs(other - pole))
+        if abs(near - pole) <= _SAME_POLE * abs(pole):
+            free.remove(near)
+            poles[k] = near
+    for pole in poles:
+        _refuse_unstable("SS", pole, pole == 0.0)
+    below, above = (
+        np.atleast_1d(np.poly(roots)).real
+        for roots in (poles, np.linalg.eigvals(A_m - np.outer(b_m, c_m)))  # for 1 in place of D
+    )
     above = above + (D - 1.0) * below
-    above[0] = D
     x = b_m
+    above[0] = D
     for k in range(1, len(above)):  # the first Markov parameters are 0 where poles outnumber zeros
         if above[:k].any() or abs(c_m @ x) > _CANCELS * np.linalg.norm(c_m) * np.linalg.norm(x):
             break
         above[k], x = 0.0, A_m @ x
-    for w in np.abs(poles[np.abs(poles) > 0.0]):
-        exact = c @ np.linalg.solve(1j * w * np.eye(len(A)) - A, b) + D
-        got = np.polyval(above, 1j * w) / np.polyval(below, 1j * w)
-        if abs(got - exact) > 1e-6 * abs(exact) + 1e-9 * abs(D):
+    above = above / np.prod([-pole for pole in poles if pole != 0.0]).real
+    factors = tuple(_factor(pole) for pole in poles if pole.imag >= 0.0)
+    made = Element.of(tuple(map(float, above[::-1])), factors)
+    size = 0.0  # beside what rounding leaves of B and C as a whole
+    for w in np.abs(poles[poles != 0.0]) if poles.any() else [1.0]:
+        X = np.linalg.solve(1j * w * np.eye(len(A)) - A, B)
+        exact, got = c @ X[:, j] + D, made(1j * w)
+        rounding = _CANCELS * np.linalg.norm(c) * np.linalg.norm(X)
+        if abs(got - exact) > 1e-6 * abs(exact) + 1e-9 * abs(D) + rounding:
             raise LawError("SS", "its poles are too far apart for one element; split it")
-    return tuple(map(float, above)), tuple(map(float, below))
+        size = max(size, float(abs(got) - rounding))
+    return made if size > 0.0 else ZERO
 
 
-def _reached(
-    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _factor(pole: complex) -> Factor:
+    """The factor of a real pole, or of a pair of complex ones."""
+    if pole == 0.0:
+        return INTEGRATOR
+    size = abs(pole) ** 2
+    return (1.0, -2.0 * pole.real / size, 1.0 / size) if pole.imag else (1.0, -1.0 / pole.real)
+
+
+def _refuse_unstable(kind: str, pole: complex, fine: Any) -> None:
+    """Raise LawError unless ``fine`` or the pole, rad/s, has a negative real part."""
+    real = pole.real if abs(pole.real) > _CANCELS * abs(pole) else 0.0
+    if not fine and real >= 0.0:
+        at = f"{complex(real, abs(pole.imag)):.3g}" if pole.imag else f"{real:.3g}"
+        raise LawError(kind, f"unstable: a pole at s = {at} rad/s")
+
+
+def _reached(A: Matrix, b: Matrix, c: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     """A, b and c in the states that b reaches, by Arnoldi's method."""
     basis = np.zeros((len(A), 0))
     v, size = b, float(np.linalg.norm(b))

@@ -51,8 +51,27 @@ def test_example_scenario_completes(example_run):
     assert example_run.summary["status"] == "completed"
 
 
+def programs(page: str) -> list[str]:
+    """The blocks of Python on a page."""
+    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)
+
+
+@pytest.mark.full
+def test_a_law_of_python_control_goes_to_c_in_ten_lines(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _, ten, matrix = programs("laws.md")
+    names = {"gfmhil": gfmhil}
+    exec(ten, names)
+    assert names["run"].status == "completed"
+    assert max(names["poles"].real) < 0
+    assert names["tuned"].gains != names["law"].gains
+    assert names["verdicts"].passed and len(names["verdicts"].matrix) == 4
+    assert "gfm_tuned_step" in (tmp_path / "firmware" / "gfm_tuned.c").read_text()
+    exec(matrix, names)
+
+
 def test_modes_of_the_example_law_are_looked_at_as_the_page_says(capsys, monkeypatch):
-    (program,) = re.findall(r"```python\n(.*?)```", (DOCS / "laws.md").read_text("utf-8"), re.S)
+    program = programs("laws.md")[0]
     monkeypatch.chdir(DOCS.parent)
     exec(program, {})
     rates = [float(line.split()[0]) for line in capsys.readouterr().out.splitlines()]

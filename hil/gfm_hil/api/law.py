@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gfm_hil.api.lti import cells_of, content_of, read_matrix
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
@@ -110,6 +112,42 @@ class Law:
         made = cls(parse_law(text))
         made.built()
         return made
+
+    @classmethod
+    def from_matrix(
+        cls, cells: Sequence[Sequence[Any]], name: str = "from-matrix", **tables: Any
+    ) -> Law:
+        """A law from Phi(s) cell by cell, p.u. and rad/s.
+
+        Args:
+            cells: 3 rows (i_u, omega_u, E_u) of 5 (v_dc, p, omega_u, q, V), each 0, a number,
+                ``(num, den)`` in descending powers of s, a system of SciPy or python-control with
+                one input and output, or an element as in a law file. Each of the first kinds gets
+                a gain ``k_ij`` that a synthesis may move from a tenth to ten times its value.
+            name: of the law.
+            tables: other keys of a law file, e.g. ``title`` or ``u_0={"i_u": "P_ref"}``.
+
+        Raises:
+            UserError: another shape, or a cell that is none of these.
+            LawError: a cell that is improper, unstable or integrates twice, and as ``load``.
+        """
+        about = {"name": name, "title": "a matrix of transfer functions", "source": "from_matrix"}
+        return cls.from_toml(toml_text({**about, **tables, **read_matrix(cells)}))
+
+    @classmethod
+    def from_control(cls, system: Any, name: str = "from-control", **tables: Any) -> Law:
+        """A law from Phi(s) as a system of python-control or SciPy, p.u. and rad/s.
+
+        Args:
+            system: continuous, transfer function or state space, 3 outputs and 5 inputs.
+            name, tables: as for ``from_matrix``, which also says what the gains are.
+
+        Raises:
+            UserError: it is no such system.
+            LawError: as ``from_matrix``.
+        """
+        about = {"name": name, "title": "a linear system", "source": "from_control"}
+        return cls.from_toml(toml_text({**about, **tables, **content_of(cells_of(system))}))
 
     @property
     def name(self) -> str:
@@ -266,6 +304,36 @@ class Law:
         if inner is None:
             return self.file
         return self.file.model_copy(update={"inner": named_inner(inner)})
+
+    def to_c(
+        self, folder: str | Path, T_s: float = 1e-4, real: str = "float32", f_n: float = 50.0
+    ) -> Path:
+        """Write this law as C99 with golden vectors and a self-test, as ``gfmhil firmware export``
+        does; returns the folder.
+
+        Args:
+            folder: new, or an empty one.
+            T_s: sampling time, s.
+            real: ``float32`` or ``float64``.
+            f_n: rated frequency of the converter, Hz, for an inner stage.
+
+        Raises:
+            UserError: the folder is not empty or cannot be written.
+            LawError: the law cannot be discretised at T_s, or a number overflows ``real``.
+        """
+        from gfm_runtime.firmware import export
+
+        folder = Path(folder)
+        check_empty(folder)
+        omega_b = 2 * math.pi * f_n
+        files = export({self.name: self.built()}, T_s, real, "unrolled", omega_b)
+        try:
+            for file, text in files.items():
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                write_text(folder / file, text)
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
+        return folder
 
     def to_toml(self) -> str:
         """The text of its law file."""

@@ -1,11 +1,10 @@
-"""gfmhil laws: the catalogue, the inner stages, and one law with its matrices."""
+"""gfmhil laws: the catalogue, the inner stages, and one law with its transfer functions."""
 
 import argparse
 import inspect
 import json
 from typing import Any
 
-import numpy as np
 from rich.markup import escape
 
 from gfm_hil.api.law import cell_text
@@ -38,10 +37,12 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--grid", action="store_true", help="those for grid codes, with a droop of 5 %%"
     )
-    show = command.add_subparsers(metavar="show").add_parser("show", help="one law, with matrices")
+    show = command.add_subparsers(metavar="show").add_parser(
+        "show", help="one law, with its transfer functions"
+    )
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
-    show.add_argument("--json", action="store_true", help="as JSON")
+    show.add_argument("--json", action="store_true", help="as JSON, with discrete matrices")
     show.set_defaults(call=call_show)
 
 
@@ -111,15 +112,11 @@ def call_show(options: argparse.Namespace) -> int:
         keys = ", ".join(f"{k} = {_value(v)}" for k, v in acting(first.inner).items())
         console.print(f"inner stage: {first.inner.kind} ({keys})")
     for k, d in enumerate(discrete):
-        stage = f", stage {k}" if len(discrete) > 1 else ""
-        console.print(f"[bold]discrete, T_s = {d.T_s:g} s{stage}[/]: {d.order} states")
-        for name in MATRICES:
-            matrix = getattr(d, name)
-            if matrix.size:
-                text = np.array2string(
-                    matrix, precision=8, suppress_small=False, max_line_width=120
-                )
-                console.print(f"{name} =\n{text}".replace("[", "\\["))
+        stage = f"stage {k}, " if len(discrete) > 1 else ""
+        console.print(f"[bold]{stage}{d.order} states[/] at T_s = {d.T_s:g} s")
+        for sign, cells in (("φ", d.law.phi), ("ψ", d.law.psi)):
+            for (i, j), element in sorted(cells.items()):
+                console.print(f"{sign}{i + 1}{j + 1} = {element}", soft_wrap=True)
     return 0
 
 

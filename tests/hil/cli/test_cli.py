@@ -87,11 +87,15 @@ def test_laws_as_json_is_a_list_of_objects_with_names(call):
     assert by_name["droop-5"]["elements"]["22"] == "P{IF×D}"
 
 
-def test_a_law_shows_its_matrix_its_source_and_the_discrete_matrices(call):
+def test_a_law_shows_its_matrix_its_source_and_its_transfer_functions(call):
     code, out, _ = call("laws", "show", "vsg-5")
     assert code == 0
-    for part in ("Φ(s)", "omega_u  0     IF  IF       0   0", "Table II", "A =", "B_r =", "D_y ="):
+    for part in ("Φ(s)", "omega_u  0     IF  IF       0   0", "Table II", "3 states"):
         assert part in out
+    for line in ("φ11 = (90 s + 400)/s", "φ22 = 0.01/(0.1672 s + 1)", "φ35 = (0.02 s + 38.1)/s"):
+        assert line in out.splitlines()
+    shown = call("laws", "show", str(Path(__file__).parents[3] / "docs/examples/my-law.toml"))[1]
+    assert "ψ22 = 0.001 s/((0.05 s + 1) (0.17 s + 1))" in shown.splitlines()
     code, out, _ = call("laws", "show", "vsg-5", "--json", "--T_s", "2e-4")
     law = json.loads(out)
     assert (code, law["name"], law["order"]) == (0, "vsg-5", 3)
