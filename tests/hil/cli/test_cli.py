@@ -110,6 +110,22 @@ def test_a_law_shows_its_matrix_its_source_and_its_transfer_functions(call):
     }  # fmt: skip
 
 
+def test_a_start_file_runs_is_stable_and_is_never_overwritten(call, here):
+    assert call("new", "law", "mine")[:2] == (0, "mine.toml\n")
+    assert call("new", "scenario", "sag.toml")[:2] == (0, "sag.toml\n")
+    assert gfmhil.Law.load("mine.toml").name == "mine"
+    assert max(gfmhil.Law.load("mine.toml").closed_loop("sag.toml").poles().real) < 0
+    assert gfmhil.design.tune("mine.toml", starts=1, evaluations=20).law.name == "mine-tuned"
+    for law in ("vsg-2", "mine.toml"):
+        assert gfmhil.run("sag.toml", law).status == "completed"
+    before = Path("mine.toml").read_bytes()
+    assert call("new", "law", "mine")[::2] == (
+        2, "gfmhil: mine.toml: is there already; choose another name\n"
+    )  # fmt: skip
+    assert Path("mine.toml").read_bytes() == before
+    assert call("new", "law", "../Mine")[0] == 2 and not list(here.parent.glob("*.toml"))
+
+
 def test_a_scheduled_law_shows_each_stage(call):
     assert len(json.loads(call("laws", "show", "mimo-gfm-scheduled", "--json")[1])["discrete"]) > 1
     assert "stage 1" in call("laws", "show", "mimo-gfm-scheduled")[1]
