@@ -124,9 +124,10 @@ def conform(
         found = execute(jobs, workers, watch)
         digests = {name: laws_digest([file], inner) for name, file in files.items()}
         own = under_test_file(converter)
+        droops = {job.law: job.under.droop for job in jobs}
         hashes = file_hashes(files, inner, own, under.plant.converter, cases, external)
     names = [*files, *([external.name] if external else [])]
-    made = Conformity(names, inner, under, cases, found, place, hashes, digests)
+    made = Conformity(names, inner, under, cases, found, place, hashes, digests, droops)
     if place is not None:
         made.write(place, watch.notice)
     return made

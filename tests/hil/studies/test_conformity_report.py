@@ -89,7 +89,7 @@ def test_the_first_page_says_what_was_judged_and_has_room_to_sign(report):
     for words in (
         "droop-3",
         "gfmhil 0.1.0",
-        "droop of the law itself",
+        "droop 1 %, that of the law itself; power -1 to 1 p.u.",
         "ours; no source gives it 1 0",
         "all 1 0",
     ):

@@ -1,5 +1,5 @@
 "use strict";
-// Draws the plots of a page with uPlot when they come into view. Drag to zoom in on a time, in all
+// Draws the plots of a page with uPlot when they come into view or are printed. Drag to zoom in on a time, in all
 // plots of the run; double-click to see all of it again.
 (async () => {
   const read = (id) => document.getElementById(id).textContent;
@@ -7,7 +7,7 @@
   const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const view = new DataView(await new Response(plain).arrayBuffer());
   const plots = JSON.parse(read("plots"));
-  const COLOURS = ["#c9d6e2", "#0072B2"], LEVELS = 4094, NO_VALUE = 0xffff;
+  const COLOURS = ["#c9d6e2", "#0072B2"], LEVELS = 4094, NO_VALUE = 0xffff, HEIGHT = 190;
 
   const curve = (first, count, low, high) => {
     const found = new Array(count);
@@ -79,9 +79,9 @@
     };
     const isMeasured = (label) => of.log[0] && label === "measured";
     const axis = (more) => ({ stroke: "#666", grid: { stroke: "#8884", width: 1 }, ...more });
-    new uPlot({
+    return new uPlot({
       width: place.clientWidth,
-      height: 190,
+      height: HEIGHT,
       scales: {
         x: { time: false, distr: of.log[0] ? 3 : 1, min: of.ends[0], max: of.ends[1] },
         y: { distr: of.log[1] ? 3 : 1, range },
@@ -106,13 +106,17 @@
     }, data, place);
   };
 
+  const rest = new Set(document.querySelectorAll(".plot")), drawn = [];
+  const show = (place) => rest.delete(place) && drawn.push([place, draw(place)]);
   const seen = new IntersectionObserver((found) => {
-    for (const { isIntersecting, target } of found) {
-      if (isIntersecting) {
-        seen.unobserve(target);
-        draw(target);
-      }
-    }
+    for (const { isIntersecting, target } of found) if (isIntersecting) show(target);
   }, { rootMargin: "600px" });
-  document.querySelectorAll(".plot").forEach((place) => seen.observe(place));
+  rest.forEach((place) => seen.observe(place));
+  addEventListener("beforeprint", () => {
+    rest.forEach(show);
+    drawn.forEach(([, plot]) => plot.setSize({ width: 440, height: HEIGHT }));  // two in a row
+  });
+  addEventListener("afterprint", () => {
+    drawn.forEach(([place, plot]) => plot.setSize({ width: place.clientWidth, height: HEIGHT }));
+  });
 })();

@@ -69,18 +69,13 @@ class _Content:
         """The whole report."""
         from reportlab.platypus import PageBreak
 
-        from gfm_hil.studies.conformity.result import HEADS, row, saturation, tally
+        from gfm_hil.studies.conformity.result import HEADS, explained, row, saturation, tally
 
         self._head(0, f"{title}: {found.verdict_of(law)}")
         self._table([[name, text] for name, text in found.about(law)], [0.2, 0.8], head=False)
         counts = tally(found, law)
         self._table(counts, [0.3, *[0.7 / (len(counts[0]) - 1)] * (len(counts[0]) - 1)])
-        self._paragraph(
-            f"Clauses, each as often as it is judged. {found.saturated(law)} of them are judged "
-            "while a limiter of the controller acts; the tables name it, with the part of the "
-            "window in which it does. These verdicts are about this model, not about a product; "
-            "check each limit against the source before you rely on it."
-        )
+        self._paragraph(explained(found, law))
         self._signature()
         rows = [
             [found.matrix[law, c.id], f"{c.id}: {c.test.title}", c.test.source.words()]
@@ -103,7 +98,7 @@ class _Content:
                     said = v.verdict + (f" (limiter: {limits})" if limits else "")
                     lines.append([str(number), said, *row(v)])
                 if part.verdicts:
-                    widths = [0.03, 0.09, 0.16, 0.06, 0.08, 0.1, 0.13, 0.19, 0.16]
+                    widths = [0.03, 0.09, 0.14, 0.06, 0.07, 0.1, 0.12, 0.17, 0.14, 0.08]
                     self._table(lines, widths)
                 else:
                     self._paragraph(part.reason)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import re
 from collections import Counter
@@ -63,6 +64,7 @@ class Conformity:
             and the tests'.
         digests: by law, the digest of all that its file, the file's bases and the inner stage say,
             which the two sides of a link compare as well.
+        droops: by law, the droop that its clauses ask for, p.u./p.u.; inf: none.
     """
 
     laws: list[str]
@@ -73,6 +75,7 @@ class Conformity:
     folder: Path | None = None
     hashes: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
+    droops: dict[str, float | None] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -166,12 +169,15 @@ class Conformity:
         """What a first page says of a law, or of all, and of the tests, line by line."""
         under = self.under
         own = [] if law is None else [("law", law), ("digest", self.digests.get(law, "–"))]
-        droop = "of the law itself" if under.droop is None else f"{100 * under.droop:g} %"
+        droop = self.droops.get(law or "", under.droop)
+        words = "" if droop is None else "none" if droop == math.inf else f"{100 * droop:.3g} %"
+        if under.droop is None:
+            words = ", ".join(filter(None, [words, "that of the law itself"]))
         return [
             *own,
             ("inner stage", "the law's own" if self.inner is None else self.inner),
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
-            ("declared", f"droop {droop}, power {under.P_min:g} to {under.P_max:g} p.u."),
+            ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),
             ("machine", self.machine),
             ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
@@ -246,6 +252,7 @@ class Conformity:
             template, title=title, found=self, law=law, slug=slug, known=KNOWN, signs=SIGNS,
             row=row, heads=HEADS, saturation=saturation, curves=curves, script=plot_script(),
             tally=None if law is None else tally(self, law),
+            explained=None if law is None else explained(self, law),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -254,17 +261,26 @@ class Conformity:
         return "\n".join([f"<Conformity of {', '.join(self.laws)}: {told}", *self.failures, ">"])
 
 
+#: of the verdicts that are neither pass nor fail, for who signs
+_MEANINGS: dict[str, str] = {
+    CANNOT: "Cannot judge: there is no run, or it ended before the window did; this is no pass.",
+    LIMITED: "Limited: the declared droop asks for more than the declared power, so that the "
+    "clause judges the limit of power and not the droop.",
+    CONSISTENT: "Consistent with itself: the limit is made of what was measured on this converter, "
+    "as its owner declares nothing; this is no pass.",
+    INFORMATIVE: "Informative: measured but judged by no limit; it counts for nothing.",
+}
 #: of the table of a part, after number and verdict
-HEADS = ("clause", "signal", "window [s]", "measured", "limit", "in words", "source")
+HEADS = ("clause", "signal", "window [s]", "measured", "limit", "in words", "source", "known")
 
 
 def row(v: Verdict) -> list[str]:
     """What a report says of a clause, under ``HEADS``."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    source = f"{v.source}; {KNOWN[v.known]}" if v.known else "–"
     signal = printed(v.signal) or "–"
-    return [v.clause, signal, window, measured, v.limit or "–", v.text, source]
+    known = KNOWN.get(v.known, "–")
+    return [v.clause, signal, window, measured, v.limit or "–", v.text, v.source or "–", known]
 
 
 def saturation(v: Verdict) -> str:
@@ -272,6 +288,21 @@ def saturation(v: Verdict) -> str:
     return ", ".join(
         f"{name} {100 * part:.0f} %" if part >= 0.01 else f"{name} under 1 %"
         for name, part in v.saturated.items()
+    )
+
+
+def explained(found: Conformity, law: str) -> str:
+    """What the table of counts of the first page means."""
+    counts = Counter[str]()
+    for of in found.counts(law).values():
+        counts.update(of)
+    terms = " ".join(text for verdict, text in _MEANINGS.items() if counts[verdict])
+    return (
+        f"Clauses, each as often as it is judged. {found.saturated(law)} of them are judged while "
+        "a limiter of the controller acts: the tables mark them with the limiter and the part of "
+        f"the window in which it does. {terms} A test, and the law, has the first that it has of "
+        "fail, cannot judge, limited, consistent with itself, pass. These verdicts are about this "
+        "model, not about a product; check each limit against the source before you rely on it."
     )
 
 

@@ -34,6 +34,11 @@ Vector = NDArray[np.float64]
 
 _NEARLY_DC = 1e-9j  # rad/s
 _OTHER_ERRORS = ("hybrid-angle",)  # error maps whose second error is an angle, not that of p
+#: what a plant's keys are called on a first page, if not as in the file
+_NAMES = {
+    "lcl": "transformer [p.u.]", "i_peak": "peak-current limit [p.u.]", "adc": "A/D", "dac": "D/A",
+    "dc_source": "DC source",
+}  # fmt: skip
 _ROUNDING = 1e-9  # p.u., s or Hz; the plant is solved to it
 
 
@@ -92,7 +97,8 @@ class UnderTest(StrictSchema):
     @property
     def instruments(self) -> str:
         """What its file says of the plant besides the converter, in words."""
-        words = ", ".join(sorted(self.plant.model_fields_set - {"converter"}))
+        told = self.plant.model_dump(exclude_unset=True, exclude={"converter"}, exclude_none=True)
+        words = ", ".join(f"{_NAMES.get(name, name)} {_plain(x)}" for name, x in told.items())
         return words or "an ideal plant: its file gives no delay, modulation, limit or protection"
 
 
@@ -158,7 +164,7 @@ class Clause(StrictSchema):
 
 
 def _plain(x: object) -> str:
-    """A value of a test file as one line."""
+    """A value of a file as one line."""
     if isinstance(x, StrictSchema):
         return _plain(x.model_dump(exclude_none=True))
     if isinstance(x, dict):

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from gfm_hil.recording.columns import printed
 from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.studies.conformity.criteria.base import Clause, Moment
 from gfm_hil.studies.conformity.verdict import Verdict
@@ -20,17 +21,19 @@ class NoOscillation(Clause):
     whole_run: ClassVar[bool] = True
 
     def judge(self, m: Moment) -> Verdict:
-        """The value is the largest ripple, p.u. peak to peak."""
+        """The value is the largest ripple, p.u. peak to peak, to four decimals."""
         scenario = m.run.scenario.model_copy(update={"expect_ripple": self.ripple})
         ripple = remaining_ripple(scenario, m.run.columns, m.run.events, m.run.ticks)
         if ripple is None:
             return m.cannot("the run is at rest for less than 0.2 s at its end")
         name = ripple.oscillates or max(ripple.pu, key=lambda n: ripple.pu[n])
-        text = f"At the end {name} moves by {ripple.pu[name]:.2g} p.u. peak to peak at most."
+        size = round(ripple.pu[name], 4)
+        moves = f"{size:.2g}" if size else "less than 0.0001"
+        text = f"At the end {printed(name)} moves by {moves} p.u. peak to peak at most."
         if ripple.oscillates:
             text = ripple.words()[0].upper() + ripple.words()[1:] + "."
         limit = f"at most {ripple.limit:g} p.u."
-        return m.says(not ripple.oscillates, ripple.pu[name], "p.u.", limit, text, name)
+        return m.says(not ripple.oscillates, size, "p.u.", limit, text, name)
 
 
 CRITERION = NoOscillation
