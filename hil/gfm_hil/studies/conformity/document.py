@@ -98,7 +98,7 @@ class _Content:
                     said = v.verdict + (f" (limiter: {limits})" if limits else "")
                     lines.append([str(number), said, *row(v)])
                 if part.verdicts:
-                    widths = [0.03, 0.09, 0.14, 0.06, 0.07, 0.1, 0.12, 0.17, 0.14, 0.08]
+                    widths = [0.02, 0.08, 0.13, 0.06, 0.08, 0.09, 0.11, 0.16, 0.17, 0.1]
                     self._table(lines, widths)
                 else:
                     self._paragraph(part.reason)

@@ -98,8 +98,10 @@ class UnderTest(StrictSchema):
     def instruments(self) -> str:
         """What its file says of the plant besides the converter, in words."""
         told = self.plant.model_dump(exclude_unset=True, exclude={"converter"}, exclude_none=True)
-        words = ", ".join(f"{_NAMES.get(name, name)} {_plain(x)}" for name, x in told.items())
-        return words or "an ideal plant: its file gives no delay, modulation, limit or protection"
+        words = {_NAMES.get(name, name): _plain(x).strip("{}") for name, x in told.items()}
+        if not words:
+            return "an ideal plant: its file gives no delay, modulation, limit or protection"
+        return "; ".join(map(": ".join, words.items()))
 
 
 def own_droop(law: BuiltLaw) -> float:
