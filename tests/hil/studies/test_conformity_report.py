@@ -250,3 +250,15 @@ def test_the_figures_are_drawn_in_a_browser(report, browser):
     browser.js("document.querySelector('.plot').scrollIntoView()")
     wait_for(lambda: browser.js("return document.querySelectorAll('.plot canvas').length") == 4)
     assert browser.complaints() == []
+
+
+@pytest.mark.systems
+@pytest.mark.apt
+@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver")
+def test_paper_gets_all_figures_two_in_a_row(report, browser):
+    browser.driver.get((report / "report.html").as_uri())
+    wait_for(lambda: browser.js("return document.querySelectorAll('.plot canvas').length") > 0)
+    browser.js("dispatchEvent(new Event('beforeprint'))")
+    width = "return [...document.querySelectorAll('.plot .u-wrap')].map((x) => x.style.width)"
+    wait_for(lambda: browser.js(width) == ["440px"] * 4)
+    assert browser.complaints() == []

@@ -176,7 +176,7 @@ class Conformity:
         return [
             *own,
             ("inner stage", "the law's own" if self.inner is None else self.inner),
-            ("converter under test", f"{under.plant.converter}; {under.instruments}"),
+            ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),
             ("machine", self.machine),
