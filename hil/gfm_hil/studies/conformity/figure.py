@@ -107,9 +107,9 @@ def draw_matrix(
     for verdict, colour in VERDICT_COLOURS.items():
         axes.plot([], [], "s", color=colour, label=f"{SIGNS[verdict]} {verdict}")
     figure.legend(fontsize=8, frameon=False, loc="outside lower left", ncols=3)
-    _save(figure, path, bbox_inches="tight")  # the layout does not see how long a slanted name is
+    _save(figure, path, "tight")  # the layout does not see how long a slanted name is
 
 
-def _save(figure: Figure, path: Path, **more: str) -> None:
+def _save(figure: Figure, path: Path, box: str | None = None) -> None:
     with replacing(path) as part:
-        figure.savefig(part, dpi=100, format="png", **more)
+        figure.savefig(part, dpi=100, format="png", bbox_inches=box)
