@@ -29,11 +29,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
-from numba.core.compiler import Compiler
 from numba.core.sigutils import normalize_signature
+
+from gfm_runtime.deferred import DeferredDispatcher, Deferring, Kept
 
 #: where compiled functions, and constants that they contain, come from
 _PLACES = {
@@ -45,8 +45,8 @@ _PLACES = {
 _TEXT_ONLY = ("firmware",)
 
 
-class _Named(Compiler):
-    """numba's compiler, with the types of the arguments in the name of what it compiles."""
+class _Named(Deferring):
+    """The compiler, with the types of the arguments in the name of what it compiles."""
 
     def define_pipelines(self) -> Any:
         """As numba asks for it, once a compilation and before it names anything."""
@@ -83,6 +83,8 @@ class _Index(IndexDataCacheFile):
 class _Cache(FunctionCache):
     """numba's cache of a function, current as long as all our compiled code is the same."""
 
+    _impl_class = Kept
+
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         stamp = (self._impl.locator.get_source_stamp(), _digest())
@@ -94,14 +96,18 @@ FREE: dict[str, Any] = {"nogil": True, "_nrt": False, "error_model": "numpy"}
 
 
 def _decorator(**options: Any) -> Any:
-    """``numba.njit`` with our cache."""
+    """``numba.njit`` with our compiler and our cache."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(pipeline_class=_Named, **options)(function)
+        dispatcher = _dispatcher(function, options)
         dispatcher._cache = _Cache(function)
         return dispatcher
 
     return decorate
+
+
+def _dispatcher(function: Callable[..., Any], options: dict[str, Any]) -> DeferredDispatcher:
+    return DeferredDispatcher(function, {}, {**options, "nopython": True}, _Named)
 
 
 def callback(
@@ -130,7 +136,7 @@ def inlined_as(name: str, function: Callable[..., Any]) -> Any:
     made in the same place.
     """
     function.__name__ = function.__qualname__ = name
-    return njit(pipeline_class=_Named, **FREE, forceinline=True)(function)
+    return _dispatcher(function, {**FREE, "forceinline": True})
 
 
 #: decorator for a function of a tick that needs numba's runtime, as slices of arrays do

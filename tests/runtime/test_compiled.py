@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 from numba.core.errors import TypingError
@@ -78,6 +79,7 @@ def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_pa
 
 _TWO_RECORDS = """
 import sys
+import numba
 import numpy as np
 from gfm_runtime.compiled import compiled
 
@@ -109,3 +111,90 @@ def test_what_two_processes_compiled_for_two_records_does_not_mix_in_a_third(tmp
         for sizes in (["2"], ["3"], ["2", "3"])
     ]
     assert found == [["4.0"], ["6.0"], ["4.0", "6.0"]]
+
+
+def test_a_function_that_only_compiled_ones_call_has_no_machine_code():
+    @compiled
+    def inner(x):
+        return x + 1
+
+    @compiled
+    def outer(x):
+        return 2 * inner(x)
+
+    assert outer(1.0) == 4.0
+    (entry,) = (cres.entry_point for cres in inner.overloads.values())
+    assert entry.function is None
+    assert inner(1.0) == 2.0
+    assert entry.function is not None
+    assert outer(2.0) == 6.0
+
+
+def test_a_callee_that_the_first_of_two_callers_does_not_reach_is_linked_for_the_second():
+    reached = False
+
+    @compiled
+    def far(x):
+        return x**3 + x
+
+    @compiled
+    def first(x):
+        return far(x) if reached else x
+
+    @compiled
+    def second(x):
+        return far(x)
+
+    @compiled
+    def both(x):
+        return first(x) + second(x)
+
+    assert both(2.0) == 12.0
+
+
+def test_numbas_own_functions_call_ours_and_so_does_python_afterwards():
+    @compiled
+    def ours(x):
+        return x[0] - x[1]
+
+    @numba.njit
+    def theirs(x):
+        return 3 * ours(x)
+
+    x = np.array([5.0, 3.0])
+    assert theirs(x) == 6.0
+    assert ours(x) == 2.0
+
+
+_COUNTED = """
+import sys
+from numba.core import event
+from gfm_runtime.compiled import compiled, inlined
+
+@inlined
+def inner(x):
+    return x + 1
+
+@compiled
+def outer(x):
+    return 2 * inner(x)
+
+with event.install_recorder("numba:compile") as recorder:
+    print([{"inner": inner, "outer": outer}[name](1.0) for name in sys.argv[1:]])
+print(len(recorder.buffer) // 2)
+"""
+
+
+@pytest.mark.processes
+def test_each_function_is_compiled_once_a_machine(tmp_path):
+    (tmp_path / "ours.py").write_text(_COUNTED)
+
+    def run(*names: str) -> list[str]:
+        command = [sys.executable, "ours.py", *names]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.splitlines()
+
+    assert run("outer") == ["[4.0]", "2"]
+    assert run("outer") == ["[4.0]", "0"]
+    assert run("inner", "outer") == ["[2.0, 4.0]", "0"]  # machine code of what is kept without
+    assert run("inner") == ["[2.0]", "0"]

@@ -1,0 +1,256 @@
+"""Machine code for the functions that Python or C calls, and for no others.
+
+numba links each function with all that it calls, optimises the whole and makes machine code of it,
+and does so again for each of its callers. A tick has hundreds of small functions that all become
+part of one loop, so LLVM would work on each as often as there are callers above it. Here it works
+on a function once, as a part of the one that Python or C calls: the first run of an installation
+compiles in less than half the time, and computes the same bits.
+
+``Deferring`` is numba's compiler up to that point, ``Entry`` is what is still to do, ``Kept``
+writes both to numba's cache, and ``DeferredDispatcher`` is what a decorator makes of a function.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.sigutils import normalize_signature
+from numba.core.typed_passes import NativeLowering
+
+
+class _Library(JITCodeLibrary):
+    """The code of a function, linked with its callees when someone asks for an address."""
+
+    _alone: Any = None
+
+    @classmethod
+    def of(cls, name: str) -> _Library:
+        library = cls(cpu_target.target_context.codegen(), name)
+        library.enable_object_caching()
+        return library
+
+    def add_linking_library(self, library: Any) -> None:
+        """Add a callee, which numba would compile first."""
+        self._linking_libraries.append(library)
+
+    def _get_module_for_linking(self) -> Any:
+        """The function alone, before it is optimised with its callees."""
+        if self._finalized:
+            return super()._get_module_for_linking()
+        if self._alone is None:
+            self._alone = self._final_module.clone()
+            for function in self._alone.functions:
+                if not function.is_declaration and function.linkage == llvm.Linkage.external:
+                    function.linkage = "linkonce_odr"  # several that are linked may contain it
+        return self._alone
+
+    def _callees(self) -> list[Any]:
+        """What the function calls, itself or through others."""
+        callees: dict[Any, None] = {}
+        left = list(self._linking_libraries)
+        while left:
+            library = left.pop()
+            if library not in callees:
+                callees[library] = None
+                if isinstance(library, _Library):
+                    left += library._linking_libraries
+        return list(callees)
+
+    def _link(self, module: Any) -> None:
+        """Link the callees into a module that has the function.
+
+        LLVM takes from a library what the module calls at that moment, so a library is linked
+        again when one that came after it calls more.
+        """
+        homes = {
+            function.name: library
+            for library in self._callees()
+            for function in library._get_module_for_linking().functions
+            if not function.is_declaration
+        }
+        while missing := {
+            homes[function.name]: None
+            for function in module.functions
+            if function.is_declaration and function.name in homes
+        }:
+            for library in missing:
+                module.link_in(library._get_module_for_linking(), preserve=True)
+
+    @property
+    def has_dynamic_globals(self) -> bool:
+        """Whether the code holds addresses of this process; numba would compile it to say so."""
+        if self._finalized:
+            return bool(super().has_dynamic_globals)
+        return any(
+            variable.name.startswith("numba.dynamic.globals")
+            for library in (self, *self._callees())
+            for variable in library._final_module.global_variables
+        )
+
+    def finalize(self) -> None:
+        """Optimise the function with its callees, and make machine code of it."""
+        for library in self._callees():
+            self._reload_init.update(library._reload_init)
+        self._link(self._final_module)
+        self._linking_libraries = []
+        super().finalize()
+
+    def pack(self) -> tuple[str, bytes]:
+        """The name, and the function with its callees, before they are optimised."""
+        module = self._get_module_for_linking().clone()
+        self._link(module)
+        return self.name, module.as_bitcode()
+
+    @classmethod
+    def unpack(cls, packed: tuple[str, bytes]) -> _Library:
+        """What ``pack`` made, in another process."""
+        name, bitcode = packed
+        library = cls.of(name)
+        library._alone = llvm.parse_bitcode(bitcode)
+        library._final_module.link_in(library._alone, preserve=True)
+        return library
+
+
+class Entry:
+    """What Python will call, once it is made; ``nrt``: the function uses numba's runtime."""
+
+    def __init__(self, library: Any, fndesc: Any, env: Any, nrt: bool) -> None:
+        self.library, self.fndesc, self.env, self.nrt = library, fndesc, env, nrt
+        self.function: Any = None
+
+    def make(self) -> None:
+        """Make the machine code, with a function that takes the arguments from Python."""
+        context = cpu_target.target_context.subtarget(enable_nrt=self.nrt)
+        library = _Library.of(self.library.name)  # a caller without this compiler may have its own
+        library.add_linking_library(self.library)
+        context.create_cpython_wrapper(library, self.fndesc, self.env, None, release_gil=True)
+        self.function = context.get_executable(library, self.fndesc, self.env)
+        self.library = library
+
+
+class Kept(CompileResultCacheImpl):
+    """A function in numba's cache, with machine code or without."""
+
+    def reduce(self, cres: Any) -> Any:
+        """As numba asks for it to write a function; those for C have no entry."""
+        entry = cres.entry_point
+        if entry is None or entry.function is not None:
+            return None, super().reduce(cres._replace(library=entry.library) if entry else cres)
+        # nor does numba keep these
+        cres.fndesc.typemap = cres.fndesc.calltypes = None
+        made_of = entry.library.pack(), entry.fndesc, entry.env, entry.nrt
+        return made_of, (cres.signature, cres.reload_init)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """As numba asks for it to read a function."""
+        made_of, rest = payload
+        if made_of is None:
+            cres = super().rebuild(target_context, rest)
+            entry = Entry(cres.library, cres.fndesc, cres.environment, nrt=False)
+            entry.function = cres.entry_point
+            return cres._replace(entry_point=entry)
+        packed, fndesc, env, nrt = made_of
+        signature, reload_init = rest
+        for function in reload_init:
+            function()
+        library = _Library.unpack(packed)
+        result: Any = CompileResult
+        return result(
+            target_context=target_context,
+            typing_context=target_context.typing_context,
+            library=library,
+            environment=env,
+            entry_point=Entry(library, fndesc, env, nrt),
+            fndesc=fndesc,
+            type_annotation="",
+            signature=signature,
+            objectmode=False,
+            lifted=(),
+            typing_error=None,
+            call_helper=None,
+            metadata=None,
+            reload_init=reload_init,
+            referenced_envs=(),
+        )
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Lowering(NativeLowering):
+    """numba's last step, without machine code."""
+
+    def run_pass(self, state: Any) -> bool:
+        flags, context = state.flags, state.targetctx
+        library = state.library = _Library.of(state.func_id.func_qualname)
+        called_by_c = flags.no_compile
+        flags.no_compile = True
+        if not called_by_c:
+            flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        super().run_pass(state)
+        if not called_by_c:
+            lowered = state["cr"]
+            entry = Entry(library, lowered.fndesc, lowered.env, flags.nrt)
+            context.insert_user_function(entry, lowered.fndesc, [library])
+            state.reload_init.extend(library._reload_init)
+            state["cr"] = lowered._replace(cfunc=entry)
+        return True
+
+
+class Deferring(Compiler):
+    """numba's compiler, up to the machine code."""
+
+    def define_pipelines(self) -> Any:
+        """As numba asks for it, once a compilation."""
+        pipelines = super().define_pipelines()
+        for pipeline in pipelines:
+            pipeline.passes = [
+                (_Lowering if step is NativeLowering else step, why)
+                for step, why in pipeline.passes
+            ]
+            pipeline.finalize()
+        return pipelines
+
+
+class DeferredDispatcher(CPUDispatcher):
+    """A compiled function; it has machine code for the arguments that Python has called it with."""
+
+    _inside = False  # numba compiles a caller
+    _insert: Any  # numba's, in C
+    _cache: Any
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """As numba asks for it where a function that it compiles calls this one."""
+        with global_compiler_lock:
+            before, self._inside = self._inside, True
+            try:
+                return super().get_call_template(args, kws)
+            finally:
+                self._inside = before
+
+    def add_overload(self, cres: Any) -> None:
+        """Take what was compiled for a signature; Python finds it if it has machine code."""
+        args = tuple(cres.signature.args)
+        self.overloads[args] = cres
+        if cres.entry_point.function is not None:
+            self._insert([arg._code for arg in args], cres.entry_point.function, False)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for a signature, with machine code unless a compiled function asks."""
+        with global_compiler_lock:
+            inside = self._inside
+            entry: Any = super().compile(sig)
+            if inside:
+                return entry
+            if entry.function is None:
+                args, _ = normalize_signature(sig)
+                cres = self.overloads[tuple(args)]
+                entry.make()
+                self.add_overload(cres)
+                self._cache.save_overload(sig, cres)
+            return entry.function
