@@ -27,7 +27,7 @@ FOLDERS = {
     "gfm_pytest": ROOT / "hil" / "gfm_pytest",
     "gfmhil": ROOT / "hil" / "gfmhil",
 }
-RUNTIME_NEEDS = {"numpy", "numba", "lazy_loader"}
+RUNTIME_NEEDS = {"numpy", "numba", "llvmlite", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 _FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "shipped", "toml_file")
 _STAGES = ("dual_sequence", "kinds", "stage", "virtual_stator", "voltage_loop")  # their options
