@@ -48,7 +48,7 @@ _CANCELS = 1e-12  # relative remainder below which a factor divides a numerator
 # Least and most of an element's numbers: times (s), a damping ratio, gains. What is outside is a
 # typing error and would overflow.
 _TIME, _DAMPING, _GAIN = (1e-9, 1e9), (5e-324, 1e12), (-1e12, 1e12)
-_ANY = (-1e100, 1e100)  # a coefficient of an expanded polynomial
+_ANY = (-1e60, 1e60)  # a coefficient of an expanded polynomial
 _BOUNDS = {"T": _TIME, "T_f": _TIME, "xi": _DAMPING} | dict.fromkeys(("num", "den", *"ABC"), _ANY)
 #: by name in a law file: by the names of the numbers that it takes, the function
 KINDS: dict[str, dict[tuple[str, ...], Callable[..., Element]]] = {}
@@ -336,6 +336,11 @@ def TF(num: Polynomial, den: Polynomial) -> Element:
         _refuse_unstable("TF", max(np.roots(rest[::-1]), key=lambda root: root.real), False)
     unit = rest[0]  # its constant coefficient becomes 1, as the named factors have it
     below = tuple(c / unit for c in rest)
+    for power, c in enumerate(first(below)[1:], 1):
+        if c and not _TIME[0] <= abs(c) ** (1 / power) <= _TIME[1]:
+            raise LawError(
+                "TF", f"den has a pole out of {1 / _TIME[1]:g} to {1 / _TIME[0]:g} rad/s"
+            )
     factors = (INTEGRATOR,) * zeros + ((below,) if len(below) > 1 else ())
     return Element.of(tuple(c / unit for c in num[::-1]), factors)
 
@@ -474,6 +479,7 @@ def _reached(A: Matrix, b: Matrix, c: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     return basis.T @ A @ basis, basis.T @ b, basis.T @ c
 
 
+@np.errstate(all="ignore")  # what is not finite is refused
 def make(where: str, kind: Kind, numbers: Mapping[str, Any]) -> Element:
     """An element by its kind and its numbers; ``T_f`` multiplies any kind by 1/(T_f s + 1).
 
@@ -492,4 +498,8 @@ def make(where: str, kind: Kind, numbers: Mapping[str, Any]) -> Element:
             made = made * IF(1.0, numbers["T_f"])
     except LawError as problem:
         raise LawError(f"{where}, {problem.where}", problem.why) from None
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        raise LawError(
+            f"{where}, {kind}", "its numbers are too far apart to compute with"
+        ) from None
     return made

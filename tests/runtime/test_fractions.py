@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import signal
 
 from gfm_design.tuning.gains import realise_each
 from gfm_runtime import LawError, build_law, discretise, pack_law, parse_law, realise
 from gfm_runtime.elements import SS, TF, Element, stable
 from gfm_runtime.lawfile import LawFile
+
+from ..support.laws import repeatable
 
 HEAD = """
 name = "x"
@@ -126,8 +130,12 @@ def test_relative_degree_is_that_of_the_state_space():
         ('type = "sum", k = 1', "phi_22: sum takes ['terms'] alone, not ['k']"),
         ('type = "P", k = 1, terms = [{ type = "P", k = 1 }]',
          "phi_22: terms belongs to sum, not to P"),
+        ('type = "TF", num = [1], den = [1e-20, 1]',
+         "phi_22, TF: den has a pole out of 1e-09 to 1e+09 rad/s"),
+        ('type = "SS", A = [[-1e50, 1e-50], [1e50, -1e50]], B = [1, 1], C = [1, 1], D = 0',
+         "phi_22, SS: its poles are too far apart for one element; split it"),
         ('type = "TF", num = [1e200], den = [1]',
-         "phi_22, TF: num = 1e+200 must be from -1e+100 to 1e+100"),
+         "phi_22, TF: num = 1e+200 must be from -1e+60 to 1e+60"),
     ],
 )  # fmt: skip
 def test_what_is_refused_has_one_line(cell, message):
@@ -156,6 +164,32 @@ def test_a_search_sees_the_same_law_and_leaves_out_what_is_unstable():
             ours = many.C[i] @ inside + many.D_r[i]
             np.testing.assert_allclose(ours, one(s)[0], rtol=1e-9, atol=1e-15)
     assert np.isnan(many.A[2]).all()
+
+
+ODD = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e59, -1e59, 1e-50, 3.5, -20.0, 1e-9, 1e9, 5e-324])
+
+
+@pytest.mark.filterwarnings("error")
+@given(num=st.lists(ODD, min_size=1, max_size=4), den=st.lists(ODD, min_size=1, max_size=5))
+@repeatable
+def test_absurd_fractions_make_a_law_or_a_message(num, den):
+    try:
+        record(f'{{ type = "TF", num = {num}, den = {den} }}')
+    except LawError as problem:
+        assert str(problem).count("phi_22") == 1 and "\n" not in str(problem)
+
+
+@pytest.mark.filterwarnings("error")
+@given(data=st.data(), n=st.integers(0, 3))
+@repeatable
+def test_absurd_state_spaces_make_a_law_or_a_message(data, n):
+    vector = st.lists(ODD, min_size=n, max_size=n)
+    A = data.draw(st.lists(vector, min_size=n, max_size=n))
+    B, C, D = data.draw(vector), data.draw(vector), data.draw(ODD)
+    try:
+        record(f'{{ type = "SS", A = {A}, B = {B}, C = {C}, D = {D} }}')
+    except LawError as problem:
+        assert str(problem).count("phi_22") == 1 and "\n" not in str(problem)
 
 
 @pytest.mark.parametrize("zeros", [(-1.0, -2.0, -3.0), (-1.0, -2.0, 1e-6), (-1e-3, -1e4, -1e4)])

@@ -14,6 +14,7 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_runtime.elements import Element, transfer
+from gfm_runtime.errors import LawError
 from gfm_runtime.signals import NU, NY
 
 Factors = list[dict[str, Any]]  # a cell of a law file
@@ -33,7 +34,12 @@ def cells_of(system: Any, shape: tuple[int, int] = (NU, NY)) -> list[list[Factor
         system = system.to_tf()
     if hasattr(system, "A"):
         A, B, C, D = (np.atleast_2d(np.asarray(getattr(system, n), float)) for n in "ABCD")
-        cells = [[_factors(one) for one in row] for row in transfer(A, B, C, D)]
+        try:
+            cells = [[_factors(one) for one in row] for row in transfer(A, B, C, D)]
+        except LawError:
+            raise
+        except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+            raise UserError("system: its numbers are too far apart to compute with") from None
     elif hasattr(system, "num") and hasattr(system, "den"):
         num, den = (_grid(system, name) for name in ("num", "den"))
         cells = [
@@ -62,8 +68,15 @@ def _factors(element: Element) -> Factors:
 
 
 def fraction(num: Sequence[float], den: Sequence[float]) -> Factors:
-    """The cell num(s)/den(s), coefficients in descending powers of s."""
-    above, below = ([float(c) for c in np.atleast_1d(part)] for part in (num, den))
+    """The cell num(s)/den(s), coefficients in descending powers of s.
+
+    Raises:
+        UserError: they are no numbers.
+    """
+    try:
+        above, below = ([float(c) for c in np.atleast_1d(part)] for part in (num, den))
+    except (TypeError, ValueError):
+        raise UserError(f"({num!r}, {den!r}): must be two lists of numbers") from None
     while len(above) > 1 and above[0] == 0.0:
         del above[0]
     return [{"type": "TF", "num": above, "den": below}] if any(above) else []
@@ -104,6 +117,8 @@ def read_matrix(cells: Sequence[Sequence[Any]]) -> dict[str, Any]:
                 made[i][j] = cell_of(value)
             except UserError as problem:
                 raise UserError(f"phi_{where}: {problem}") from None
+            except LawError as problem:
+                raise LawError(f"phi_{where}, {problem.where}", problem.why) from None
     content = content_of(made)
     return {**content, "phi": content["phi"] | ready}
 

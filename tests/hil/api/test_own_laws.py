@@ -103,12 +103,15 @@ def test_what_is_no_law_is_told(system, message):
     ("cell", "message"),
     [
         (UNSTABLE, "phi_22, TF: unstable: a pole at s = 2 rad/s"),
-        (control.ss(UNSTABLE), "SS: unstable: a pole at s = 2 rad/s"),
+        (control.ss(UNSTABLE), "phi_22, SS: unstable: a pole at s = 2 rad/s"),
         (1 / S**2, "phi_22: unstable: a double integrator 1/s^2"),
         (S / 1, "phi_22: improper: its numerator has degree 1, its denominator 0; "
          "give a filter T_f to D or PD, or multiply by an IF"),
         ("1/s", "phi_22: system: str is no transfer function or state space"),
         (PHI, "phi_22: system: is 3 × 5; must be 1 × 1"),
+        (("s", [1]), "phi_22: ('s', [1]): must be two lists of numbers"),
+        (signal.StateSpace([[np.nan]], [[1.0]], [[1.0]], [[0.0]]),
+         "phi_22: system: its numbers are too far apart to compute with"),
     ],
 )  # fmt: skip
 def test_what_is_no_cell_is_told_in_one_line(cell, message):
