@@ -104,7 +104,7 @@ class _Library(JITCodeLibrary):
 
     def pack(self) -> tuple[str, bytes]:
         """The name, and the function with its callees, before they are optimised."""
-        module = self._get_module_for_linking().clone()
+        module = self._final_module.clone()
         self._link(module)
         return self.name, module.as_bitcode()
 
@@ -113,8 +113,7 @@ class _Library(JITCodeLibrary):
         """What ``pack`` made, in another process."""
         name, bitcode = packed
         library = cls.of(name)
-        library._alone = llvm.parse_bitcode(bitcode)
-        library._final_module.link_in(library._alone, preserve=True)
+        library._final_module.link_in(llvm.parse_bitcode(bitcode))
         return library
 
 

@@ -168,6 +168,7 @@ def test_numbas_own_functions_call_ours_and_so_does_python_afterwards():
 
 _COUNTED = """
 import sys
+from numba import njit
 from numba.core import event
 from gfm_runtime.compiled import compiled, inlined
 
@@ -179,8 +180,13 @@ def inner(x):
 def outer(x):
     return 2 * inner(x)
 
+@njit
+def theirs(x):
+    return 3 * inner(x)
+
+all_of_them = {"inner": inner, "outer": outer, "theirs": theirs}
 with event.install_recorder("numba:compile") as recorder:
-    print([{"inner": inner, "outer": outer}[name](1.0) for name in sys.argv[1:]])
+    print([all_of_them[name](1.0) for name in sys.argv[1:]])
 print(len(recorder.buffer) // 2)
 """
 
@@ -196,5 +202,6 @@ def test_each_function_is_compiled_once_a_machine(tmp_path):
 
     assert run("outer") == ["[4.0]", "2"]
     assert run("outer") == ["[4.0]", "0"]
+    assert run("theirs") == ["[6.0]", "1"]  # numba's own calls what is kept without machine code
     assert run("inner", "outer") == ["[2.0, 4.0]", "0"]  # machine code of what is kept without
     assert run("inner") == ["[2.0]", "0"]
