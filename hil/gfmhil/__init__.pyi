@@ -1,5 +1,6 @@
 from gfm_hil.api.law import Law as Law
 from gfm_hil.api.law import laws as laws
+from gfm_hil.api.runs import BetweenTicks as BetweenTicks
 from gfm_hil.api.runs import Comparison as Comparison
 from gfm_hil.api.runs import NetworkRun as NetworkRun
 from gfm_hil.api.runs import Run as Run

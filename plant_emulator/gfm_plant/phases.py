@@ -32,7 +32,7 @@ def stands(plant: PlantRecords, at: float) -> complex:
 
 
 @inlined
-def _along(x: int, z: complex) -> float:
+def along(x: int, z: complex) -> float:
     return _A[x].real * z.real + _A[x].imag * z.imag
 
 
@@ -55,7 +55,7 @@ def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: in
         slope += E * (r.omega_b / r.L_f)
     for j in range(N_PHASES):
         x = (j - 1) % 3
-        value = _along(x, i if j < 4 else (v if j < 7 else i_o)) if j > 0 else s.x[V_DC]
+        value = along(x, i if j < 4 else (v if j < 7 else i_o)) if j > 0 else s.x[V_DC]
         if math.isnan(s.phase_seen[0, j]):
             s.phase_seen[0, j] = s.phase_seen[1, j] = value
         change = value - s.phase_seen[0, j]
@@ -65,7 +65,7 @@ def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: in
             + r.phase_weights[2] * value
         )
         s.phase_seen[0, j], s.phase_seen[1, j] = value, low
-        back = _along(x, slope) if 0 < j < 4 else change / plant.net[0].T_s
+        back = along(x, slope) if 0 < j < 4 else change / plant.net[0].T_s
         seen = low - r.phase_skew[j] * back
         y[first + j] = _count(r, s.tick, j, seen)
 

@@ -13,17 +13,21 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.engine.processes import Progress
 from gfm_hil.recording.run import Run, converters_of
+from gfm_hil.results.between_figure import plot_between
 from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
 from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
+from gfm_hil.run.between import BetweenTicks, between_ticks
+from gfm_hil.run.losses import losses
 from gfm_hil.run.network_run import NetworkRun, save_network
 from gfm_hil.run.runner import Notice
+from gfm_hil.run.spectrum import spectrum
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.workers import SILENT, Watch
 
 __all__ = [
-    "Comparison", "NetworkRun", "Run", "compare", "load_run", "merge", "recover", "run",
-    "run_network", "save",
+    "BetweenTicks", "Comparison", "NetworkRun", "Run", "compare", "load_run", "merge", "recover",
+    "run", "run_network", "save",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
@@ -43,8 +47,31 @@ def save(run: Run | NetworkRun, folder: str | Path) -> Path:
     return run_folder.save(run, folder, write_report)
 
 
+def look_between_ticks(
+    run: Run, start: float, stop: float, step: float = 1e-6
+) -> BetweenTicks:  # fmt: skip
+    """What a switched bridge does between the ticks in a window of a run, which is repeated for it.
+
+    Args:
+        run: of one converter, whose law computed u.
+        start, stop: from when to when, s.
+        step: the longest piece, s; edges and dead times end pieces besides.
+
+    Raises:
+        UserError: the bridge is averaged, the window is none, the controller is not ours, or the
+            run cannot be repeated, as one in real time with misses.
+    """
+    law = Law.from_toml(run.law_text) if run.law_text else run.scenario.law
+    with law_files([law]) as files:
+        (file,) = files.values()
+        scenario = load_scenario(run.scenario, in_process=True, law=file)
+        return between_ticks(run, scenario, start, stop, step)
+
+
 # what a run does by functions of rooms above its own
 Run.plot, Run.plot_waveforms, Run.save = plot, plot_waveforms, save
+Run.between_ticks = look_between_ticks
+BetweenTicks.spectrum, BetweenTicks.losses, BetweenTicks.plot = spectrum, losses, plot_between
 NetworkRun.plot, NetworkRun.save = plot_network, save
 
 

@@ -29,6 +29,10 @@ COMMANDS = {
         "export",
         "write a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
     ),
+    "waveforms": (
+        "waveforms",
+        "show what a switched bridge does between the ticks of a run: ripple, spectrum, losses",
+    ),
     "compare": ("compare", "run a scenario under several laws"),
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),

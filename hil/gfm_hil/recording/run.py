@@ -125,6 +125,7 @@ class Run:
     if TYPE_CHECKING:  # functions of rooms further up, which ``gfm_hil.api.runs`` adds
         plot: ClassVar[Callable[..., list[Axes]]]
         plot_waveforms: ClassVar[Callable[..., list[Axes]]]
+        between_ticks: ClassVar[Callable[..., Any]]
         save: ClassVar[Callable[..., Path]]
 
     @classmethod

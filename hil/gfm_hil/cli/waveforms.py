@@ -1,0 +1,107 @@
+"""gfmhil waveforms: what a switched bridge does between the ticks of a run."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.api.runs import load_run
+from gfm_hil.cli import common
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import replacing
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.between_figure import SIZE, draw_between
+from gfm_hil.results.table import Table
+from gfm_hil.run.between import BetweenTicks
+from gfm_hil.run.losses import load_data_sheet
+
+_PICTURES, _TABLES = (".png", ".svg", ".pdf"), (".csv", ".npz")
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Repeat a run with a switched bridge in this process, and look at a window of it at every "
+        "edge: ripple, RMS current of the DC capacitor, and of windows of 10 cycles and more "
+        "distortion by IEC 61000-4-7; with a data sheet the losses."
+    )
+    command.add_argument("folder", type=Path, help="the run folder")
+    command.add_argument("window", type=common.window, metavar="FROM:TO", help="the window, s")
+    command.add_argument(
+        "--step", type=float, default=1e-6, metavar="S", help="longest piece, s (1e-6)"
+    )
+    command.add_argument(
+        "--data-sheet", type=Path, metavar="FILE", help="values of the devices, for the losses"
+    )
+    command.add_argument(
+        "-o", "--out", type=Path, action="append", default=[], metavar="FILE",
+        help="write the figure (.png, .svg, .pdf) or all pieces in V and A (.csv, .npz); may be"
+        " repeated",
+    )  # fmt: skip
+    command.add_argument("--json", action="store_true", help="as JSON")
+
+
+def call(options: argparse.Namespace) -> int:
+    for file in options.out:
+        if file.suffix not in _PICTURES + _TABLES:
+            known = ", ".join(_PICTURES + _TABLES)
+            raise UserError(f"--out {file}: must end in one of {known}")
+    sheet = None if options.data_sheet is None else load_data_sheet(options.data_sheet)
+    run = load_run(options.folder)
+    start, stop = options.window
+    between = run.between_ticks(start, stop, options.step)
+    found = _figures(between)
+    if sheet is not None:
+        lost = between.losses(sheet)
+        found["losses_W"] = {**lost.conduction, **lost.switching, "total": lost.total}
+    if options.json:
+        print(json.dumps(found, indent=2))
+    else:
+        rows = [
+            (f"{name}: {part}" if part else name, f"{value:.4g}")
+            for name, values in found.items()
+            for part, value in (values.items() if isinstance(values, dict) else [("", values)])
+        ]
+        terminal().print(Table(("", "value"), rows, text=None))
+    for file in options.out:
+        _write(file, between, run.scenario.title)
+    return 0
+
+
+def _figures(between: BetweenTicks) -> dict[str, Any]:
+    """What one reads off a window, by name."""
+    b = between.bases
+    A = np.sqrt(2 / 3) * b.S_n / b.V_n
+    found: dict[str, Any] = {
+        "ripple_i_A": A * max(between.ripple(f"i_{phase}") for phase in "abc"),
+        "ripple_v_dc_V": b.V_dcref * between.ripple("v_dc"),
+        "capacitor_rms_A": b.S_n / b.V_dcref * between.capacitor_rms(),
+    }
+    try:
+        for name in ("i_a", "i_oa", "v_a", "u_a"):
+            found[name] = between.spectrum(name).distortion()
+    except UserError:
+        pass  # shorter than the standard's window
+    return found
+
+
+def _write(file: Path, between: BetweenTicks, title: str) -> None:
+    with replacing(file) as part:
+        if file.suffix in _PICTURES:
+            from matplotlib.figure import Figure
+
+            figure = Figure(figsize=SIZE, layout="constrained")
+            draw_between(figure, between, title)
+            figure.savefig(part, dpi=110, format=file.suffix[1:])
+            return
+        rows = between.table(si=True)
+        if file.suffix == ".npz":
+            with part.open("wb") as stream:
+                np.savez_compressed(stream, allow_pickle=False, **rows)
+        else:
+            with part.open("w", encoding="utf-8") as text:
+                head = ",".join(rows)
+                np.savetxt(
+                    text, np.column_stack([*rows.values()]), "%.12g", ",", header=head, comments=""
+                )
