@@ -129,6 +129,12 @@ compiled: Any = _decorator(**FREE)
 inlined: Any = _decorator(**FREE, forceinline=True)
 
 
+def expanded(function: Callable[..., Any]) -> Any:
+    """For a function that returns a view of its argument: numba puts it into its callers before it
+    looks at types, since a function without numba's runtime cannot return an array of its own."""
+    return _dispatcher(function, {**FREE, "inline": "always"})
+
+
 def inlined_as(name: str, function: Callable[..., Any]) -> Any:
     """As ``inlined``, for a function that is made at run time and calls functions it was made with.
 

@@ -13,7 +13,7 @@ import numpy as np
 from llvmlite import binding, ir
 from numba import types
 
-from gfm_hil.realtime.atomics import intrinsic
+from gfm_hil.realtime.atomics import intrinsic, load32, load64
 from gfm_runtime.compiled import inlined
 
 _AT_ONCE = 16  # bytes
@@ -40,22 +40,6 @@ def _tables() -> np.ndarray:
 
 
 _T = _tables()
-
-
-def _make_load(bits: int, kind: types.Integer) -> Any:
-    """An intrinsic that reads a little-endian number of ``bits`` bits at an address."""
-
-    def load(typingctx, address):
-        def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            pointer = builder.inttoptr(arguments[0], ir.IntType(bits).as_pointer())
-            return builder.load(pointer, align=1)
-
-        return kind(types.int64), make
-
-    return intrinsic(load)
-
-
-_load32, _load64 = _make_load(32, types.uint32), _make_load(64, types.uint64)
 
 
 @intrinsic
@@ -105,12 +89,12 @@ def crc32_by_tables(message, count):
     k = 0
     while k + _AT_ONCE <= count:
         # first the terms that do not depend on the previous step's CRC
-        later = _four(_load32(at + k + 12), 0) ^ _four(_load32(at + k + 8), 4)
-        later ^= _four(_load32(at + k + 4), 8)
-        crc = later ^ _four(crc ^ _load32(at + k), 12)
+        later = _four(load32(at + k + 12), 0) ^ _four(load32(at + k + 8), 4)
+        later ^= _four(load32(at + k + 4), 8)
+        crc = later ^ _four(crc ^ load32(at + k), 12)
         k += _AT_ONCE
     while k + 4 <= count:
-        crc = _four(crc ^ _load32(at + k), 0)
+        crc = _four(crc ^ load32(at + k), 0)
         k += 4
     while k < count:
         crc = _T[0, (crc ^ message[k]) & 0xFF] ^ (crc >> np.uint32(8))
@@ -125,10 +109,10 @@ def crc32_by_folding(message, count):
         return crc32_by_tables(message, count)
     at = message.ctypes.data
     # four leading zero bytes do not change the remainder and make the first block 16 bytes
-    low, high = np.uint64(_load32(at) ^ _ONES) << _HALF, _load64(at + 4)
+    low, high = np.uint64(load32(at) ^ _ONES) << _HALF, load64(at + 4)
     k = 12
     while k < count:
-        low, high = _fold(low, high, _load64(at + k), _load64(at + k + 8))
+        low, high = _fold(low, high, load64(at + k), load64(at + k + 8))
         k += _AT_ONCE
     crc = _four(np.uint32(low), 12) ^ _four(np.uint32(low >> _HALF), 8)
     return crc ^ _four(np.uint32(high), 4) ^ _four(np.uint32(high >> _HALF), 0) ^ _ONES

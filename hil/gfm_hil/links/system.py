@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numba import carray, types  # type: ignore[attr-defined]
+from numba import int64, types
 
-from gfm_runtime.compiled import cached
+from gfm_hil.realtime.atomics import load32
+from gfm_runtime.compiled import compiled
 
-_errno_place: Any = types.ExternalFunction("__errno_location", types.CPointer(types.int32)())
+_errno_place: Any = types.ExternalFunction("__errno_location", types.int64())
 
 #: poll(2): address of the structures, how many, and ms
 poll: Any = types.ExternalFunction("poll", types.int32(types.int64, types.int64, types.int32))
 
 
-@cached
+@compiled
 def errno_now():
     """errno of the previous call."""
-    return np.int64(carray(_errno_place(), 1)[0])
+    return int64(load32(_errno_place()))

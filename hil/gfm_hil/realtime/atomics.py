@@ -83,3 +83,19 @@ def copy(typingctx, to, origin, size):
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64, types.int64), make
+
+
+def _make_load(bits: int, kind: types.Integer) -> Any:
+    """An intrinsic that reads a little-endian number of ``bits`` bits at an address."""
+
+    def load(typingctx, address):
+        def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            pointer = builder.inttoptr(arguments[0], ir.IntType(bits).as_pointer())
+            return builder.load(pointer, align=1)
+
+        return kind(types.int64), make
+
+    return intrinsic(load)
+
+
+load32, load64 = _make_load(32, types.uint32), _make_load(64, types.uint64)

@@ -33,6 +33,7 @@ FILES = ("udp", "shm", "zmq", "serial")
 #: files of what one would pick instead, and the packages that each needs
 PEERS = {
     "cyclonedds": ("cyclonedds",),
+    "grpc": ("grpc",),
     "iceoryx2": ("iceoryx2", "flatbuffers"),
     "lcm": ("lcm",),
     "modbus": ("pymodbus",),

@@ -15,7 +15,7 @@ from gfm_hil.links.can.bus_time import frame_time
 from gfm_hil.links.can.dbc import PAYLOADS
 from gfm_hil.links.can.wire import ERROR, MTU_FD, frame_dtype
 from gfm_hil.realtime.atomics import copy
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 
 PLACES = 128  # for frames that wait for the bus, and as many again for frames that were sent
 _LONGEST = PAYLOADS[-1]
@@ -45,19 +45,19 @@ def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
         bus["time"][0, length] = round(frame_time(sent, fd, bitrate, data_bitrate) * 1e9)
 
 
-@cached
+@compiled
 def has_room(bus):
     """Whether another frame may ``arrive``."""
     return bus[0].waiting < PLACES and bus[0].through < PLACES
 
 
-@cached
+@compiled
 def busy(bus):
     """Whether a frame is on the bus or waits for it."""
     return bus[0].waiting > 0 or bus[0].through > 0
 
 
-@cached
+@compiled
 def arrive(bus, places, frame, deliver, now):
     """Queue a frame; one of our own (``deliver`` = 0) only occupies the bus.
 
@@ -80,13 +80,13 @@ def arrive(bus, places, frame, deliver, now):
         b.waiting += 1
 
 
-@cached
+@compiled
 def _fill(places, k, frame, deliver, at):
     places[k].at, places[k].deliver = at, deliver
     copy(places[k : k + 1].ctypes.data + _FRAME_AT, frame.ctypes.data, MTU_FD)
 
 
-@cached
+@compiled
 def _arbitrate(b, places, now):
     """Move every frame that has won arbitration by now from waiting to delivery."""
     while b.waiting > 0 and b.through < PLACES:
@@ -111,7 +111,7 @@ def _arbitrate(b, places, now):
             places[k] = places[k + 1]
 
 
-@cached
+@compiled
 def is_through(bus, places, now):
     """Whether a frame is ready for delivery."""
     b = bus[0]
@@ -120,7 +120,7 @@ def is_through(bus, places, now):
     return b.through > 0 and places[PLACES + b.first].at <= now
 
 
-@cached
+@compiled
 def deliver(bus, places, frame):
     """Copy the frame that ``is_through`` found into ``frame``, an array of ``wire.frame_dtype``."""
     b = bus[0]

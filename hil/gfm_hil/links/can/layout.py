@@ -30,7 +30,7 @@ from gfm_hil.links.can.dbc import (
     write_dbc,
 )
 from gfm_hil.links.can.wire import crc8
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import Vector, carried
 
@@ -176,7 +176,7 @@ def plan_of(database: Database, inner: int = False) -> Plan:
     return plan
 
 
-@cached
+@compiled
 def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
     """Write values rounded to counts, and add the end-to-end protection.
 
@@ -206,7 +206,7 @@ def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
     return saturated
 
 
-@cached
+@compiled
 def unpack_vector(payload, index, start, scale, offset, values):
     """Write a frame's values into the vector; an invalid count becomes NaN."""
     for k in range(len(index)):

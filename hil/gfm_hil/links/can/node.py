@@ -38,9 +38,9 @@ from gfm_hil.links.can.vectors import (
     set_sender,
 )
 from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
-from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.realtime.clock import now_ns
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled, expanded
 
 #: no message; the bus is lost, see ``lost``; a frame of the handshake came, in ``into``
 NOTHING, LOST, TRANSPORT = -1, -2, -3
@@ -109,13 +109,13 @@ def _part(name: str) -> Any:
     # numba tells functions apart by name and by a number that counts in each process. Two parts of
     # one name, compiled by two processes and loaded from its cache by a third, could be confused.
     part.__qualname__ = part.__name__ = f"part_{name}"
-    return cached(part)
+    return expanded(part)
 
 
 _state, _sockets, _sender, _receiver, _bus, _places, _out, _into = map(_part, _SIZES)
 
 
-@cached
+@compiled
 def put(handle, frame):
     """Send the frame in an array; False if it was dropped or the bus is lost."""
     state, bus = _state(handle), _bus(handle)
@@ -134,7 +134,7 @@ def put(handle, frame):
     return False
 
 
-@cached
+@compiled
 def send(handle, message):
     """Send a message of the loops: 1; 0 if any part of it was dropped; NOTHING if it is not a frame
     of the loops."""
@@ -151,7 +151,7 @@ def send(handle, message):
     return sent
 
 
-@cached
+@compiled
 def fetch(handle):
     """Read the frames that the socket has; returns whether one is ready to be processed."""
     bus, places, into = _bus(handle), _places(handle), _into(handle)
@@ -166,7 +166,22 @@ def fetch(handle):
     return is_through(bus, places, now_ns() if bus[0].emulate else 0)
 
 
-@cached
+@compiled
+def _take_frame(handle, frame):
+    """The next frame to process, if there is one: of those that were fetched, or of the socket."""
+    bus = _bus(handle)
+    if bus[0].emulate or bus[0].through > 0:
+        there = fetch(handle)
+        if there:
+            deliver(bus, _places(handle), frame)
+        return there
+    came = read_frame(_sockets(handle), frame)
+    if came < 0:
+        _state(handle)[0].lost = -came
+    return came > 0
+
+
+@compiled
 def receive(handle, message):
     """The next message.
 
@@ -180,21 +195,20 @@ def receive(handle, message):
     state = _state(handle)
     if state[0].open == 0:
         return NOTHING
+    frame = _into(handle)
     for _ in range(_AT_ONCE):
-        there = state[0].lost == 0 and fetch(handle)
+        there = state[0].lost == 0 and _take_frame(handle, frame)
         if state[0].lost != 0:
             return LOST
         if not there:
             return NOTHING
-        frame = _into(handle)
-        deliver(_bus(handle), _places(handle), frame)
         size = process(handle, frame[0], message)
         if size != NOTHING:
             return size
     return NOTHING
 
 
-@cached
+@compiled
 def process(handle, frame, message):
     """Process a frame; returns the length of the message that it completes, or as ``receive``."""
     state, receiver = _state(handle)[0], _receiver(handle)
@@ -214,7 +228,7 @@ def process(handle, frame, message):
     return NOTHING
 
 
-@cached
+@compiled
 def sleep(handle, ms):
     """Sleep until the socket has a frame, at most ``ms``; not while a frame is on the bus."""
     if _state(handle)[0].open != 0 and not busy(_bus(handle)):
@@ -230,18 +244,18 @@ def can_port(node: Node) -> Port:
     return Port(node.handle, _send, _receive, _SPINS, _await)
 
 
-@port_function
+@free_port_function
 def _send(handle, message):
     return max(0, send(handle, message))
 
 
-@port_function
+@free_port_function
 def _receive(handle, message):
     size = receive(handle, message)
     return -1 if size == LOST else max(0, size)
 
 
-@port_function
+@free_port_function
 def _await(handle, message):
     sleep(handle, _PATIENCE)
     size = receive(handle, message)

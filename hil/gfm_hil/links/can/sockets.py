@@ -18,7 +18,7 @@ from numba import types
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
 from gfm_hil.links.system import errno_now, poll
 from gfm_hil.realtime.clock import now_ns
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 
 SOCKETCAN, LOOPBACK = range(2)
 _OTHERS = 3  # places of a loopback bus besides our own
@@ -52,18 +52,20 @@ def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = (
     record["poll"] = fd | select.POLLIN << _EVENTS
 
 
-@cached
+@compiled
 def write_frame(sockets, frame):
     """Send the frame in an array of ``wire.frame_dtype``; returns 0 or the errno."""
     s, address = sockets[0], frame.ctypes.data
     if s.kind == SOCKETCAN:
         size = MTU_FD if frame[0].flags & FD else MTU
         return 0 if _send(s.fd, address, size, _DONTWAIT) == size else errno_now()
-    problem = 0
+    problem = now = 0
     size = HEAD + frame[0].length
     for k in range(_OTHERS):
-        if s.empty_until[k] != 0 and now_ns() < s.empty_until[k]:
-            continue
+        if s.empty_until[k] != 0:
+            now = now or now_ns()
+            if now < s.empty_until[k]:
+                continue
         s.empty_until[k] = 0
         if _send(s.others[k], address, size, _DONTWAIT) != size:
             why = errno_now()
@@ -74,7 +76,7 @@ def write_frame(sockets, frame):
     return problem
 
 
-@cached
+@compiled
 def read_frame(sockets, frame):
     """Receive into the frame in an array of ``wire.frame_dtype``; returns 1, 0 if none is there,
     or the negative errno."""
@@ -89,7 +91,7 @@ def read_frame(sockets, frame):
     return 1
 
 
-@cached
+@compiled
 def sleep_for_frame(sockets, ms):
     """Sleep until the socket is readable, at most ``ms``."""
     poll(sockets.ctypes.data + _POLL_AT, 1, ms)

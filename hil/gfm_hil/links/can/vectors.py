@@ -22,7 +22,7 @@ from gfm_hil.links.can import wire
 from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
 from gfm_hil.realtime.atomics import copy
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import Vector
 
 #: a CAN frame: identifier and payload
@@ -117,7 +117,7 @@ def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r["status_width"] = [fields[name][0].itemsize for name in _STATUS]
 
 
-@cached
+@compiled
 def encode(sender, message, frames):
     """The CAN frames of a frame of the bench, in the order in which to send them.
 
@@ -172,12 +172,12 @@ def encode(sender, message, frames):
     return count
 
 
-@cached
+@compiled
 def _head(frame, number, length, flags):
     frame.id, frame.length, frame.flags = number, length, flags
 
 
-@cached
+@compiled
 def belongs(receiver, number):
     """Whether an identifier belongs to this vector or to its sender's status."""
     r = receiver[0]
@@ -187,7 +187,7 @@ def belongs(receiver, number):
     return number == r.status_number
 
 
-@cached
+@compiled
 def decode(receiver, frame, message):
     """Take a CAN frame of this vector (see ``belongs``).
 
@@ -214,7 +214,7 @@ def decode(receiver, frame, message):
     return _take_values(r, part, data, message)
 
 
-@cached
+@compiled
 def _take_status(r, data):
     sequence = _extend(r, np.int64(data[1]))
     if sequence < r.sequence:
@@ -227,13 +227,13 @@ def _take_status(r, data):
         r.last[k] = wire.number(data, r.status_at[k], r.status_width[k])
 
 
-@cached
+@compiled
 def _extend(r, counter):
     """The full sequence from its received low bits."""
     return r.sequence + (counter - r.sequence + _BEHIND) % _SEQUENCES - _BEHIND
 
 
-@cached
+@compiled
 def _take_values(r, part, data, message):
     counter = np.int64(data[1])
     if counter != r.counter:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gfm_hil.links.crc import crc32
 from gfm_hil.links.frame import DATA_IDS, buffer, wire_dtype
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 from gfm_runtime.signals import NU_INNER, NY_INNER, Vector, carried
 
 frame_dtype = np.dtype(
@@ -77,7 +77,7 @@ def _table() -> np.ndarray:
 _TABLE = _table()
 
 
-@cached
+@compiled
 def crc8(data_id, payload):
     """CRC of byte 0 over the data id and ``payload[1:]``."""
     crc = _TABLE[0xFF ^ (data_id & 0xFF)]
@@ -110,7 +110,7 @@ def size_and_head(group: Vector, inner: int) -> tuple[int, int]:
     return len(message), int.from_bytes(message[:_HEAD_BYTES].tobytes(), "little")
 
 
-@cached
+@compiled
 def number(data, at, width):
     """The little-endian number of ``width`` bytes."""
     value = np.int64(0)
@@ -119,26 +119,26 @@ def number(data, at, width):
     return value
 
 
-@cached
+@compiled
 def put_number(data, at, width, value):
     """Write the low ``width`` bytes of a number, little-endian."""
     for k in range(width):
         data[at + k] = (value >> (8 * k)) & 0xFF
 
 
-@cached
+@compiled
 def begins_with(head, message):
     """Whether a message, long enough, begins with these bytes."""
     return number(message, 0, _HEAD_BYTES) == head
 
 
-@cached
+@compiled
 def undamaged(message, size):
     """Whether the CRC of a frame of ``size`` bytes is right."""
     return crc32(message, size - CRC_BYTES) == number(message, size - CRC_BYTES, CRC_BYTES)
 
 
-@cached
+@compiled
 def seal(message, size):
     """Write the CRC of a frame of ``size`` bytes."""
     put_number(message, size - CRC_BYTES, CRC_BYTES, np.int64(crc32(message, size - CRC_BYTES)))

@@ -14,7 +14,7 @@ import numpy as np
 
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.crc import crc32
-from gfm_runtime.compiled import cached
+from gfm_runtime.compiled import compiled
 
 _RUN = 254  # bytes without a zero that one code byte covers
 _CRC = 4  # bytes, little-endian
@@ -25,7 +25,7 @@ MOST = _LONG + _LONG // _RUN + 1
 DAMAGED = -1
 
 
-@cached
+@compiled
 def _is_greeting(message, size):
     same = size >= len(_GREETING)
     for k in range(min(size, len(_GREETING))):
@@ -33,7 +33,7 @@ def _is_greeting(message, size):
     return same
 
 
-@cached
+@compiled
 def stuff(message, out):
     """Write a message as it goes to the line, with the zero that ends it; returns the bytes.
 
@@ -61,7 +61,7 @@ def stuff(message, out):
     return at + 1
 
 
-@cached
+@compiled
 def unstuff(piece, size, message):
     """Write the message of ``size`` > 0 bytes that stood between two zeros of the line, at most
     ``MOST``, into ``message``, room for as many; returns its length, or ``DAMAGED``."""

@@ -17,14 +17,15 @@ from numba import types
 from numpy.typing import NDArray
 
 from gfm_hil.links.base import LONGEST
-from gfm_hil.links.port import Port, port_function
+from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.links.serial.framing import DAMAGED, MOST, stuff, unstuff
 from gfm_hil.links.system import errno_now, poll
-from gfm_runtime.compiled import cached
+from gfm_hil.realtime.atomics import copy
+from gfm_runtime.compiled import compiled
 
 #: numbers of the handle: the open line (-1: none), counts, errno of a line that is gone, ends
 (FD, COUNT_DAMAGED, DROPPED, GONE, _CAME_AT, _CAME_END, _PIECE_END, _REST_AT, _REST_END, _POLL,
- _WAITING, _EMPTY, _MOST_EMPTY, _NAP, _NAP_NS) = range(15)  # fmt: skip
+ _WAITING, _EMPTY, _MOST_EMPTY, _NAP, _NAP_NS, _SINCE) = range(16)  # fmt: skip
 _NUMBERS = 16
 _WORD = 8
 _AT_ONCE = 4096  # bytes of a read
@@ -73,10 +74,10 @@ def set_line(h: NDArray[np.int64], fd: int) -> None:
     h[FD], h[_POLL] = fd, max(fd, 0) | select.POLLIN << _EVENTS
 
 
-@cached
+@compiled
 def flush(h):
     """Write what is left to write as far as there is room; whether that was all. If the line is
-    gone, GONE says why."""
+    gone, GONE says why, and nothing is left to write."""
     left = h[_REST_END] - h[_REST_AT]
     if left == 0:
         return True
@@ -85,22 +86,29 @@ def flush(h):
         why = errno_now()
         if why not in _NONE_NOW:
             h[GONE] = why
+            h[_REST_AT] = h[_REST_END]
         return False
     h[_REST_AT] += done
     return done == left
 
 
-@cached
+@compiled
 def send(h, message):
     """Send a message; 0 if the line has no room for it, or is gone."""
     if h[FD] < 0 or len(message) > LONGEST:
         return 0
     if flush(h):
-        if _ioctl(h[FD], _TIOCOUTQ, h.ctypes.data + _WORD * _WAITING) < 0:
-            h[GONE] = errno_now()  # the other side closed its pseudo terminal
-            return 0
-        if h[_WAITING] & 0xFFFFFFFF <= _ROOM:
-            h[_REST_AT], h[_REST_END] = 0, stuff(message, h[_REST:].view(np.uint8))
+        # no more can wait than at the last look and what was written since: a look takes 0.5 µs
+        if h[_WAITING] + h[_SINCE] > _ROOM:
+            if _ioctl(h[FD], _TIOCOUTQ, h.ctypes.data + _WORD * _WAITING) < 0:
+                h[GONE] = errno_now()  # the other side closed its pseudo terminal
+                return 0
+            h[_WAITING] &= 0xFFFFFFFF
+            h[_SINCE] = 0
+        if h[_WAITING] + h[_SINCE] <= _ROOM:
+            size = stuff(message, h[_REST:].view(np.uint8))
+            h[_REST_AT], h[_REST_END] = 0, size
+            h[_SINCE] += size
             flush(h)
             return 0 if h[GONE] else 1
     if h[GONE] == 0:
@@ -108,34 +116,36 @@ def send(h, message):
     return 0
 
 
-@cached
+@compiled
 def take(h, message):
     """The next message of the bytes that came: its length, or 0 if none is whole."""
+    if h[_CAME_AT] == h[_CAME_END]:
+        return 0
     came, piece = h[_CAME:_PIECE].view(np.uint8), h[_PIECE:_MESSAGE].view(np.uint8)
-    while h[_CAME_AT] < h[_CAME_END]:
-        byte = came[h[_CAME_AT]]
-        h[_CAME_AT] += 1
-        n = h[_PIECE_END]
+    whole = h[_MESSAGE:_REST].view(np.uint8)
+    end, n, size = h[_CAME_END], h[_PIECE_END], 0
+    for at in range(h[_CAME_AT], end):
+        byte = came[at]
         if byte != 0:
             if n <= MOST:  # a longer piece is damaged, up to its zero
                 piece[n] = byte
-                h[_PIECE_END] = n + 1
+                n += 1
             continue
         if n == 0:
             continue
-        h[_PIECE_END] = 0
-        whole = h[_MESSAGE:_REST].view(np.uint8)
         size = unstuff(piece, n, whole) if n <= MOST else DAMAGED
-        if size == DAMAGED:
-            h[COUNT_DAMAGED] += 1
-            continue
-        for k in range(min(size, len(message))):
-            message[k] = whole[k]
-        return size
-    return 0
+        n = 0
+        if size != DAMAGED:
+            end = at + 1
+            break
+        h[COUNT_DAMAGED] += 1
+        size = 0
+    h[_CAME_AT], h[_PIECE_END] = end, n
+    copy(message.ctypes.data, whole.ctypes.data, min(size, len(message)))
+    return size
 
 
-@cached
+@compiled
 def receive(h, message):
     """The next message: its length, 0 if none is there, -1 if the line is gone."""
     size = take(h, message)
@@ -161,12 +171,12 @@ def feed(h: NDArray[np.int64], some: bytes) -> None:
     h[_CAME_AT], h[_CAME_END] = 0, len(some)
 
 
-@port_function
+@free_port_function
 def _port_send(handle, message):
     return send(handle, message)
 
 
-@port_function
+@free_port_function
 def _port_receive(handle, message):
     size = receive(handle, message)
     if size == 0 and handle[_EMPTY] >= handle[_MOST_EMPTY]:
@@ -177,7 +187,7 @@ def _port_receive(handle, message):
     return size
 
 
-@port_function
+@free_port_function
 def _port_await(handle, message):
     size = receive(handle, message)
     if size == 0:

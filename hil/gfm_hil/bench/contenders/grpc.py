@@ -1,0 +1,70 @@
+"""gRPC, by the package grpcio: unary calls of plain bytes over a Unix socket."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from gfm_hil.bench.contenders import Contender, udp
+from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.core.roles import Role
+from gfm_hil.links.port import Port
+
+_SERVICE, _METHOD = "gfmhil", "exchange"
+_START_S = 10.0
+
+
+def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+    if "grpc" in names:
+        yield Contender("grpc", "grpc", f"unix:{place}/grpc", _open, "grpcio", limit=udp.LIMIT)
+
+
+def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+    """The controller is the server: u answers the call that brings y. Its guide to performance
+    prefers unary calls to streams in Python, which need more threads."""
+    return _server(c.endpoint, own) if role == "controller" else over_link(_Client(c.endpoint), own)
+
+
+class _Client:
+    """The plant's end: it calls and has the answer before it polls for one."""
+
+    port: Port | None = None
+
+    def __init__(self, endpoint: str) -> None:
+        import grpc
+
+        self._channel = grpc.insecure_channel(endpoint)
+        grpc.channel_ready_future(self._channel).result(_START_S)
+        self._call = self._channel.unary_unary(f"/{_SERVICE}/{_METHOD}")
+        self._answer: bytes | None = None
+
+    def send(self, message: bytes) -> bool:
+        self._answer = self._call(message)
+        return True
+
+    def receive(self) -> bytes | None:
+        answer, self._answer = self._answer, None
+        return answer
+
+    def close(self) -> None:
+        self._channel.close()
+
+
+def _server(endpoint: str, own: Messages) -> PingPong:
+    """A server that answers in a thread of its own."""
+    import grpc
+
+    answers = [row.tobytes() for row in own]
+    calls = iter(range(1 << 62))
+
+    def exchange(request: bytes, context: Any) -> bytes:
+        return answers[next(calls) % len(answers)]
+
+    server = grpc.server(ThreadPoolExecutor(1))
+    handlers = {_METHOD: grpc.unary_unary_rpc_method_handler(exchange)}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, handlers),))
+    server.add_insecure_port(endpoint)
+    server.start()
+    return PingPong(lambda *_: -1, lambda stop: None, lambda: server.stop(None).wait(), False)
