@@ -5,8 +5,6 @@ the DC side on S_n and the DC voltage reference V_dcref, so that v_dc = 1 p.u. a
 and one p.u. of power is the same on both sides.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

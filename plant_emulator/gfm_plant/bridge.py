@@ -10,8 +10,6 @@ until the circuit would drive it beyond: then a diode, or a switch, conducts.
 Even states of the gates are levels, the odd one above each is the dead time to the next one.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

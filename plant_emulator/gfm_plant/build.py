@@ -1,7 +1,5 @@
 """From options to records: computes once all constants that a tick needs."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

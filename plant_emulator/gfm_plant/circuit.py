@@ -16,8 +16,6 @@ frame that stands still belong to two real circuits, which have nothing to do wi
 ``join_axes`` makes one set of modes of both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -5,8 +5,6 @@ before, and tries the time of the zero until the current vanishes there: the cir
 exactly at every time, so this is the zero to rounding.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,8 +1,6 @@
 """The DC link, Eq. (8), along a piece of time: by its power series under the power that the bridge
 draws; and what limits its source: a battery's power and charge, and a chopper beside it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

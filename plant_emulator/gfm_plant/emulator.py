@@ -4,8 +4,6 @@ The functions are compiled and allocate nothing. `plant` is the `PlantRecords` o
 `gfm_plant.Network`, k the index of one of its converters; quantities are in p.u. of that converter.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

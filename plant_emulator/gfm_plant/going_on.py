@@ -5,8 +5,6 @@ Both ways are large and have several callers. So callers reach them by an addres
 records: each is compiled once, and the switched bridge only for a plant that has one.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

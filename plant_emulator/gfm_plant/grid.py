@@ -3,8 +3,6 @@
 Frequencies and voltages are in p.u., times in s. An event acts from the coming tick on.
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Sequence

@@ -8,8 +8,6 @@ mirror image: with a and b for what X^-1 takes from both axes,
     z = (a - j b)/2 w + (a + j b)/2 mirror.
 """
 
-from __future__ import annotations
-
 import cmath
 from typing import Any
 

@@ -6,8 +6,6 @@ for plants of any size, and a call passes no more than a pointer. Python sees th
 every array under its name. Currents and voltages are complex: space vectors in the common frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -8,8 +8,6 @@ x = (i_d, i_q, v_d, v_q, i_od, i_oq, delta, v_dc), u = (i_u, omega_u, E_u),
 y = (v_dc, p, omega_u, q, V) and d = (omega_g, V_g), as in the paper.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

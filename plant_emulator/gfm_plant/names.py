@@ -1,7 +1,5 @@
 """Names of the plant's true values, of its trips and of their reasons."""
 
-from __future__ import annotations
-
 from gfm_runtime.signals import D_NAMES, U_NAMES, Y_NAMES
 
 TRIPS = (

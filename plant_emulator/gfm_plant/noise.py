@@ -4,8 +4,6 @@ No generator state is carried along, so a sample does not depend on how often or
 others are drawn: every link, mode and restart sees the same noise.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Converter parameters: read from a TOML file in SI units, handed on in per unit."""
 
-from __future__ import annotations
-
 import errno
 import stat
 import tomllib

@@ -4,8 +4,6 @@ pieces of these.
 The functions are as those of `gfm_plant.emulator`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ The phases of a space vector x that turns in the common frame are Re(x e^(j omeg
 a = e^(j 2 pi/3) and n = 0, 1, 2; in p.u. they are p.u. of a phase's nominal peak value.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

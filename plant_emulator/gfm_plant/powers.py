@@ -10,8 +10,6 @@ each other. The powers of A are kept by what A depends on: which devices conduct
 at which limit the DC source is. Matrices are stored by columns.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -6,8 +6,6 @@ what the sums since the start were at each place of the last cycle. The differen
 exact to their rounding, so that nothing drifts.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The range and resolution of one A/D or D/A channel."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfm_runtime.compiled import compiled

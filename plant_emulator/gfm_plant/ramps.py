@@ -1,7 +1,5 @@
 """The grid simulator from tick to tick: its ramps, sags and unbalance."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from gfm_runtime.compiled import compiled

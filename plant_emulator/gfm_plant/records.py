@@ -7,8 +7,6 @@ network p.u. of the first converter's. The order of measured channels is (v_dc, 
 of an inner stage.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

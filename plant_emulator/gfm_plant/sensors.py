@@ -1,7 +1,5 @@
 """The measurements of the controller: the true quantities through sensors and A/D."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -14,8 +14,6 @@ An unbalanced fault acts on two axes, on which the real and the imaginary parts 
 have rates of their own, see `circuit`; all vectors are then turned so that alpha is real.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

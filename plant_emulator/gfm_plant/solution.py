@@ -14,8 +14,6 @@ conj(s) e^(-2 j omega_b t), which are phasors too: they turn at -omega where a s
 omega. See `circuit.join_axes`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The plant's equilibrium: x and u for a given power and voltage."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ whole cycles. A side below 0.2 p.u. is dead: it has no angle, and the check does
 nor does it close while an unbalanced fault is there.
 """
 
-from __future__ import annotations
-
 import math
 
 from gfm_plant.layout import field

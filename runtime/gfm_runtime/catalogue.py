@@ -5,8 +5,6 @@ converter, ``laws/grid`` those for grid codes, with a declared droop of 5 %. The
 the others, but ``law_names`` does not list them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterable

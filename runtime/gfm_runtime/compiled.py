@@ -20,8 +20,6 @@ Both act on the functions that are decorated here and on no others: a program th
 numba as it is.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from functools import cache

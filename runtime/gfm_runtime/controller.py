@@ -9,8 +9,6 @@ and stops sending SAFE, and the controller goes to RUNNING. In a network the oth
 there the controller begins with the voltage and the frequency that it measures.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

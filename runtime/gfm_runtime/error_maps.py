@@ -17,8 +17,6 @@ hybrid-angle    column 2: e = sin((delta_ref - delta)/2), [Tayyebi2020hybrid] in
 =============== ==================================================================================
 """
 
-from __future__ import annotations
-
 import math
 
 from gfm_runtime.compiled import inlined

@@ -1,7 +1,5 @@
 """Arithmetic over named parameters in a law file, e.g. ``"2 * H * D_p"``."""
 
-from __future__ import annotations
-
 import ast
 import math
 import operator

@@ -12,8 +12,6 @@ correlation above COHERENT), and is held otherwise: in a transient that comes fr
 without the angle and would tell nothing.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import count
 from typing import Any

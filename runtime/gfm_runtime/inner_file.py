@@ -4,8 +4,6 @@ The shipped ones are in ``gfm_runtime/inner_stages``. A number may be an express
 parameters of the law that has the table.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import TypeAdapter

@@ -5,8 +5,6 @@ A law reaches the kernel as one record of ``law_dtype`` (constants) and one of `
 same bytes. The kernel knows no law by name, allocates nothing, calls no BLAS and no clock.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -7,8 +7,6 @@ channel only. With a nonlinear error map the references and measurements are map
 (``gfm_runtime.error_maps``); column 3 feeds back the law's own omega_u.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What pydantic finds wrong with a file, in one line a mistake."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, get_args

@@ -6,8 +6,6 @@ the DC integrator, the inertia factor, the q-V integrator). States are scaled by
 that a law with time constants of microseconds and of seconds stays well conditioned.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

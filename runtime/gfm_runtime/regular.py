@@ -1,7 +1,5 @@
 """Reading regular files only: a pipe or a device may have no end, and opening one may wait."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """Tables of one kind in TOML that are shipped under a name, or stand in a file of the user."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files

@@ -17,8 +17,6 @@ Add signals at the end of a group only; anything else is a new ``TABLE_VERSION``
 sides of a link compare before they start.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import astuple, dataclass, replace

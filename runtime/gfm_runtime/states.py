@@ -1,7 +1,5 @@
 """The states of the controller and the reasons for its safe state, as codes and in words."""
 
-from __future__ import annotations
-
 INIT, READY, RUNNING, SAFE, STOPPED = range(5)
 STATES = ("INIT", "READY", "RUNNING", "SAFE", "STOPPED")
 

@@ -6,8 +6,6 @@ trend of u carried over. A row without states cannot absorb the difference betwe
 there it goes into ``state.offset``, which decays with the law's T_off.
 """
 
-from __future__ import annotations
-
 from gfm_runtime.compiled import compiled
 from gfm_runtime.inner import settle_inner, take_measurements
 from gfm_runtime.kernel import look, output, set_inputs

@@ -4,8 +4,6 @@ Tables and arrays of the result are nested at most ``MAX_DEPTH`` deep, so that c
 may walk through them by recursion.
 """
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import suppress
 from pathlib import Path

@@ -7,8 +7,6 @@ Column 3 of B_y and D_y multiplies the law's own omega_u[k] *of the same tick*: 
 the scalar loop omega_u = (...) + D_y[1,2] omega_u in closed form, so no hidden delay enters.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ The poles of Y cancel, and the zeros of the denominator are in the left half pla
 0 as often, clockwise, as the closed loop on Z has unstable poles.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

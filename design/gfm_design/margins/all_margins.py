@@ -1,7 +1,5 @@
 """All margins of a loop: each loop on its own, all channels at once, delay, elements, the grid."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

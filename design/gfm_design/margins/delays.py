@@ -14,8 +14,6 @@ clockwise, for each unstable pole of A_d. Eigenvalues then judge the two ends of
 the scan found, and refine it; should they not agree with the count, they scan themselves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

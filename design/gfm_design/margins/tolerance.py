@@ -4,8 +4,6 @@ Each element varies alone, and the operating point is solved for each value. A v
 operating point counts as unstable: the converter cannot run there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

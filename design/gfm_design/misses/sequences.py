@@ -15,8 +15,6 @@ Words bound it from below. Pieces of K ticks may have 2 m misses in the K ticks 
 joint: what they prove for at most m of K is true, but not all that is true.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property

@@ -10,8 +10,6 @@ The state is that of the loop, and the u that acts without a new one, where the 
 not begin with it anyway: x = (plant, delay lines, controller, last u, the two newest u that came).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

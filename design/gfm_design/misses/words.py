@@ -5,8 +5,6 @@ no word of up to n misses, with any number of hits behind them, is unstable. Suc
 disturbance that comes back does; whether every sequence is stable is asked in ``sequences``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

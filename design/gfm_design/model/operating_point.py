@@ -6,8 +6,6 @@ x = A x + B (r, y) and u = u_0 + C x + D (r, y) at its sampling time, with y as 
 it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act.
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Callable, Sequence

@@ -10,8 +10,6 @@ An unstable system has no H-infinity norm, although its L-infinity norm may be f
 refused, with the unstable eigenvalue.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -11,8 +11,6 @@ dR = R dA R. A peak also moves along the frequency as the gains move: over (x, l
 saddle, and ln omega is eliminated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple

@@ -7,8 +7,6 @@ Signals are deviations in p.u. from an operating point; omega_g is the grid's fr
 controller's own reference omega_g stays where it is (no PLL, as in the paper's MIMO-GFM).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

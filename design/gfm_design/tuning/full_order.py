@@ -16,8 +16,6 @@ project) requires full rank at every frequency. For that, small multiples of all
 are added to w and z. They can only raise gamma_j: the bound holds up to a part of order 1e-4.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -7,8 +7,6 @@ file in one pass. ``gfm_runtime.realisation`` builds one law with all checks, in
 a search asks for thousands.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -12,8 +12,6 @@ An unstable point costs more than any stable one, by its spectral abscissa: the 
 stabilises the loop, then lowers gamma.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

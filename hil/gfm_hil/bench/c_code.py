@@ -1,7 +1,5 @@
 """C sources of the benchmark, compiled at run time if there is a compiler, and their laws."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shlex

@@ -6,8 +6,6 @@ the distribution of times. Of many rows some differ by chance, so Holm's method 
 values for their number.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

@@ -4,8 +4,6 @@
 64 MB (memory), writes that reach the disk (files), datagrams to itself (network).
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -3,8 +3,6 @@
 It neither encrypts nor knows its peer, so no run uses it.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import socket

@@ -5,8 +5,6 @@ They speak the protocol of docs/own-controller.md, so that any controller can an
 CLOCK_TAI may be off, in ns as integers; 0: its clock is CLOCK_MONOTONIC.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of ``gfmhil bench latency`` for other tools."""
 
-from __future__ import annotations
-
 import io
 import json
 import time

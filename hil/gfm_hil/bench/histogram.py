@@ -4,8 +4,6 @@ As in HdrHistogram: below 2^``BITS`` ns every value has its own bucket; above, e
 divided into 2^(``BITS`` - 1) buckets, so that a bucket is at most 1/64 of its value wide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

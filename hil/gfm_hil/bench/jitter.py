@@ -4,8 +4,6 @@ Both processors pace at the same time, as the two sides of a run do. No link and
 the ticks lost here: they are the host's share of the misses.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """Round trips of every link and of the limit in C, in interleaved rounds of one run."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable

@@ -6,8 +6,6 @@ ticks without a fresh u, their causes, and how many ticks a loop that only paces
 machine right before and after.
 """
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import tempfile

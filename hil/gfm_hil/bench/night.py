@@ -5,8 +5,6 @@ histogram, its worst times with their causes, and its bursts. A kill costs at mo
 was being measured: a line that is cut off counts for nothing, and goes when the night goes on.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections import Counter

@@ -7,8 +7,6 @@ trip, less the time between t2 and t3. Whether the ways there and back are equal
 measured so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The options of ``gfmhil bench``, checked, and the measurements that they ask for."""
 
-from __future__ import annotations
-
 import math
 import time
 from argparse import Namespace

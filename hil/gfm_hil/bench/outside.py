@@ -4,8 +4,6 @@ Their threads wait for the same deadlines by the same calls as our own ``nanosle
 processors, with the same priority and without a setting of the machine.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """bench.html: a result as one self-contained file."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from pathlib import Path

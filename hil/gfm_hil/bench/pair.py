@@ -4,8 +4,6 @@ Both open every contender at the start, so that a round of one can follow a roun
 once. Both are pinned; with the policy fifo they also get the real-time priority of a run's sides.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil

@@ -4,8 +4,6 @@ This side is a plant without a plant: its y is that of the operating point, and 
 u. The other side is ``gfmhil bench answer``, or any controller of docs/own-controller.md.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

@@ -10,8 +10,6 @@ included. ``stop`` are three numbers in memory that both processes share: not 0 
 wait for a deadline, and ``period_ns``.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import time

@@ -1,7 +1,5 @@
 """Figures of a result: percentiles in HdrHistogram's style, misses, lockstep, kernel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

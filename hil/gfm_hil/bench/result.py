@@ -4,8 +4,6 @@ It has ``results`` (rows of `latency`), ``jitter``, ``kernel`` and ``loop`` (tho
 requested), ``remarks``, ``environment``, ``caveats`` and ``seconds``.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

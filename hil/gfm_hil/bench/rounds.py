@@ -4,8 +4,6 @@ A turn is the fastest of a few short runs, since other work on the machine only 
 is computed per turn, between runs that follow each other at once; then the median is taken.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 import time

@@ -4,8 +4,6 @@ There the answer is back at the first look. What remains is reading the clock, c
 and, with frames whose clocks are compared, their CRCs on both sides.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfm_hil.bench.exchange import frames, send_all

@@ -5,8 +5,6 @@ after the next one. The highest rate is that at which at most a share of them mi
 of its logarithm. Cost is the processor time of both sides over that of the round.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time

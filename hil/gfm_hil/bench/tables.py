@@ -1,7 +1,5 @@
 """The results as tables: headings, columns and cells, for a terminal and for the page."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any

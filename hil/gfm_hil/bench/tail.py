@@ -1,7 +1,5 @@
 """How sure a percentile is, and what lies beyond the data, from the histogram of many times."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

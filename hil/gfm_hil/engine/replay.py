@@ -5,8 +5,6 @@ itself, or an earlier one after a miss (-1: the u of the start). Both sides then
 they did in real time, so that the run has the same bits each time.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The interface of a link: it carries whole messages and never blocks past the given timeout."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

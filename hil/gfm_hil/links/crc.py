@@ -5,8 +5,6 @@ until 16 are left (V. Gopal et al., "Fast CRC Computation for Generic Polynomial
 Instruction", Intel, 2009); tables process those 16, and all bytes on other processors.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

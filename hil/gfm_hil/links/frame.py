@@ -3,8 +3,6 @@
 ``frame_dtype`` gives the layout.
 """
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

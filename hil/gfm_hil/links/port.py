@@ -4,8 +4,6 @@ A loop is compiled once for all links: it gets the functions as values and calls
 their address (3 ns). They use no Python object and never take the interpreter's lock.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

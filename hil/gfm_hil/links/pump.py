@@ -4,8 +4,6 @@ The compiled loop writes to and reads from two rings in this process's memory. T
 link: it takes what the loop sends from one ring and puts what arrives into the other.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

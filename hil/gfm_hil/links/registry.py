@@ -4,8 +4,6 @@ A package adds a link by an entry point of the group ``gfmhil.links`` that has t
 loads a ``LinkKind``.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points

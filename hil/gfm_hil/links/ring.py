@@ -11,8 +11,6 @@ A ring may have a bell, a word by which a reader that sleeps is woken: not 0 whi
 writer that does not know it only lets the reader sleep for longer.
 """
 
-from __future__ import annotations
-
 import platform
 import sys
 from typing import Any

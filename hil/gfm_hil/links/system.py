@@ -1,7 +1,5 @@
 """What the links' compiled functions share of libc: errno and poll."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import int64, types

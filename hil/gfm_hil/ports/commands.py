@@ -1,7 +1,5 @@
 """An operator: finds a run by its folder, sends commands to it and reads its growing recording."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ asyncio's servers accept every connection, up to the last descriptor of the proc
 have a limit of their own, so that any number of them takes no place from those that have.
 """
 
-from __future__ import annotations
-
 import contextlib
 import resource
 import socket

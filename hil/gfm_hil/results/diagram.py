@@ -4,8 +4,6 @@ Drawn from the scenario alone, with its parameters in p.u. of each converter; th
 lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

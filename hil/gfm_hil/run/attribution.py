@@ -14,8 +14,6 @@ Where somebody watched the processors (``gfm_hil.run.stalls``), what stood still
 and a tick is not the link's if something else had a processor for most of what it lacked.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from itertools import pairwise

@@ -5,8 +5,6 @@ pages of the kernel's ring buffer (include/linux/ring_buffer.h of Linux) and kee
 processor for a while.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

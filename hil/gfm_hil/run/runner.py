@@ -1,7 +1,5 @@
 """A whole run: one process or two, and a run folder in the end, however it ended."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import time

@@ -1,7 +1,5 @@
 """Time on the processors of a real-time loop that others had, and who of them explains a stall."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal

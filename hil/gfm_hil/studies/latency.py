@@ -1,7 +1,5 @@
 """Ticks without a new u that were measured, beside what laws bear."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The linear loop of a scenario, at the operating point where the run starts."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Two figures of margins: the stable region over the line, and sigma over the added delay."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

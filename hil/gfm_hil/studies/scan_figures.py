@@ -1,7 +1,5 @@
 """Figures of a measured admittance: its entries, passivity, NFP plot, and eigenloci on a grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path

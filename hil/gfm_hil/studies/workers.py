@@ -1,7 +1,5 @@
 """Tasks of a study on several processes, and how a study tells what goes on."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

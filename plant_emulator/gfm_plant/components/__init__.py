@@ -3,8 +3,6 @@
 A new component is a file here and a field there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 

@@ -11,8 +11,6 @@ extrapolated from the beginning of the piece: the error falls with the square of
 piece. v_f itself follows the parabola through v at the beginning, the middle and the end.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np

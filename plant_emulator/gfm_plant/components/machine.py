@@ -1,7 +1,5 @@
 """A synchronous machine in its classical model."""
 
-from __future__ import annotations
-
 import cmath
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar

@@ -1,8 +1,6 @@
 """What a component of a network declares: the rest of the plant, the linear model, the diagram and
 the documentation read it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar

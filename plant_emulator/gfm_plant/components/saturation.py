@@ -12,8 +12,6 @@ the error falls with the square of the length of a piece. The flux follows the v
 rule. Resistances of the circuit alone take a constant flux away.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar
 

@@ -7,8 +7,6 @@ where p is the power that comes, p.u. of the network, and S the rating over that
 Within a tick omega is held at its value in the middle, extrapolated.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -24,8 +24,6 @@ extrapolated, and rotor and regulator go on by Heun's rule under the currents at
 error falls with the square of T_s. V is the mean over a tick, which e'', R and X'' give.
 """
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self

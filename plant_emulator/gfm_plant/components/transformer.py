@@ -1,7 +1,5 @@
 """A transformer."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

@@ -8,8 +8,6 @@ stage limits, and a current loop gives the bridge's voltage e = e_d + j e_q.
 A kind of stage is a file: its options, its i* in a tick, and its line in ``Inner``.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, get_args
 

@@ -9,8 +9,6 @@ the grid's angle carry no power that could bring the angle back.
 Source: Paquette and Divan, IEEE Trans. Ind. Appl. 51(2), 2015: virtual impedance current limiting.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -10,8 +10,6 @@ loops; Qoria et al., IEEE Open Access J. Power Energy 7, 2020: threshold virtual
 0.67 p.u.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Eclipse Cyclone DDS, by the package cyclonedds."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path

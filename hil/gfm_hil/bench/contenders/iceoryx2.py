@@ -1,7 +1,5 @@
 """iceoryx2, a package from PyPI for shared memory."""
 
-from __future__ import annotations
-
 import ctypes
 import secrets
 from collections.abc import Iterator, Sequence

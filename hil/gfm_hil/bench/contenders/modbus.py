@@ -1,7 +1,5 @@
 """Modbus/TCP, by the package pymodbus."""
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import threading

@@ -1,7 +1,5 @@
 """NNG, by the package pynng."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The link over a pseudo terminal, and its limit: the same bytes on one in C."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The link ``shm``, and its limit in C: shared memory, a file that both sides map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every link that has no file of its own, and their limit: UDP in C on the loopback interface."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Eclipse Zenoh, by the package eclipse-zenoh."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The link ``zmq`` over ipc and tcp and without its port, and its limits: C on the same libzmq."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """CAN and CAN FD through python-can, and a bus on the loopback device."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 from pathlib import Path

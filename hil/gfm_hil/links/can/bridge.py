@@ -1,7 +1,5 @@
 """Joins a bus of python-can to a socket, so that a node works on a socket whatever the bus is."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -8,8 +8,6 @@ Both vectors share one bus, so that an exchange takes the sum of their frames. O
 almost full, an additional frame (a state that changed, see ``vectors``) makes one exchange late.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ identifier wins the bus: states first, then commands, then measurements, then th
 frames are those of ISO-TP and have no signals.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from typing import Any
 

@@ -7,8 +7,6 @@ end. The clock is the wall clock, so the delay matters only in real time: a run 
 longer and gives the same results. Without emulation a frame is delivered as it arrives.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfm_hil.links.can.bus_time import frame_time

@@ -3,8 +3,6 @@
 cantools reads the DBC once, at the start; the loop never calls it.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

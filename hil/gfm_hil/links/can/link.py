@@ -1,7 +1,5 @@
 """The CAN link: one side's node on a socket, and the handshake over ISO-TP (ISO 15765-2)."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging

@@ -6,8 +6,6 @@ other nodes, as one datagram that holds Linux' ``struct canfd_frame``. Like ``vc
 no time and loses frames only when a receiver's buffer overflows; it never leaves the machine.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -5,8 +5,6 @@ and compiled loops use the same node through the same code. The node reads and w
 ``sockets``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

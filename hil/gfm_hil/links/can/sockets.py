@@ -4,8 +4,6 @@ SocketCAN, and a ``Bridge`` in its place, transfer whole structures; on the loop
 ``loopback``) a frame goes to each of the other places as a datagram.
 """
 
-from __future__ import annotations
-
 import errno
 import select
 import socket

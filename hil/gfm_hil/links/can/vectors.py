@@ -14,8 +14,6 @@ loss the count of lost frames misses multiples of 64.
 A CAN frame that fails its check becomes a frame that fails the reader's check and is counted.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from gfm_hil.links.can import wire

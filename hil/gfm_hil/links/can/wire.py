@@ -3,8 +3,6 @@
 A datagram ends with the last data byte; SocketCAN requires whole structures.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 

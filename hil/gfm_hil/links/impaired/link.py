@@ -1,7 +1,5 @@
 """A link with an impairment stage at its receiving end, and the same interface."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

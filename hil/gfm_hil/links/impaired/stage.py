@@ -5,8 +5,6 @@ generator's state, counters, and a queue of delayed messages. One compiled imple
 every link, in Python and in compiled loops.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """A serial line: UART, USB-CDC or RS-485, and a pseudo terminal on one machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic import Field

@@ -6,8 +6,6 @@ wherever a reader begins, and whatever was lost or damaged before. A frame has a
 greeting, which has none, gets one here.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ All state is in one int64 array, the ``handle`` of the port: numbers first, then
 came, of the piece of a message up to its zero, of the message, and of what is still to be written.
 """
 
-from __future__ import annotations
-
 import errno
 import select
 import termios

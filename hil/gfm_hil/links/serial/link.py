@@ -1,7 +1,5 @@
 """The serial link: one side's end of a line, which pyserial opens and sets up."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -1,7 +1,5 @@
 """Shared memory between two processes on one machine."""
 
-from __future__ import annotations
-
 import secrets
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shared-memory link: a ring each way; the controller creates the memory, the plant joins it."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

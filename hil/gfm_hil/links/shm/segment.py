@@ -6,8 +6,6 @@ distinguishes the segment of a killed run from one in use. A process locks the f
 makes, joins or removes a segment; no process holds the lock during a run.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import mmap

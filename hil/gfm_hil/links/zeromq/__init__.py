@@ -1,7 +1,5 @@
 """ZeroMQ over ipc or tcp."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from gfm_hil.core.roles import Role

@@ -4,8 +4,6 @@ A folder of keys holds ``<role>.key``, the public key, and ``<role>.key_secret``
 A side needs its own secret key and the other side's public key.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

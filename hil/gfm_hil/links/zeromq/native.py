@@ -4,8 +4,6 @@ It is the library that pyzmq has loaded, so that both use the same socket. A soc
 another thread after a full memory fence; starting and joining a thread is one.
 """
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

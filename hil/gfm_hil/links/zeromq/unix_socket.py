@@ -1,8 +1,6 @@
 """The file of an ipc endpoint: checks that a process of our own user made it and listens there, and
 that no other user can replace it."""
 
-from __future__ import annotations
-
 import os
 import socket
 import stat

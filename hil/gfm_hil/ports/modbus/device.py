@@ -5,8 +5,6 @@ resulting commands to the run, which checks them again, and only then stores any
 out one request at a time; clients can read meanwhile.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar

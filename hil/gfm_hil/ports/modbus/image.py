@@ -4,8 +4,6 @@ A register belongs to one point; a point is identified by its path, such as ``70
 ``705.Crv2.Pt1.V``. Scale factors are set once, here, and never change.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """What the device knows of its run, and its read-only points: name plate, measurements, state."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

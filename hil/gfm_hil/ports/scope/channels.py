@@ -1,7 +1,5 @@
 """The channels of a scope: recorded columns with names and units, and figures of the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ order, float32 minimum and maximum of every bin; then float32 mean, over the las
 them and of the watched channels.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scope as a port: it also shows runs that are over."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -5,8 +5,6 @@ once as ticks arrive; level 0 is the recording itself. A window of any length is
 coarsest level that resolves it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

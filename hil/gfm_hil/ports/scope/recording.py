@@ -1,7 +1,5 @@
 """The recording behind a scope: of a run in progress or of a finished one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

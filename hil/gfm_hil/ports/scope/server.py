@@ -1,7 +1,5 @@
 """The scope's server: one port for page and WebSocket; it polls the run 30 times a second."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http

@@ -1,7 +1,5 @@
 """One page's connection: who may open and control, its requests, and its messages."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

@@ -10,8 +10,6 @@
 A write becomes a command to the run's command server, whose checks and limits hold therefore.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import time

@@ -1,7 +1,5 @@
 """A run as the memory of an XCP slave: a port on UDP or a CAN FD bus (ASAM MCD-1 XCP, part 3)."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import select

@@ -4,8 +4,6 @@ It has the commands with which a tool measures by polling and calibrates; DAQ li
 pages and programming are not there, and are answered by ERR_CMD_UNKNOWN. One master at a time.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 """Run folders as files that other tools open: MF4, MAT, Parquet, CSV, and CAN traffic as BLF; what
 each format needs to be installed, and writing one whole or not at all."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module

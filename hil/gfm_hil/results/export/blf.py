@@ -8,8 +8,6 @@ not the words that end a run. All that is on a bus is for a logger on that bus, 
 ``python -m can.logger``.
 """
 
-from __future__ import annotations
-
 import heapq
 from bisect import bisect_right
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ value-to-text conversions; the log's lines are the file's events, at their tick 
 summary and log are attached as they are.
 """
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """CSV, MAT and Parquet: what a library writes, in a page of ours each."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

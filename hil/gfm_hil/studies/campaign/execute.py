@@ -1,8 +1,6 @@
 """A campaign: checked, and run in chunks on the cores of this machine or on a Dask cluster; its
 records on disk: JSON, one run a line, so that nothing done is ever lost."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The map of a campaign: what became of every run over two parameters, one panel a law."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

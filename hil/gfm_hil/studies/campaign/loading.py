@@ -1,7 +1,5 @@
 """Reading a campaign file, and checking all of it before anything starts."""
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Callable, Mapping

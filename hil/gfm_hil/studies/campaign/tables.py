@@ -1,7 +1,5 @@
 """The closing tables of a campaign on the terminal."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a worker does: a chunk of runs in process, each turned into a small record."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

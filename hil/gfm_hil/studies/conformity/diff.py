@@ -5,8 +5,6 @@ several times, by its turn. If each report has one law, these two are compared w
 called, so that a changed law may have another name or path.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The parts of all tests under all laws, on several processes: each is run, judged and drawn."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Mapping, Sequence

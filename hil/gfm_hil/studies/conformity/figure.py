@@ -1,7 +1,5 @@
 """The picture of a part, and that of the matrix of all verdicts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hashes of what a report rests on."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files

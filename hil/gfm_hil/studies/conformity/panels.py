@@ -1,8 +1,6 @@
 """What the figures of a part show: the judged signals with windows and limits, as few points as
 the eye needs, for the picture and for the page that lets a reader zoom."""
 
-from __future__ import annotations
-
 import base64
 import math
 import zlib

@@ -1,7 +1,5 @@
 """What the tests showed of one law or several, and the files that say so."""
 
-from __future__ import annotations
-
 import json
 import math
 import platform

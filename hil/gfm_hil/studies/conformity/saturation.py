@@ -1,8 +1,6 @@
 """Which clauses are judged while a limiter of the controller acts: their verdict is then about the
 limiter as much as about the law."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

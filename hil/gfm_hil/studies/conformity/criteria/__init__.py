@@ -4,8 +4,6 @@ is judged by it.
 A new kind is a file with ``CRITERION`` and its name in ``KINDS``.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Union
 

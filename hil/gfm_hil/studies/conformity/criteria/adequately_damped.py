@@ -1,7 +1,5 @@
 """The swing of p is adequately damped, as the Australian rules define it."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

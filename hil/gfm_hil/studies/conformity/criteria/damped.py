@@ -1,7 +1,5 @@
 """The swing of p is damped."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

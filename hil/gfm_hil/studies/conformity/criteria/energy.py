@@ -1,7 +1,5 @@
 """A change of frequency takes enough energy out of the converter."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """p answers a phase jump as a swing equation with such a damping ratio would."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """p stays in the envelope of what a unit of such damping, inertia and reactance does."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Literal

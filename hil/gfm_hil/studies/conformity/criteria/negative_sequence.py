@@ -1,7 +1,5 @@
 """The converter gives a current of the negative sequence against an unbalance."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

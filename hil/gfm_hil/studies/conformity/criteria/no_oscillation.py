@@ -1,7 +1,5 @@
 """All is at rest at the end."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """A signal moves by at least so much."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

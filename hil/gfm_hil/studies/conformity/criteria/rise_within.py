@@ -1,7 +1,5 @@
 """A signal rises fast enough, and does not fall back."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """A signal settles at a value."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """The converter keeps synchronism with the grid."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 import numpy as np
