@@ -40,11 +40,8 @@ class Bases:
         return self.omega_n
 
     def base_of(self, quantity: str) -> float:
-        """Return the SI value that is 1 p.u. of `quantity`.
-
-        Raises:
-            ValueError: If `quantity` is none of `QUANTITIES`.
-        """
+        """Return the SI value that is 1 p.u. of `quantity`. Raises ValueError: If `quantity` is
+        none of `QUANTITIES`."""
         S, V, w = self.S_n, self.V_n, self.omega_n
         Z, Z_dc = V**2 / S, self.V_dcref**2 / S
         values = (

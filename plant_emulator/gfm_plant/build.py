@@ -313,11 +313,8 @@ _LEAST_COUNTS = 50
 
 
 def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
-    """Pack a switched bridge, if it is one.
-
-    Raises:
-        ValueError: its times or its timer do not fit.
-    """
+    """Pack a switched bridge, if it is one. Raises ValueError: its times or its timer do not
+    fit."""
     bridge, where = options.bridge, f"{where}.bridge"
     bases = load_converter(options.converter).bases
     par["leg"] = math.sqrt(2 / 3) * bases.V_dcref / bases.V_n
@@ -370,11 +367,7 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
 
 def _carrier(converters: Mapping[str, tuple[Plant, str]], T_s: float) -> tuple[int, int]:
     """Return the periods of the carrier in T_s, 0 if no bridge is switched, and how often compare
-    values are loaded in one.
-
-    Raises:
-        ValueError: the bridges differ.
-    """
+    values are loaded in one. Raises ValueError: the bridges differ."""
     found = {
         (0, 1) if b.kind == "average" else (round((b.carrier_hz or 1 / T_s) * T_s), b.updates)
         for b in (options.bridge for options, _ in converters.values())

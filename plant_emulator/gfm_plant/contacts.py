@@ -77,11 +77,8 @@ def zero_circuit(wiring: Wiring) -> Circuit:
 
 
 def join(wiring: Wiring, omega_b: float) -> Joint:
-    """Return the system of a wiring whose contacts are all closed.
-
-    Raises:
-        ValueError: as `circuit.find_modes`.
-    """
+    """Return the system of a wiring whose contacts are all closed. Raises ValueError: as
+    `circuit.find_modes`."""
     fault, place = wiring.fault, "" if wiring.fault is None else wiring.fault_node
     closed = wiring.with_poles()
     circuit, _ = closed.circuit(wiring.blocked, None, 0, place or GROUND)

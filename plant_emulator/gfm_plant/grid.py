@@ -28,11 +28,8 @@ LEAST_SEGMENT = 1e-3
 
 def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) -> None:
     """Step the frequency of an ideal grid to `omega_g`, or ramp it there at `rate` (p.u./s, > 0).
-
-    Raises:
-        ValueError: If a value is out of range, the grid is finite and has its own frequency, or
-            there is none.
-    """
+    Raises ValueError: If a value is out of range, the grid is finite and has its own frequency, or
+    there is none."""
     _needs_grid(plant)
     if len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
@@ -76,11 +73,8 @@ def grid_voltage(
 
 
 def grid_load(plant: Network, change: float) -> None:
-    """Add `change` to the load of a finite grid, p.u. of the grid's rating.
-
-    Raises:
-        ValueError: If the grid is ideal, or `change` is not finite.
-    """
+    """Add `change` to the load of a finite grid, p.u. of the grid's rating. Raises ValueError: If
+    the grid is ideal, or `change` is not finite."""
     _require("change", change, True, "finite")
     if not len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
@@ -154,11 +148,8 @@ def fault(
 
 
 def _phases(kind: str, phases: str | None, Z_0: complex | None) -> str:
-    """The phases that a fault connects.
-
-    Raises:
-        ValueError: If there is no such kind, or it cannot have these phases or this impedance.
-    """
+    """The phases that a fault connects. Raises ValueError: If there is no such kind, or it cannot
+    have these phases or this impedance."""
     if kind not in FAULTED_PHASES:
         raise ValueError(f"kind = {kind!r}: must be one of {list(FAULTED_PHASES)}")
     allowed = list(FAULTED_PHASES[kind])
@@ -178,11 +169,8 @@ def _place(
     wiring: Wiring, position: float | None, line: str | None, node: str | None
 ) -> tuple[str, str | None, str]:
     """The node of a fault, or that at the start of its branch; the name of the branch if the fault
-    is inside one; and the words for the place.
-
-    Raises:
-        ValueError: If there is no such place, or no current could flow there.
-    """
+    is inside one; and the words for the place. Raises ValueError: If there is no such place, or no
+    current could flow there."""
     inside = None
     if position is not None:
         inner = LEAST_SEGMENT <= position <= 1 - LEAST_SEGMENT
@@ -244,11 +232,8 @@ def grid_unbalance(
 
 
 def phase_jump(plant: Network, degrees: float) -> None:
-    """Advance the grid's angle by `degrees`, so that delta falls by as much.
-
-    Raises:
-        ValueError: If `degrees` is not finite, or there is no grid.
-    """
+    """Advance the grid's angle by `degrees`, so that delta falls by as much. Raises ValueError: If
+    `degrees` is not finite, or there is no grid."""
     _needs_grid(plant)
     _require("degrees", degrees, True, "finite")
     angle = math.radians(degrees)
@@ -263,11 +248,8 @@ def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
     """Set the line to `L_g` and `R_g` times the elements of the converter file.
 
     The line's current does not jump. In an island the flux of line and load does not jump, so that
-    the current may. The ``factors`` of the options are not applied again.
-
-    Raises:
-        ValueError: If L_g <= 0 or R_g < 0, or a mode becomes too fast for the DC link. The plant
-            is then unchanged.
+    the current may. The ``factors`` of the options are not applied again. Raises ValueError: If L_g
+    <= 0 or R_g < 0, or a mode becomes too fast for the DC link. The plant is then unchanged.
     """
     _require("L_g", L_g, L_g > 0, "a factor > 0")
     _require("R_g", R_g, R_g >= 0, "a factor >= 0")
@@ -438,11 +420,8 @@ def finish_check(plant: Network) -> SynchroCheckResult | None:
 
 
 def _breaker(plant: Network, name: str) -> tuple[str, str, str]:
-    """The branch or shunt that a breaker opens, and the nodes at its ends.
-
-    Raises:
-        ValueError: If there is no such breaker.
-    """
+    """The branch or shunt that a breaker opens, and the nodes at its ends. Raises ValueError: If
+    there is no such breaker."""
     breakers = plant.wiring.breakers()
     if name not in breakers:
         raise ValueError(f"name = {name!r}: must be one of {sorted(breakers)}")

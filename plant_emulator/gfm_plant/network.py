@@ -149,10 +149,8 @@ class Network:
     def rewire(self, wiring: Wiring) -> None:
         """Go on from the present state with another wiring.
 
-        A branch that has come in two keeps its current in both.
-
-        Raises:
-            ValueError: as ``connect``; the plant is then unchanged.
+        A branch that has come in two keeps its current in both. Raises ValueError: as ``connect``;
+        the plant is then unchanged.
         """
         before, now = self.wiring, self.now
         w = dict(zip(before.order, now["w"][0], strict=False))
@@ -212,12 +210,9 @@ class Network:
         return name, i.real.mean() / turn
 
     def connect(self, wiring: Wiring) -> None:
-        """Set the modes of all circuits that a wiring gives.
-
-        Raises:
-            ValueError: If the modes cannot be told apart (`gfm_plant.circuit`), or one is too fast
-                for the DC link. The plant is then unchanged.
-        """
+        """Set the modes of all circuits that a wiring gives. Raises ValueError: If the modes cannot
+        be told apart (`gfm_plant.circuit`), or one is too fast for the DC link. The plant is then
+        unchanged."""
         changed = self.copy()
         _connect(changed, wiring)
         changed.wiring = wiring

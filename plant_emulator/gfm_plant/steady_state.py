@@ -22,11 +22,9 @@ def plant_equilibrium(
     """Return the equilibrium x (8,), u (3,) with p = P, terminal voltage V and v_dc = 1.
 
     Newton's method on the plant's own Eq. (1)-(8), with the Jacobian by complex step. It starts
-    from the angle that the line alone would take, and so heads for the stable one of the two
-    angles at which a line carries P. All arguments in p.u.
-
-    Raises:
-        NoEquilibrium: If none exists, as for a power beyond what the line carries.
+    from the angle that the line alone would take, and so heads for the stable one of the two angles
+    at which a line carries P. All arguments in p.u. Raises NoEquilibrium: If none exists, as for a
+    power beyond what the line carries.
     """
     z = _start(par, P, V, V_g, omega_g)
     d = np.array([omega_g, V_g], complex)

@@ -136,11 +136,8 @@ class Controller:
         return self.discrete[int(self.ctl["active"][0])]
 
     def select(self, name: str) -> None:
-        """Request a law; the controller changes to it at the next tick, bumpless.
-
-        Raises:
-            LawError: the law is not one of ``sets``.
-        """
+        """Request a law; the controller changes to it at the next tick, bumpless. Raises LawError:
+        the law is not one of ``sets``."""
         if name not in self.sets:
             raise LawError(f"law {name!r}", f"not ready; ready are {list(self.sets)}")
         self.asked, self.gains = name, {}

@@ -31,10 +31,8 @@ _UNARY: dict[type[ast.unaryop], Callable[[float], float]] = {
 def evaluate(where: str, value: float | str, parameters: Mapping[str, Any]) -> Any:
     """A number, or an expression of + - * / ** ( ) over ``parameters``.
 
-    Of parameters that are arrays the result is one, and may hold values that are not finite.
-
-    Raises:
-        LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
+    Of parameters that are arrays the result is one, and may hold values that are not finite. Raises
+    LawError: naming ``where``: syntax, an unknown name, a result that is no finite number.
     """
     try:
         result = _walk(where, _parse(where, value), parameters)
@@ -48,11 +46,8 @@ def evaluate(where: str, value: float | str, parameters: Mapping[str, Any]) -> A
 
 
 def evaluated(where: str, table: T, parameters: Mapping[str, float]) -> T:
-    """The table with a number in place of each expression, checked again.
-
-    Raises:
-        LawError: naming ``where`` and the key: as ``evaluate``, and a number that is not allowed.
-    """
+    """The table with a number in place of each expression, checked again. Raises LawError: naming
+    ``where`` and the key: as ``evaluate``, and a number that is not allowed."""
     values = {name: getattr(table, name) for name in table.model_fields_set}
     for name, value in values.items():
         if isinstance(value, TomlTable):

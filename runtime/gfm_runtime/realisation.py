@@ -68,11 +68,8 @@ class Row(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what comes of it is refused
 def realise(law: BuiltLaw) -> LawStateSpace:
-    """State space of a law.
-
-    Raises:
-        LawError: two integrators in series through omega_u, a coefficient that is not finite.
-    """
+    """State space of a law. Raises LawError: two integrators in series through omega_u, a
+    coefficient that is not finite."""
     _check_series(law)
     rows = []
     for i in range(NU):

@@ -32,10 +32,7 @@ class Shipped(Generic[T]):
 
     def named(self, name: str) -> T | None:
         """The table of a shipped name, or of a path that ends in ``.toml``; None for ``none``.
-
-        Raises:
-            LawError: an unknown name, or every mistake of the file.
-        """
+        Raises LawError: an unknown name, or every mistake of the file."""
         if name == NONE:
             return None
         where, content = f"{self.what} {name}", dict[str, Any]()

@@ -60,21 +60,15 @@ else:
 
 
 def read_toml(path: str | Path, links: bool = True) -> dict[str, Any]:
-    """The content of a TOML file; ``links``: it may be a link.
-
-    Raises:
-        ValueError: one line: as ``read_text`` or ``parse_toml``.
-    """
+    """The content of a TOML file; ``links``: it may be a link. Raises ValueError: one line: as
+    ``read_text`` or ``parse_toml``."""
     return parse_toml(read_text(path, links))
 
 
 def read_text(path: str | Path, links: bool = True) -> str:
-    """The text of a file, with or without a byte order mark; ``links``: it may be a link.
-
-    Raises:
-        ValueError: one line: the file cannot be opened, is not regular (a pipe or a device may
-            have no end), is larger than ``MAX_BYTES`` or is not UTF-8.
-    """
+    """The text of a file, with or without a byte order mark; ``links``: it may be a link. Raises
+    ValueError: one line: the file cannot be opened, is not regular (a pipe or a device may have no
+    end), is larger than ``MAX_BYTES`` or is not UTF-8."""
     try:
         data = read_regular(path, MAX_BYTES, links)
     except OSError as problem:
@@ -87,11 +81,8 @@ def read_text(path: str | Path, links: bool = True) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The content of a TOML text.
-
-    Raises:
-        ValueError: one line: it is not TOML, or is nested too deeply.
-    """
+    """The content of a TOML text. Raises ValueError: one line: it is not TOML, or is nested too
+    deeply."""
     too_deep = f"not usable: tables and arrays are nested more than {MAX_DEPTH} deep"
     try:
         content = tomllib.loads(text)

@@ -84,12 +84,8 @@ def tustin(
 
 
 def discretise(law: BuiltLaw, T_s: float) -> DiscreteLaw:
-    """Discretise a law by Tustin at T_s [s].
-
-    Raises:
-        LawError: T_s out of range, an omega_u loop without solution or unstable, and as
-            ``realise``.
-    """
+    """Discretise a law by Tustin at T_s [s]. Raises LawError: T_s out of range, an omega_u loop
+    without solution or unstable, and as ``realise``."""
     if not (math.isfinite(T_s) and T_s > 0.0):
         raise LawError("T_s", f"{T_s} s must be > 0")
     ss = realise(law)

@@ -61,10 +61,7 @@ def no_trace() -> Trace:
 
 def trace_of(scenario: Scenario, start: NDArray[np.float64]) -> Trace:
     """The trace that a scenario replays; ``start``: u before tick 0, shape (3,) or (4,), p.u.
-
-    Raises:
-        UserError: no such file, no timing in it, another T_s, or shorter than the run.
-    """
+    Raises UserError: no such file, no timing in it, another T_s, or shorter than the run."""
     impairment = scenario.link.impairment
     if impairment is None or impairment.trace is None:
         return no_trace()

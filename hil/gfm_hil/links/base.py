@@ -101,10 +101,7 @@ class LinkKind:
     ) -> LinkOptions:
         """The options as a model, if endpoint (None: a fresh one) and options may be used.
 
-        ``inner``: in a run with an inner stage.
-
-        Raises:
-            ValueError: they may not; one line.
+        ``inner``: in a run with an inner stage. Raises ValueError: they may not; one line.
         """
         if endpoint is not None and re.fullmatch(self.pattern, endpoint) is None:
             raise ValueError(f"endpoint = {endpoint!r}: must be {self.form}")

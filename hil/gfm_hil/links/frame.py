@@ -300,11 +300,8 @@ class FrameReader:
 
     def unpack(self, message: bytes, values: NDArray[np.float64]) -> int:
         """Write the values of a good frame with a newer tick into ``values``; returns its tick.
-
-        Raises:
-            FrameError: the frame failed a check; the reader has counted it, and ``values`` is
-                unchanged.
-        """
+        Raises FrameError: the frame failed a check; the reader has counted it, and ``values`` is
+        unchanged."""
         size = len(message)
         if size == len(self.message):
             self.message[:] = np.frombuffer(message, np.uint8)

@@ -55,11 +55,8 @@ class PumpedLink:
         return bool(ring.put(self._loop, np.frombuffer(bytearray(message), np.uint8)))
 
     def receive(self) -> bytes | None:
-        """The next message, or None.
-
-        Raises:
-            PeerLost, UserError: the link raised it in the thread.
-        """
+        """The next message, or None. Raises PeerLost, UserError: the link raised it in the
+        thread."""
         size = ring.take(self._loop, self._message)
         if size == 0 and self._problem is not None:
             raise self._problem

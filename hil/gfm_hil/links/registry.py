@@ -30,11 +30,8 @@ def link_names() -> list[str]:
 
 @cache
 def link_kind(name: str) -> LinkKind:
-    """The link of that name.
-
-    Raises:
-        ValueError: there is none, or a package's link cannot be loaded.
-    """
+    """The link of that name. Raises ValueError: there is none, or a package's link cannot be
+    loaded."""
     if name in _OURS:
         return import_module(_OURS[name]).KIND
     for point in entry_points(group=GROUP, name=name):
@@ -51,11 +48,8 @@ def link_kind(name: str) -> LinkKind:
 def open_link(
     name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None, inner: int = False
 ) -> Link:
-    """Open one end of the link of that name; ``inner``: for a run with an inner stage.
-
-    Raises:
-        UserError: the name, the endpoint or the options are wrong, or the link cannot be opened.
-    """
+    """Open one end of the link of that name; ``inner``: for a run with an inner stage. Raises
+    UserError: the name, the endpoint or the options are wrong, or the link cannot be opened."""
     try:
         kind = link_kind(name)
         checked = kind.checked(endpoint, options or {}, inner)

@@ -67,11 +67,8 @@ class Operator:
         return self.command(event, by)
 
     def stop(self, by: Identity | None = None) -> None:
-        """Stop the run as Ctrl-C does; with a converter of a network, all of it.
-
-        Raises:
-            UserError: the run does not answer.
-        """
+        """Stop the run as Ctrl-C does; with a converter of a network, all of it. Raises UserError:
+        the run does not answer."""
         running = present(self._folder)
         if running:
             self._ask("plant" if "plant" in running else running[0], {"type": "stop"}, by)
@@ -85,10 +82,8 @@ class Operator:
         (what those that are ready are asked for by), ``T_s`` (s). A side that has not recorded
         anything is left out.
 
-        The loop only appends rows, so that reading them does not disturb it.
-
-        Raises:
-            UserError: the recording is damaged.
+        The loop only appends rows, so that reading them does not disturb it. Raises UserError: the
+        recording is damaged.
         """
         found: dict[str, Any] = {}
         run = self.run

@@ -65,11 +65,8 @@ class Listener(socket.socket):
         self.port = int(self.getsockname()[1])
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection; if too many have not spoken yet, close the oldest of them.
-
-        Raises:
-            OSError: there is none (BlockingIOError), or no descriptor for it.
-        """
+        """Accept a connection; if too many have not spoken yet, close the oldest of them. Raises
+        OSError: there is none (BlockingIOError), or no descriptor for it."""
         connection, address = super().accept()
         for option in _KEEPALIVE:
             connection.setsockopt(*option)

@@ -86,10 +86,7 @@ class BesideRun:
 
     def wait(self, commands: bool = True) -> None:
         """With ``--wait`` wait until the run records or, if it needs them, takes ``commands``.
-
-        Raises:
-            KeyboardInterrupt: the port is to end.
-        """
+        Raises KeyboardInterrupt: the port is to end."""
         there = present if commands else recorded
         while self._patient and not there(self.folder):
             if self.interrupted:
@@ -99,21 +96,14 @@ class BesideRun:
             os.nice(_NICENESS)
 
     def operator(self) -> Operator:
-        """An operator of the run.
-
-        Raises:
-            UserError: no run is in progress.
-        """
+        """An operator of the run. Raises UserError: no run is in progress."""
         operator = Operator(self.folder, self._through)
         self._resources.callback(operator.close)
         return operator
 
     def first(self, ask: Callable[[], _T | None]) -> _T:
-        """What ``ask`` returns once it returns something: the handshake may not be over yet.
-
-        Raises:
-            UserError: the run is over before.
-        """
+        """What ``ask`` returns once it returns something: the handshake may not be over yet. Raises
+        UserError: the run is over before."""
         while (found := ask()) is None:
             if self.over():
                 raise not_running(self.folder)
@@ -208,11 +198,8 @@ class OperatorPort(ABC):
             need(*self.needs)
 
     def check(self, options: argparse.Namespace) -> None:
-        """See that the options can be, before anything starts.
-
-        Raises:
-            UserError: one cannot, or others reach the address though nobody said so.
-        """
+        """See that the options can be, before anything starts. Raises UserError: one cannot, or
+        others reach the address though nobody said so."""
         check_number("--port", options.port)
         if self.tls is None and not options.open and beyond_loopback(f"tcp://{options.host}:0"):
             raise UserError(
@@ -221,11 +208,8 @@ class OperatorPort(ABC):
 
     @abstractmethod
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
-        """Serve until the run is over; returns the exit code.
-
-        Raises:
-            UserError: no run is in progress, or the address cannot be used.
-        """
+        """Serve until the run is over; returns the exit code. Raises UserError: no run is in
+        progress, or the address cannot be used."""
 
     def call(self, options: argparse.Namespace) -> int:
         """Carry out the command; returns its exit code."""

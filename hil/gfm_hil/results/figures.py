@@ -514,11 +514,8 @@ def complex_plane(
 
 
 def plot(run: Run, *names: str) -> list[Axes]:
-    """Draw signals over time, one a panel; without names the six panels of the report.
-
-    Raises:
-        UserError: a signal that was not recorded.
-    """
+    """Draw signals over time, one a panel; without names the six panels of the report. Raises
+    UserError: a signal that was not recorded."""
     if not names:
         return draw_signals(pyplot_figure(SIZE), run.scenario, run.columns, run.summary)
     signals = run.signals

@@ -72,11 +72,8 @@ class NetworkRun(Mapping[str, Run]):
         return {name: run.metrics for name, run in self.items()}
 
     def conclude(self, folder: Path, report: Report | None = None) -> None:
-        """Write what the runs share into a folder that has theirs and the scenario.
-
-        Raises:
-            UserError: the folder cannot be written.
-        """
+        """Write what the runs share into a folder that has theirs and the scenario. Raises
+        UserError: the folder cannot be written."""
         try:
             if report is not None and any(run.ticks for run in self.values()):
                 report(replace(self, folder=folder))
@@ -86,11 +83,8 @@ class NetworkRun(Mapping[str, Run]):
 
     @classmethod
     def recover(cls, folder: Path, report: Report | None = None) -> NetworkRun:
-        """Complete the folder of a network whose run was cut off, converter by converter.
-
-        Raises:
-            UserError, Unfinished: as ``run_folder.recover``.
-        """
+        """Complete the folder of a network whose run was cut off, converter by converter. Raises
+        UserError, Unfinished: as ``run_folder.recover``."""
         scenario = read_scenario(folder)
         runs = {name: recover(place, report) for name, place in _places(folder, scenario).items()}
         found = cls(scenario, runs, folder)
@@ -99,11 +93,8 @@ class NetworkRun(Mapping[str, Run]):
 
     @classmethod
     def load(cls, folder: str | Path) -> NetworkRun:
-        """The runs of a folder that ``save`` or ``gfmhil run`` has written.
-
-        Raises:
-            UserError: it is none.
-        """
+        """The runs of a folder that ``save`` or ``gfmhil run`` has written. Raises UserError: it is
+        none."""
         folder = Path(folder)
         scenario = read_scenario(folder)
         if not scenario.parts:

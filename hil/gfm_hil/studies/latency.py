@@ -21,11 +21,8 @@ _TRIED = 50  # misses in a row at least, for the sentence of a report
 
 
 def misses_of(run: Run) -> Misses:
-    """The misses of a run in real time.
-
-    Raises:
-        UserError: it was in lockstep, or lacks the plant's times.
-    """
+    """The misses of a run in real time. Raises UserError: it was in lockstep, or lacks the plant's
+    times."""
     if run.summary["mode"] != "realtime":
         raise UserError(f"{run.folder}: was in lockstep, where no tick is missed")
     if not run.timing.keys() >= {*MISS_NEEDS} or not run.ticks:

@@ -62,11 +62,8 @@ def _check(options: CanOptions, T_s: float) -> None:
 
 
 def _refuse_unused(endpoint: str | None, options: CanOptions) -> None:
-    """Check that the backend named in the options is the one that carries the frames.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Check that the backend named in the options is the one that carries the frames. Raises
+    ValueError: it is not."""
     named = "interface" in options.model_fields_set
     if named and (endpoint is None or endpoint.startswith(LOOPBACK)):
         said = "no endpoint" if endpoint is None else f"endpoint = {endpoint!r}"

@@ -88,12 +88,9 @@ def budget(plan: Plan, bitrate: float, data_bitrate: float) -> Budget:
 
 
 def check_budget(options: CanOptions, T_s: float) -> None:
-    """Check that every exchange fits the period.
-
-    Raises:
-        ValueError: it does not fit; the message says by how much, and the nearest settings that
-            do. Or the DBC that the options name cannot be used.
-    """
+    """Check that every exchange fits the period. Raises ValueError: it does not fit; the message
+    says by how much, and the nearest settings that do. Or the DBC that the options name cannot be
+    used."""
     plan = load_plan(options)
     need = budget(plan, options.bitrate, options.data_bitrate)
     period = options.every * T_s

@@ -43,11 +43,8 @@ _NODES = {"plant": "Plant", "controller": "Controller"}
 
 
 def offset(row: Row) -> float:
-    """Value of count 0: 0 if the range then fits 16 bits, else the middle of the range.
-
-    Raises:
-        ValueError: the range does not fit 16 bits at this scale.
-    """
+    """Value of count 0: 0 if the range then fits 16 bits, else the middle of the range. Raises
+    ValueError: the range does not fit 16 bits at this scale."""
     if max(abs(row.low), abs(row.high)) <= INT16 * row.scale:
         return 0.0
     if row.high - row.low <= 2 * INT16 * row.scale:

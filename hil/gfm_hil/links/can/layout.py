@@ -94,11 +94,8 @@ def _digest(text: str, size: int) -> int:
 
 
 def dtype_of(message: Message) -> np.dtype:
-    """A record with the layout of the DBC.
-
-    Raises:
-        ValueError: a signal is not made of whole bytes, little-endian.
-    """
+    """A record with the layout of the DBC. Raises ValueError: a signal is not made of whole bytes,
+    little-endian."""
     for s in message.signals:
         if s.start % 8 or s.length not in (8, 16, 32) or s.byte_order != "little_endian":
             raise ValueError(
@@ -140,11 +137,8 @@ def _frames_of(title: str, messages: Mapping[str, Message]) -> list[Message]:
 
 
 def plan_of(database: Database, inner: int = False) -> Plan:
-    """The frames of a DBC that the link uses; ``inner``: in a run with an inner stage.
-
-    Raises:
-        ValueError: a frame or a signal is missing or misplaced.
-    """
+    """The frames of a DBC that the link uses; ``inner``: in a run with an inner stage. Raises
+    ValueError: a frame or a signal is missing or misplaced."""
     messages = {m.name: m for m in database.messages}
     missing = sorted({*STATUS.values(), *TRANSPORT.values()} - set(messages))
     if missing:
@@ -216,11 +210,8 @@ def unpack_vector(payload, index, start, scale, offset, values):
 
 @cache
 def load_plan(options: CanOptions) -> Plan:
-    """The frames of the DBC that the options name, or of the generated one.
-
-    Raises:
-        ValueError: the DBC cannot be read, or lacks what the link needs.
-    """
+    """The frames of the DBC that the options name, or of the generated one. Raises ValueError: the
+    DBC cannot be read, or lacks what the link needs."""
     if options.dbc is None:
         return plan_of(read_dbc(write_dbc(options.fd)), options.inner)
     where = f"dbc = {options.dbc!r}"

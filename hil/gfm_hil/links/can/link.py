@@ -130,11 +130,7 @@ class CanLink:
 
     def send(self, message: bytes) -> bool:
         """Send a message; False if the bus has no room for all of it, or if it is one of the
-        handshake that the peer did not take.
-
-        Raises:
-            PeerLost: the bus is down.
-        """
+        handshake that the peer did not take. Raises PeerLost: the bus is down."""
         if len(message) > LONGEST:
             return False
         sent = send(self._node.handle, np.frombuffer(bytearray(message), np.uint8))
@@ -183,11 +179,8 @@ class CanLink:
         self._damaged += isinstance(problem, _DAMAGE)
 
     def receive(self) -> bytes | None:
-        """The next message, or None.
-
-        Raises:
-            PeerLost: the bus is down, or the other side uses another DBC.
-        """
+        """The next message, or None. Raises PeerLost: the bus is down, or the other side uses
+        another DBC."""
         self._transport.process()
         message = self._transport.recv()
         if message is None:

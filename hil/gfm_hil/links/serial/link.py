@@ -109,11 +109,8 @@ class SerialLink:
         return UserError(f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {why}")
 
     def send(self, message: bytes) -> bool:
-        """Send a message; False if the line has no room for it.
-
-        Raises:
-            PeerLost: the device is gone.
-        """
+        """Send a message; False if the line has no room for it. Raises PeerLost: the device is
+        gone."""
         if not self._there():
             return False
         sent = send(self._line, np.frombuffer(bytearray(message), np.uint8))
@@ -122,11 +119,7 @@ class SerialLink:
         return bool(sent)
 
     def receive(self) -> bytes | None:
-        """The next message, or None.
-
-        Raises:
-            PeerLost: the device is gone.
-        """
+        """The next message, or None. Raises PeerLost: the device is gone."""
         if not self._there():
             return None
         size = receive(self._line, self._message)

@@ -69,11 +69,8 @@ class Segment:
 
 
 def create(name: str) -> Segment:
-    """Make the segment of that name, after removing the segments of dead owners.
-
-    Raises:
-        Refused: a living process uses it, the file is not a segment of ours, or there is no room.
-    """
+    """Make the segment of that name, after removing the segments of dead owners. Raises Refused: a
+    living process uses it, the file is not a segment of ours, or there is no room."""
     with _locked() as folder:
         path = folder / (PREFIX + name)
         for other in folder.glob(PREFIX + "*"):
@@ -97,11 +94,8 @@ def create(name: str) -> Segment:
 
 def join(name: str) -> Segment | None:
     """Join the segment of that name as the plant; None if no living controller has made it yet.
-
-    Raises:
-        Refused: it has another layout, is not a segment of ours, or another living plant has
-            joined it.
-    """
+    Raises Refused: it has another layout, is not a segment of ours, or another living plant has
+    joined it."""
     path = _folder() / (PREFIX + name)
     if not path.exists():  # a plant that waits locks nothing
         return None
@@ -147,11 +141,8 @@ def _remove_if(segment: Segment, owner: Identity | None) -> None:
 
 @contextlib.contextmanager
 def _locked() -> Iterator[Path]:
-    """The user's private folder, locked.
-
-    Raises:
-        Refused: it is not private, or another process keeps it locked.
-    """
+    """The user's private folder, locked. Raises Refused: it is not private, or another process
+    keeps it locked."""
     folder = _folder()
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -171,11 +162,8 @@ def _folder() -> Path:
 
 
 def _owner(path: Path) -> Identity | None:
-    """The living owner of a segment; None if the owner is dead.
-
-    Raises:
-        Refused: the file is not a segment of ours.
-    """
+    """The living owner of a segment; None if the owner is dead. Raises Refused: the file is not a
+    segment of ours."""
     with path.open("rb") as file:
         content = file.read(_OWNER.size)
     if not content.strip(b"\0"):

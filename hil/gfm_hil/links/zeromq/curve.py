@@ -26,11 +26,8 @@ def key_files(folder: Path) -> list[Path]:
 
 
 def write_keys(folder: Path, force: bool = False) -> list[Path]:
-    """Write a new key pair per side, readable by the user alone.
-
-    Raises:
-        UserError: a key exists and ``force`` is not set, or it cannot be written.
-    """
+    """Write a new key pair per side, readable by the user alone. Raises UserError: a key exists and
+    ``force`` is not set, or it cannot be written."""
     _need_curve()
     files = key_files(folder)
     for file in files:
@@ -91,11 +88,8 @@ class Curve:
 
 
 def _key(file: Path) -> tuple[bytes, bytes | None]:
-    """The public key and, if the file has it, the secret key, Z85.
-
-    Raises:
-        UserError: there is no such file, or it holds no valid key.
-    """
+    """The public key and, if the file has it, the secret key, Z85. Raises UserError: there is no
+    such file, or it holds no valid key."""
     where = f"link.options.curve = {str(file.parent)!r}: {file.name}"
     try:
         public, secret = zmq.auth.load_certificate(file)

@@ -36,11 +36,7 @@ _IFF_LOOPBACK = 0x8  # of linux/if.h
 
 def refuse_open(endpoint: str | None, options: ZmqOptions) -> None:
     """Check that frames leave this machine only encrypted or with ``plain = true``, and that file
-    permissions control who may connect on this machine.
-
-    Raises:
-        ValueError: the check fails.
-    """
+    permissions control who may connect on this machine. Raises ValueError: the check fails."""
     if endpoint is None:
         return
     if endpoint.startswith("ipc://@"):

@@ -18,12 +18,9 @@ def path_of(endpoint: str) -> Path:
 
 
 def is_served(endpoint: str) -> bool:
-    """Whether a process of our user listens at an ipc endpoint.
-
-    Raises:
-        UserError: the folder, the file or the process belongs to another user, another user could
-            replace the file or connect to it, or it is not a socket.
-    """
+    """Whether a process of our user listens at an ipc endpoint. Raises UserError: the folder, the
+    file or the process belongs to another user, another user could replace the file or connect to
+    it, or it is not a socket."""
     path = path_of(endpoint)
     where = f"link.endpoint = {endpoint!r}"
     try:

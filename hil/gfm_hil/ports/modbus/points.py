@@ -52,11 +52,8 @@ class Droops:
 
 
 def droops(file: LawFile, changed: Mapping[str, float]) -> Droops:
-    """The droops of a law with changed parameters; tied parameters follow.
-
-    Raises:
-        LawError: the changed law is invalid.
-    """
+    """The droops of a law with changed parameters; tied parameters follow. Raises LawError: the
+    changed law is invalid."""
     law = build_law(file, tied(file, dict(changed)))
 
     def own(name: str, seen: complex) -> float | None:
@@ -88,11 +85,8 @@ class LawDroops:
         return found
 
     def event(self, law: str, changed: Mapping[str, float], wanted: Mapping[str, float]) -> Event:
-        """The command that changes a law's droops.
-
-        Raises:
-            ValueError: the law has no droop of that name, or the value is invalid.
-        """
+        """The command that changes a law's droops. Raises ValueError: the law has no droop of that
+        name, or the value is invalid."""
         now = self.droops(law, changed)
         for name, value in wanted.items():
             if getattr(now, name) is None:

@@ -44,11 +44,7 @@ class Recording:
 
     @property
     def f_b(self) -> float:
-        """Base frequency, Hz.
-
-        Raises:
-            UserError: the scenario's converter cannot be loaded.
-        """
+        """Base frequency, Hz. Raises UserError: the scenario's converter cannot be loaded."""
         return nominal_frequency(self.scenario)
 
     def done(self) -> int:
@@ -80,12 +76,9 @@ class Recording:
         return read_events(self.folder, self.capacity)
 
     def ended(self) -> dict[str, str] | None:
-        """How the run ended, ``status`` and ``reason``; None while it is in progress.
-
-        Raises:
-            UserError: the summary cannot be read, or it is unknown whether the run is still in
-                progress.
-        """
+        """How the run ended, ``status`` and ``reason``; None while it is in progress. Raises
+        UserError: the summary cannot be read, or it is unknown whether the run is still in
+        progress."""
         try:
             content = read_summary(self.folder, self.capacity)
         except FileNotFoundError:  # without one it is over once its command servers have gone
@@ -96,11 +89,8 @@ class Recording:
 
 
 def open_recording(folder: Path) -> Recording:
-    """The recording in a run folder.
-
-    Raises:
-        UserError: it is not a run folder, or has no recording.
-    """
+    """The recording in a run folder. Raises UserError: it is not a run folder, or has no
+    recording."""
     scenario = read_scenario(folder)
     if (folder / "summary.json").is_file():
         run = Run.load(folder)

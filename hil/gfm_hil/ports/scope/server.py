@@ -86,11 +86,8 @@ class Scope:
         ready: Callable[[int], None],
     ) -> None:
         """Serve until cancelled, by https if there is a TLS context, at the first of the ports that
-        can be bound (0: any free one); ``ready`` is called with it.
-
-        Raises:
-            UserError: none of the ports can be bound.
-        """
+        can be bound (0: any free one); ``ready`` is called with it. Raises UserError: none of the
+        ports can be bound."""
         with _listen(host, ports) as listener:
 
             async def reap() -> None:

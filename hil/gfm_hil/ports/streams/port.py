@@ -62,11 +62,8 @@ class Follower:
 
     def news(self) -> list[NewRows]:
         """Rows recorded since the last call that returned; afterwards ``over`` says whether these
-        were the last.
-
-        Raises:
-            OSError: the recording cannot be read now; the next call returns its rows.
-        """
+        were the last. Raises OSError: the recording cannot be read now; the next call returns its
+        rows."""
         over = not (self.folder / "parts").is_dir()  # the parts were merged and removed
         found = []
         for role, part in self.run.parts.items():

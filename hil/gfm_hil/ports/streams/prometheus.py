@@ -147,11 +147,8 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 @contextlib.contextmanager
 def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int]:
-    """Serve metrics at ``/metrics`` while in this context; yields the port.
-
-    Raises:
-        UserError: the port cannot be bound.
-    """
+    """Serve metrics at ``/metrics`` while in this context; yields the port. Raises UserError: the
+    port cannot be bound."""
     registry = CollectorRegistry()
     registry.register(collector)
     try:

@@ -147,11 +147,8 @@ class Memory:
         return a2l_text(name, "a controller on the bench of gfmhil", entries, more=more)
 
     def read(self, address: int, size: int) -> bytes:
-        """Bytes of the memory, all of the same tick.
-
-        Raises:
-            Refusal: there is no such memory, or the run has not begun.
-        """
+        """Bytes of the memory, all of the same tick. Raises Refusal: there is no such memory, or
+        the run has not begun."""
         first = address - address % CELL
         cells = [self._at(at) for at in range(first, address + size, CELL)]
         now = self._now()

@@ -116,11 +116,8 @@ class Slave:
             self._notice(text + last)
 
     def _carried_out(self, packet: bytes, peer: Any) -> bytes:
-        """What follows the code of a positive response.
-
-        Raises:
-            Refusal: the response is an error.
-        """
+        """What follows the code of a positive response. Raises Refusal: the response is an
+        error."""
         command, count = packet[0], packet[1] if len(packet) > 1 else 0
         if command == CONNECT:
             self._at = (0, 0)
