@@ -52,17 +52,12 @@ _RESOLUTION = 1e-14  # p.u.; what is watched has happened where it is further ab
 
 
 class Topology(NamedTuple):
-    """What a leg can do.
+    """What a leg can do."""
 
-    Attributes:
-        levels: how many voltages it has.
-        off: the state of its gates that blocks it.
-        conducts: for each state of the gates how a current leaves the leg, and how one enters it:
-            by the rail N or P or the midpoint O of the DC link, and by a switch, a diode, or both.
-    """
-
-    levels: int
-    off: int
+    levels: int  # how many voltages it has
+    off: int  # the state of its gates that blocks it
+    # for each state of the gates how a current leaves the leg, and how one enters it: by the rail N
+    # or P or the midpoint O of the DC link, and by a switch, a diode, or both
     conducts: tuple[tuple[str, str], ...]
 
 

@@ -102,50 +102,37 @@ class Circuit:
 
 @dataclass(frozen=True)
 class Modes:
-    """What ``find_modes`` returns, for w of n_w states, n modes and n_s sources.
+    """What ``find_modes`` returns, for w of n_w states, n modes and n_s sources."""
 
-    Attributes:
-        rates: eigenvalues, (n,), 1/s.
-        states: w of the modes, (n_w, n); a state that the circuit does not have is zero.
-        modes: the modes of w, (n, n_w); it projects by stored energy.
-        drive: rate of the modes per source voltage, and per current of the sinks, (n, n_s), 1/s.
-        mirror: factor, (n,), on ``modes`` and ``drive`` for the mirror images of w and of the
-            sources, conj(x) e^(-2 j omega_b t); zero in a balanced circuit, which has no use for
-            them.
-    """
-
-    rates: NDArray[np.complex128]
+    rates: NDArray[np.complex128]  # eigenvalues, (n,), 1/s
+    # w of the modes, (n_w, n); a state that the circuit does not have is zero
     states: NDArray[np.complex128]
-    modes: NDArray[np.complex128]
+    modes: NDArray[np.complex128]  # the modes of w, (n, n_w); it projects by stored energy
+    # rate of the modes per source voltage, and per current of the sinks, (n, n_s), 1/s
     drive: NDArray[np.complex128]
+    # factor, (n,), on ``modes`` and ``drive`` for the mirror images of w and of the sources,
+    # conj(x) e^(-2 j omega_b t); zero in a balanced circuit, which has no use for them
     mirror: NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
 class Rates:
-    """What ``find_rates`` returns: w' = by_w w + by_s s in the frame that stands still.
+    """What ``find_rates`` returns: w' = by_w w + by_s s in the frame that stands still."""
 
-    Attributes:
-        by_w, by_s: (n_w, n_w) and (n_w, n_s), 1/s; rows of states that the circuit does not have
-            are zero.
-        fastest: the norm of ``by_w`` in energy coordinates, 1/s.
-    """
-
+    # by_w, by_s: (n_w, n_w) and (n_w, n_s), 1/s; rows of states that the circuit does not have are
+    # zero
     by_w: NDArray[np.float64]
     by_s: NDArray[np.float64]
-    fastest: float
+    fastest: float  # the norm of ``by_w`` in energy coordinates, 1/s
 
 
 @dataclass(frozen=True)
 class _Reduced:
     """The circuit in energy coordinates q = K' (root w): q' = omega_b K' (M / root / root) K q +
-    omega_b K' (B / root) s.
+    omega_b K' (B / root) s."""
 
-    Attributes:
-        names: of the states, branches before capacitors; M, B: of the stored quantities; root: of
-            their L and C; K: columns that are an orthonormal basis of what the nodes allow.
-    """
-
+    # of the states, branches before capacitors; M, B: of the stored quantities; root: of their L
+    # and C; K: columns that are an orthonormal basis of what the nodes allow
     names: list[str]
     M: NDArray[np.float64]
     B: NDArray[np.float64]
@@ -155,16 +142,13 @@ class _Reduced:
 
 @dataclass(frozen=True)
 class Assembled:
-    """The equations of a circuit before the currents at its nodes add up: see `_Reduced`.
-
-    Attributes:
-        meets: of each node without a source or a capacitor what each state takes away from it.
-    """
+    """The equations of a circuit before the currents at its nodes add up: see `_Reduced`."""
 
     names: list[str]
     M: NDArray[np.float64]
     B: NDArray[np.float64]
     root: NDArray[np.float64]
+    # of each node without a source or a capacitor what each state takes away from it
     meets: dict[str, NDArray[np.float64]]
 
 

@@ -40,27 +40,19 @@ _SMALL = 1e-9
 
 @dataclass(frozen=True)
 class Joint:
-    """The system q' = flow q + by_s s, for n_q coordinates, n_w states and n_s sources.
+    """The system q' = flow q + by_s s, for n_q coordinates, n_w states and n_s sources."""
 
-    Attributes:
-        to_w, from_w: w and its parts on both axes by q and back, (2, n_w, n_q).
-        from_s: what the sources do, (2, n_s, n_q), 1/s.
-        flow: (8, n_q, n_q), 1/s, by the phases of the fault that conduct: 1 for a, 2 for b, 4
-            for c.
-        fault_bars: (8, 3, n_q), zero where there is none; fault_carries: the currents of its
-            phases, (8, 3, n_q).
-        pole_bars: the currents of the poles, (n_poles, 3, n_q); an open one is a bar.
-        sources: names of sources and sinks in their order.
-    """
-
+    # to_w, from_w: w and its parts on both axes by q and back, (2, n_w, n_q)
     to_w: _Array
     from_w: _Array
-    from_s: _Array
+    from_s: _Array  # what the sources do, (2, n_s, n_q), 1/s
+    # (8, n_q, n_q), 1/s, by the phases of the fault that conduct: 1 for a, 2 for b, 4 for c
     flow: _Array
+    # (8, 3, n_q), zero where there is none; fault_carries: the currents of its phases, (8, 3, n_q)
     fault_bars: _Array
     fault_carries: _Array
-    pole_bars: _Array
-    sources: list[str]
+    pole_bars: _Array  # the currents of the poles, (n_poles, 3, n_q); an open one is a bar
+    sources: list[str]  # names of sources and sinks in their order
 
 
 def zero_circuit(wiring: Wiring) -> Circuit:

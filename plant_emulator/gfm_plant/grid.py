@@ -386,17 +386,11 @@ def check_synchronism(
 
 @dataclass(frozen=True)
 class SynchroCheckResult:
-    """How a synchro-check ended.
+    """How a synchro-check ended."""
 
-    Attributes:
-        name: of the breaker; "" for that of the grid.
-        closed: whether it has closed.
-        V, omega, degrees: the differences by then, of the first side to the second: p.u. and
-            degrees.
-    """
-
-    name: str
-    closed: bool
+    name: str  # of the breaker; "" for that of the grid
+    closed: bool  # whether it has closed
+    # V, omega, degrees: the differences by then, of the first side to the second: p.u. and degrees
     V: float
     omega: float
     degrees: float

@@ -33,20 +33,16 @@ _MOST = 500  # steps of the DC link, or intervals of Simpson's rule, in a period
 
 @dataclass
 class Network:
-    """A plant of one converter or more.
+    """A plant of one converter or more."""
 
-    Attributes:
-        par, st, net, now, parts: its memory, as `PlantRecords` has it, all arrays of ``net`` and
-            ``now`` included.
-        wiring: how its parts are connected now.
-    """
-
+    # par, st, net, now, parts: its memory, as `PlantRecords` has it, all arrays of ``net`` and
+    # ``now`` included
     par: Record
     st: Record
     net: Record
     now: Record
     parts: tuple[Record, ...]
-    wiring: Wiring
+    wiring: Wiring  # how its parts are connected now
 
     @cached_property
     def records(self) -> PlantRecords:

@@ -26,20 +26,17 @@ N_RING = 256  # places of a ring that holds one cycle
 
 
 class PlantRecords(NamedTuple):
-    """A plant as compiled functions take it, see ``gfm_plant.make_plant``.
+    """A plant as compiled functions take it, see ``gfm_plant.make_plant``."""
 
-    Attributes:
-        par, st: parameters and state of the converters, shape (N,), of `converter_par_dtype` and
-            `converter_state_dtype`.
-        net, now: parameters and state of the network that connects them, shape (1,), see `layout`.
-        parts: of each kind of component in ``components.DYNAMIC`` the records of all that there
-            are, of its ``record``.
-    """
-
+    # par, st: parameters and state of the converters, shape (N,), of `converter_par_dtype` and
+    # `converter_state_dtype`
     par: Record
     st: Record
+    # net, now: parameters and state of the network that connects them, shape (1,), see `layout`
     net: Record
     now: Record
+    # of each kind of component in ``components.DYNAMIC`` the records of all that there are, of its
+    # ``record``
     parts: tuple[Record, ...]
 
 

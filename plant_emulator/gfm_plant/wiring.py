@@ -42,24 +42,18 @@ ALPHA, BETA = 0, 1
 
 @dataclass(frozen=True)
 class ConverterCircuit:
-    """A converter as the circuit sees it: bridge, filter, and the line to its node.
-
-    Attributes:
-        node: where its line ends.
-        L_f, R_f, C_f, L_g, R_g: elements of Eq. (1)-(6), p.u. of the network.
-        earthed: of the line, as of a `Branch`.
-        at_end: whether the connection point is there and not at the filter capacitor.
-    """
+    """A converter as the circuit sees it: bridge, filter, and the line to its node."""
 
     name: str
-    node: str
+    node: str  # where its line ends
+    # L_f, R_f, C_f, L_g, R_g: elements of Eq. (1)-(6), p.u. of the network
     L_f: float
     R_f: float
     C_f: float
     L_g: float
     R_g: float
-    earthed: str = ""
-    at_end: bool = False
+    earthed: str = ""  # of the line, as of a `Branch`
+    at_end: bool = False  # whether the connection point is there and not at the filter capacitor
 
     @property
     def terminal(self) -> str:
@@ -95,19 +89,13 @@ class ConverterCircuit:
 @dataclass(frozen=True, kw_only=True)
 class Contact:
     """Which phases conduct where they do not always do: those of a fault to ground, or the poles of
-    a breaker between its two sides.
+    a breaker between its two sides."""
 
-    Attributes:
-        kind: a key of `FAULTED_PHASES`.
-        phases: one of that kind.
-        clearing: of `CLEARINGS`.
-        R: of a fault from each phase to ground, of kind LL from one phase to the other; p.u. of the
-            network.
-    """
-
-    kind: str = "3ph"
-    phases: str = "abc"
-    clearing: str = "zero"
+    kind: str = "3ph"  # a key of `FAULTED_PHASES`
+    phases: str = "abc"  # one of that kind
+    clearing: str = "zero"  # of `CLEARINGS`
+    # of a fault from each phase to ground, of kind LL from one phase to the other; p.u. of the
+    # network
     R: float = 0.0
 
     @property
@@ -167,79 +155,52 @@ class Contact:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultPlace(Contact):
-    """A fault: where phases are shorted, which, and through what.
+    """A fault: where phases are shorted, which, and through what."""
 
-    Attributes:
-        node: the node, or the one at which the faulted branch starts.
-        branch: name of the branch with the fault inside, or None: at the node itself.
-        position: on that branch, in (0, 1).
-        Z_0: R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the
-            grid, see `Wiring.zero_sequence`.
-    """
-
-    node: str
-    branch: str | None
-    position: float
+    node: str  # the node, or the one at which the faulted branch starts
+    branch: str | None  # name of the branch with the fault inside, or None: at the node itself
+    position: float  # on that branch, in (0, 1)
+    # R + jX of the zero sequence's path, p.u. of the network; None: that of the lines to the grid,
+    # see `Wiring.zero_sequence`
     Z_0: complex | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpeningBreaker(Contact):
-    """The poles of an open breaker that still conduct, each until its current passes zero.
+    """The poles of an open breaker that still conduct, each until its current passes zero."""
 
-    Attributes:
-        name: of its branch, or GRID_SOURCE.
-    """
-
-    name: str
+    name: str  # of its branch, or GRID_SOURCE
 
 
 @dataclass(frozen=True)
 class Check:
-    """The synchro-check of an open breaker.
+    """The synchro-check of an open breaker."""
 
-    Attributes:
-        name: of the breaker; "" for that of the grid.
-        sides: the nodes at its two ends, or GRID_SOURCE for the grid itself.
-    """
-
-    name: str
-    sides: tuple[str, str]
+    name: str  # of the breaker; "" for that of the grid
+    sides: tuple[str, str]  # the nodes at its two ends, or GRID_SOURCE for the grid itself
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """The connections of a plant.
+    """The connections of a plant."""
 
-    Attributes:
-        omega_b: rad/s.
-        units: the converters.
-        branches: lines between nodes, and loads with an inductor, which end at `circuit.GROUND`.
-        shunts: loads that are resistors.
-        capacitors: banks of them.
-        fed: by their names the components with sources, voltages before currents.
-        grid: node of the grid, None: there is none.
-        closed: whether the grid's breaker is closed.
-        opened: names of branches whose breakers are open.
-        fault: where one is, or may be again, or None.
-        opening: the breakers, open by ``closed`` or ``opened``, whose poles may still conduct.
-        blocked: indices of converters whose bridges are out of every circuit.
-        check: the synchro-check that waits to close a breaker, or None.
-    """
-
-    omega_b: float
-    units: tuple[ConverterCircuit, ...]
+    omega_b: float  # rad/s
+    units: tuple[ConverterCircuit, ...]  # the converters
+    # lines between nodes, and loads with an inductor, which end at `circuit.GROUND`
     branches: tuple[Branch, ...] = ()
-    shunts: tuple[Shunt, ...] = ()
-    capacitors: tuple[Capacitor, ...] = ()
+    shunts: tuple[Shunt, ...] = ()  # loads that are resistors
+    capacitors: tuple[Capacitor, ...] = ()  # banks of them
+    # by their names the components with sources, voltages before currents
     fed: tuple[tuple[str, Fed], ...] = ()
-    grid: str | None = None
-    closed: bool = True
-    opened: frozenset[str] = frozenset()
-    fault: FaultPlace | None = None
+    grid: str | None = None  # node of the grid, None: there is none
+    closed: bool = True  # whether the grid's breaker is closed
+    opened: frozenset[str] = frozenset()  # names of branches whose breakers are open
+    fault: FaultPlace | None = None  # where one is, or may be again, or None
+    # the breakers, open by ``closed`` or ``opened``, whose poles may still conduct
     opening: tuple[OpeningBreaker, ...] = ()
+    # indices of converters whose bridges are out of every circuit
     blocked: frozenset[int] = frozenset()
-    check: Check | None = None
+    check: Check | None = None  # the synchro-check that waits to close a breaker, or None
 
     @property
     def order(self) -> tuple[str, ...]:

@@ -26,17 +26,11 @@ STEPPED = "a clock stepped"
 
 
 class Offset(NamedTuple):
-    """The answerer's clock less ours.
+    """The answerer's clock less ours."""
 
-    Attributes:
-        ns: in each exchange, shape (n,).
-        within_ns: how far it may be off.
-        clock: how it is known.
-    """
-
-    ns: NDArray[np.float64]
-    within_ns: float
-    clock: str
+    ns: NDArray[np.float64]  # in each exchange, shape (n,)
+    within_ns: float  # how far it may be off
+    clock: str  # how it is known
 
 
 def offset(stamps: Numbers, one_clock: bool, tai_ns: float = 0.0) -> Offset:

@@ -25,19 +25,12 @@ _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 @dataclass(frozen=True)
 class BenchContext:
-    """What a controller is connected to.
+    """What a controller is connected to."""
 
-    Attributes:
-        T_s: sampling time of the run, s.
-        inner: whether the run has an inner stage, so that y and u have its signals.
-        bases: of the converter.
-        delay: from the sampling of y to the moment when u acts, in ticks.
-    """
-
-    T_s: float = 1e-4
-    inner: int = False
-    bases: Bases = field(default_factory=Bases)
-    delay: float = 0.0
+    T_s: float = 1e-4  # sampling time of the run, s
+    inner: int = False  # whether the run has an inner stage, so that y and u have its signals
+    bases: Bases = field(default_factory=Bases)  # of the converter
+    delay: float = 0.0  # from the sampling of y to the moment when u acts, in ticks
 
 
 class ControllerError(Exception):

@@ -74,21 +74,15 @@ _Wires = tuple[NDArray[np.int64], NDArray[np.int64], Vector]
 
 
 class PortWiring(NamedTuple):
-    """The map of a controller's ports, made for a run.
+    """The map of a controller's ports, made for a run."""
 
-    Attributes:
-        constants: shape (inputs,), what a port gets that has no signal.
-        into, out: of the inputs, the signals being references and measurements, and of the
-            outputs, the signals being those of u.
-        fixed: shape (3,) or (4,): values of u that no port gives.
-        blocks: place of the output that blocks the bridge, or -1.
-    """
-
-    constants: Vector
+    constants: Vector  # shape (inputs,), what a port gets that has no signal
+    # into, out: of the inputs, the signals being references and measurements, and of the outputs,
+    # the signals being those of u
     into: _Wires
     out: _Wires
-    fixed: Vector
-    blocks: int
+    fixed: Vector  # shape (3,) or (4,): values of u that no port gives
+    blocks: int  # place of the output that blocks the bridge, or -1
 
     def inputs(self, ref: Vector, y: Vector) -> Vector:
         """The values of all inputs, from references and measurements in p.u."""

@@ -51,17 +51,14 @@ _LOOK_S = 0.05
 
 
 class Share(NamedTuple):
-    """What a role's loop has of one converter.
-
-    Attributes:
-        crowded: there are more loops than processors: this one yields its processor at every
-            look, and in lockstep it sleeps soon.
-    """
+    """What a role's loop has of one converter."""
 
     bench: Bench
     link: Link
     part: RolePart
     timeline: Timeline
+    # there are more loops than processors: this one yields its processor at every look, and in
+    # lockstep it sleeps soon
     crowded: bool = False
 
 

@@ -89,23 +89,17 @@ _GREETING: TypeAdapter[_Hello | _Go] = TypeAdapter(
 
 @dataclass(frozen=True)
 class Start:
-    """What both sides agreed on.
+    """What both sides agreed on."""
 
-    Attributes:
-        t0_ns: time of tick 0 by our own CLOCK_MONOTONIC; where the other side has another one,
-            the controller's is late by the time that START took to come.
-        one_clock: both sides run on one machine.
-        refused: how many malformed greetings came.
-        run: the number that the plant has drawn for this run, 16 hexadecimal digits; None if a
-            foreign plant sent none.
-        controller: what the controller calls itself; None if it did not say.
-    """
-
+    # time of tick 0 by our own CLOCK_MONOTONIC; where the other side has another one, the
+    # controller's is late by the time that START took to come
     t0_ns: int
-    one_clock: bool
-    refused: int
+    one_clock: bool  # both sides run on one machine
+    refused: int  # how many malformed greetings came
+    # the number that the plant has drawn for this run, 16 hexadecimal digits; None if a foreign
+    # plant sent none
     run: str | None
-    controller: str | None
+    controller: str | None  # what the controller calls itself; None if it did not say
 
 
 class Meeting:

@@ -28,17 +28,12 @@ _PIECE = 1_000  # ticks of all converters that are recorded at a time, in the pr
 
 
 class Stack(NamedTuple):
-    """The controllers of a plant, one below the other.
+    """The controllers of a plant, one below the other."""
 
-    Attributes:
-        controllers: their records: ctl and est of shape (N,), laws and states of shape (N, laws).
-        y: measurements of the current tick, (N, 5) or (N, 11), p.u.
-        u: inputs of the current tick, (N, 3) or (N, 4), p.u.
-    """
-
+    # their records: ctl and est of shape (N,), laws and states of shape (N, laws)
     controllers: ControllerRecords
-    y: NDArray[np.float64]
-    u: NDArray[np.float64]
+    y: NDArray[np.float64]  # measurements of the current tick, (N, 5) or (N, 11), p.u.
+    u: NDArray[np.float64]  # inputs of the current tick, (N, 3) or (N, 4), p.u.
 
 
 def stack(benches: Sequence[Bench]) -> Stack:

@@ -78,44 +78,33 @@ loop_dtype = np.dtype(
 
 
 class LinkEnd(NamedTuple):
-    """One end of a link as the loops use it: ``gfm_hil.links.Port`` and the frames' buffers.
+    """One end of a link as the loops use it: ``gfm_hil.links.Port`` and the frames' buffers."""
 
-    Attributes:
-        send, receive, patient, handle, spins: of the port.
-        out: sequence, record and bytes of the frame to send.
-        into: record and bytes of a frame received.
-        reader: counters of what was received, see ``gfm_hil.links.frame``.
-    """
-
+    # send, receive, patient, handle, spins: of the port
     send: Any
     receive: Any
     patient: Any
     handle: NDArray[np.int64]
     spins: int
-    out: tuple[Any, Any, Any]
-    into: tuple[Any, Any]
-    reader: NDArray[Any]
+    out: tuple[Any, Any, Any]  # sequence, record and bytes of the frame to send
+    into: tuple[Any, Any]  # record and bytes of a frame received
+    reader: NDArray[Any]  # counters of what was received, see ``gfm_hil.links.frame``
 
 
 class Records(NamedTuple):
-    """What a loop writes, whichever role it has.
+    """What a loop writes, whichever role it has."""
 
-    Attributes:
-        loop: one element of ``loop_dtype``.
-        flags: shape (FLAGS,), int64, written by other threads.
-        y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
-            stage, (21,) and (7,) with counts; p.u. and counts.
-        rows, times, progress: of the recording's part.
-        plan, kept: of the trace that is replayed, see ``gfm_hil.engine.replay``.
-    """
-
-    loop: NDArray[Any]
-    flags: NDArray[np.int64]
+    loop: NDArray[Any]  # one element of ``loop_dtype``
+    flags: NDArray[np.int64]  # shape (FLAGS,), int64, written by other threads
+    # y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
+    # stage, (21,) and (7,) with counts; p.u. and counts
     y: NDArray[np.float64]
     u: NDArray[np.float64]
+    # rows, times, progress: of the recording's part
     rows: NDArray[np.float64]
     times: NDArray[np.int64]
     progress: NDArray[np.int64]
+    # plan, kept: of the trace that is replayed, see ``gfm_hil.engine.replay``
     plan: NDArray[np.int64]
     kept: NDArray[np.float64]
 

@@ -24,15 +24,12 @@ ACTS, STEPS = range(2)  # columns of ``Trace.plan``
 
 
 class Trace(NamedTuple):
-    """What a run replays; without a trace both have no rows.
+    """What a run replays; without a trace both have no rows."""
 
-    Attributes:
-        plan: the tick whose u acts, and whether the controller computes; shape (ticks, 2).
-        kept: the newest u by tick, and last the one that acts; shape (N + 1, 3), or (N + 1, 4) with
-            an inner stage, p.u.
-    """
-
+    # the tick whose u acts, and whether the controller computes; shape (ticks, 2)
     plan: NDArray[np.int64]
+    # the newest u by tick, and last the one that acts; shape (N + 1, 3), or (N + 1, 4) with an
+    # inner stage, p.u.
     kept: NDArray[np.float64]
 
 

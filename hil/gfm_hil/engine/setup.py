@@ -30,27 +30,20 @@ ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or g
 
 @dataclass
 class Bench:
-    """Everything that one run changes.
-
-    Attributes:
-        plant: the plant, in common with the other converters of a network.
-        place: the converter's index in it.
-        controller: the controller, its first law at rest and RUNNING.
-        y: measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
-        u: inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
-        external: what computes u in place of the law; None for the law.
-        trace: what the run replays.
-    """
+    """Everything that one run changes."""
 
     scenario: Scenario
-    plant: Network
-    place: int
-    controller: Controller
+    plant: Network  # the plant, in common with the other converters of a network
+    place: int  # the converter's index in it
+    controller: Controller  # the controller, its first law at rest and RUNNING
     start: OperatingPoint
+    # measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
     y: NDArray[np.float64]
+    # inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     u: NDArray[np.float64]
+    # what computes u in place of the law; None for the law
     external: SteppedController | None = None
-    trace: Trace = field(default_factory=no_trace)
+    trace: Trace = field(default_factory=no_trace)  # what the run replays
 
     @property
     def inner(self) -> int:

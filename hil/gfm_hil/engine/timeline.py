@@ -31,14 +31,10 @@ _ROOM = 1 << 16  # bytes kept beside the log for its last lines
 
 @dataclass
 class Ticket:
-    """The outcome of an operator's event: its tick once ``done``, or an error.
-
-    Attributes:
-        others: of the other converters, whose logs name the event too.
-    """
+    """The outcome of an operator's event: its tick once ``done``, or an error."""
 
     operator: dict[str, Any]
-    others: Sequence[Timeline] = ()
+    others: Sequence[Timeline] = ()  # of the other converters, whose logs name the event too
     done: threading.Event = field(default_factory=threading.Event)
     tick: int = -1
     error: str = ""

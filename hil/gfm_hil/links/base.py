@@ -67,33 +67,27 @@ class LinkOptions(BaseModel):
 
 @dataclass(frozen=True)
 class LinkKind:
-    """What the bench knows of a link before it opens one.
+    """What the bench knows of a link before it opens one."""
 
-    Attributes:
-        name: as in ``link.type``.
-        text: what it is, in a few words.
-        pattern, form: the regular expression that an endpoint must match, and the same in words.
-        fresh: makes an endpoint for a new run, given a new empty folder with a short path.
-        open: opens one side's end at an endpoint with checked options. Heavy imports belong
-            in there. Raises ``UserError`` if it cannot use the endpoint.
-        options: model of ``link.options``.
-        check: checks the options against the sampling time in s; raises ValueError in one line.
-        check_both: checks that an endpoint (None: a fresh one) may be used with the options;
-            raises ValueError likewise.
-        warm_up: compiles, or loads from numba's cache, what an end with these options calls.
-        exact: float64 values arrive as sent, so that results equal those of a run in process.
-    """
-
-    name: str
-    text: str
+    name: str  # as in ``link.type``
+    text: str  # what it is, in a few words
+    # pattern, form: the regular expression that an endpoint must match, and the same in words
     pattern: str
     form: str
+    # makes an endpoint for a new run, given a new empty folder with a short path
     fresh: Callable[[Path], str]
+    # opens one side's end at an endpoint with checked options. Heavy imports belong in there.
+    # Raises ``UserError`` if it cannot use the endpoint
     open: Callable[[Role, str, Any], Link]
-    options: type[LinkOptions] = LinkOptions
+    options: type[LinkOptions] = LinkOptions  # model of ``link.options``
+    # checks the options against the sampling time in s; raises ValueError in one line
     check: Callable[[Any, float], None] = lambda options, T_s: None
+    # checks that an endpoint (None: a fresh one) may be used with the options; raises ValueError
+    # likewise
     check_both: Callable[[str | None, Any], None] = lambda endpoint, options: None
+    # compiles, or loads from numba's cache, what an end with these options calls
     warm_up: Callable[[Any], None] = lambda options: None
+    # float64 values arrive as sent, so that results equal those of a run in process
     exact: bool = True
 
     def checked(

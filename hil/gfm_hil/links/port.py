@@ -21,32 +21,27 @@ PORT_CALL = types.int64(types.int64[::1], types.uint8[::1])
 
 @dataclass(frozen=True)
 class Port:
-    """One side's end of a link, for compiled loops.
+    """One side's end of a link, for compiled loops."""
 
-    Attributes:
-        handle: state of the functions (addresses, counters), int64; its owner keeps alive the
-            memory that it points to. After the link is closed, nothing may be called through it.
-        send: sends the whole of ``message``: returns 1, or 0 if it dropped it.
-        receive: writes the next message to ``message``; returns its length in bytes, 0 if none has
-            arrived, or -1 if the link is lost: the link's own ``receive`` then raises and says
-            why. A message that is too long is dropped, and its length returned.
-        spins: empty polls before a waiting loop begins to yield its processor: many if the peer
-            delivers directly, 0 if a thread of the link needs the processor to deliver.
-        patient: as ``receive``, but may sleep for up to a millisecond until a message arrives: for
-            loops without deadlines, after many empty polls. On a crowded machine a thread that
-            only yields keeps the peer that it waits for from running. None: the loop sleeps
-            briefly instead.
-        spin_limit: empty polls after which a loop in lockstep may sleep: some hundred
-            microseconds, so that loops sleep only on a crowded machine.
-        paced: tells the link whether there are pauses between the messages, as in real time.
-    """
-
+    # state of the functions (addresses, counters), int64; its owner keeps alive the memory that it
+    # points to. After the link is closed, nothing may be called through it
     handle: NDArray[np.int64]
-    send: Any
+    send: Any  # sends the whole of ``message``: returns 1, or 0 if it dropped it
+    # writes the next message to ``message``; returns its length in bytes, 0 if none has arrived, or
+    # -1 if the link is lost: the link's own ``receive`` then raises and says why. A message that is
+    # too long is dropped, and its length returned
     receive: Any
+    # empty polls before a waiting loop begins to yield its processor: many if the peer delivers
+    # directly, 0 if a thread of the link needs the processor to deliver
     spins: int
+    # as ``receive``, but may sleep for up to a millisecond until a message arrives: for loops
+    # without deadlines, after many empty polls. On a crowded machine a thread that only yields
+    # keeps the peer that it waits for from running. None: the loop sleeps briefly instead
     patient: Any = None
+    # empty polls after which a loop in lockstep may sleep: some hundred microseconds, so that loops
+    # sleep only on a crowded machine
     spin_limit: int = 5000
+    # tells the link whether there are pauses between the messages, as in real time
     paced: Callable[[bool], object] = bool
 
     def __post_init__(self) -> None:

@@ -118,23 +118,14 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True)
 class Described:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: of the column in the run folder.
-        symbol: as printed, LaTeX; empty for codes and times.
-        unit: of what is recorded, with the base of a per-unit value; empty for codes.
-        quantity: short description.
-        origin: where it was recorded, in short; may be empty.
-        words: meanings of the values of a code.
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    quantity: str
-    origin: str = ""
-    words: tuple[tuple[int, str], ...] = ()
+    name: str  # of the column in the run folder
+    symbol: str  # as printed, LaTeX; empty for codes and times
+    unit: str  # of what is recorded, with the base of a per-unit value; empty for codes
+    quantity: str  # short description
+    origin: str = ""  # where it was recorded, in short; may be empty
+    words: tuple[tuple[int, str], ...] = ()  # meanings of the values of a code
 
     @property
     def comment(self) -> str:

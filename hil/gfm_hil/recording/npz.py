@@ -47,16 +47,11 @@ _LAST = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS).flush()  # ends
 
 @dataclass(frozen=True)
 class ColumnGroup:
-    """Columns to be written that are read together.
+    """Columns to be written that are read together."""
 
-    Attributes:
-        columns: their types by name.
-        rows: their length.
-        read: ``read(first, last)`` gives those rows of each column, in the order of ``columns``.
-    """
-
-    columns: dict[str, np.dtype[Any]]
-    rows: int
+    columns: dict[str, np.dtype[Any]]  # their types by name
+    rows: int  # their length
+    # ``read(first, last)`` gives those rows of each column, in the order of ``columns``
     read: Callable[[int, int], Iterable[NDArray[Any]]]
 
     @staticmethod
@@ -140,20 +135,16 @@ def _deflate(plain: bytes) -> bytes:
 
 @dataclass
 class Column:
-    """An array of shape (rows,) in an .npz file; ``column[first:last]`` reads only those rows.
+    """An array of shape (rows,) in an .npz file; ``column[first:last]`` reads only those rows."""
 
-    Attributes:
-        path, name: file and member.
-        dtype, rows: of the array.
-        step: rows a block; ``rows`` for a file of another writer, which is read as a whole.
-        starts: where each block begins in the file, and where the last one ends, bytes.
-    """
-
+    # path, name: file and member
     path: Path
     name: str
+    # dtype, rows: of the array
     dtype: np.dtype[Any]
     rows: int
-    step: int
+    step: int  # rows a block; ``rows`` for a file of another writer, which is read as a whole
+    # where each block begins in the file, and where the last one ends, bytes
     starts: tuple[int, ...]
 
     def __post_init__(self) -> None:

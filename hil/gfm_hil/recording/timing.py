@@ -19,15 +19,10 @@ MISS_NEEDS = ("plant_scheduled", "plant_received")
 
 @dataclass(frozen=True)
 class DurationHistogram:
-    """A histogram of durations, which takes little memory: many ticks have the same duration.
+    """A histogram of durations, which takes little memory: many ticks have the same duration."""
 
-    Attributes:
-        ns: the different durations in order.
-        count: number of ticks with each duration.
-    """
-
-    ns: NDArray[np.int64]
-    count: NDArray[np.int64]
+    ns: NDArray[np.int64]  # the different durations in order
+    count: NDArray[np.int64]  # number of ticks with each duration
 
     @staticmethod
     def of(durations: Iterable[NDArray[np.int64]]) -> DurationHistogram:
@@ -60,19 +55,15 @@ class DurationHistogram:
 
 @dataclass(frozen=True)
 class Duration:
-    """A duration in each tick, from one stamp to another.
+    """A duration in each tick, from one stamp to another."""
 
-    Attributes:
-        name, meaning: for labels.
-        begin, end: columns of timing.npz.
-        periods: number of T_s to add: the stamp at the end belongs to that many ticks later.
-    """
-
+    # name, meaning: for labels
     name: str
     meaning: str
+    # begin, end: columns of timing.npz
     begin: str
     end: str
-    periods: int = 0
+    periods: int = 0  # number of T_s to add: the stamp at the end belongs to that many ticks later
 
     @property
     def needs(self) -> tuple[str, str]:

@@ -29,20 +29,14 @@ _LAG = dict(zip(PHASES, (0.0, 2 * math.pi / 3, -2 * math.pi / 3), strict=True)) 
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of a space vector as a column, of which only the rows asked for are computed.
+    """A phase of a space vector as a column, of which only the rows asked for are computed."""
 
-    Attributes:
-        columns: with those of ``NEEDS``.
-        name, phase: of ``WAVES`` and ``PHASES``.
-        f_n: nominal frequency, Hz.
-        factor: from p.u. to what is wanted.
-    """
-
-    columns: Columns
+    columns: Columns  # with those of ``NEEDS``
+    # name, phase: of ``WAVES`` and ``PHASES``
     name: str
     phase: str
-    f_n: float
-    factor: float = 1.0
+    f_n: float  # nominal frequency, Hz
+    factor: float = 1.0  # from p.u. to what is wanted
     dtype = np.dtype(float)
 
     def __len__(self) -> int:

@@ -20,21 +20,13 @@ _TAIL = 0.05  # fraction at the end of a window whose mean is the final value
 
 @dataclass(frozen=True)
 class Window:
-    """A signal from a step on.
+    """A signal from a step on."""
 
-    Attributes:
-        name: of the signal.
-        t: time, s, shape (n,).
-        x: values, shape (n,).
-        before: value just before the step.
-        since: time of the step, s.
-    """
-
-    name: str
-    t: Vector
-    x: Vector
-    before: float
-    since: float
+    name: str  # of the signal
+    t: Vector  # time, s, shape (n,)
+    x: Vector  # values, shape (n,)
+    before: float  # value just before the step
+    since: float  # time of the step, s
 
     def show(self, value: float) -> str:
         """A value with its unit."""
@@ -48,16 +40,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Violation:
-    """A failed check.
+    """A failed check."""
 
-    Attributes:
-        text: what is wrong, in a sentence or two.
-        at: time of the worst point, s.
-        t, low, high: the band that the signal should have kept, each of shape (n,); NaN: no limit.
-    """
-
-    text: str
-    at: float
+    text: str  # what is wrong, in a sentence or two
+    at: float  # time of the worst point, s
+    # t, low, high: the band that the signal should have kept, each of shape (n,); NaN: no limit
     t: Vector
     low: Vector
     high: Vector

@@ -18,27 +18,21 @@ from gfm_hil.recording.timing import ROUND_TRIP, DurationHistogram, missed
 
 @dataclass(frozen=True)
 class LoopDelay:
-    """What one run showed, in us.
+    """What one run showed, in us."""
 
-    Attributes:
-        set_us: the delay that the scenario sets between y[k] and u[k] acting.
-        T_s_us: the sampling time.
-        ticks, misses: of the run; ``longest_hold``: misses in a row, ticks.
-        round_trip_us: percentiles of y[k] sent to u[k] received, of the ticks that were not
-            missed; None in lockstep, where nothing is measured in real time.
-        acting_us: percentiles of the age of y behind the u that acts, holds included. It is an
-            upper bound: a late u may have come before the next one in time.
-        beyond: ticks in which it exceeded set_us + the margin.
-    """
-
-    set_us: float
-    T_s_us: float
+    set_us: float  # the delay that the scenario sets between y[k] and u[k] acting
+    T_s_us: float  # the sampling time
+    # ticks, misses: of the run; ``longest_hold``: misses in a row, ticks
     ticks: int
     misses: int
     longest_hold: int
+    # percentiles of y[k] sent to u[k] received, of the ticks that were not missed; None in
+    # lockstep, where nothing is measured in real time
     round_trip_us: dict[str, float] | None
+    # percentiles of the age of y behind the u that acts, holds included. It is an upper bound: a
+    # late u may have come before the next one in time
     acting_us: dict[str, float] | None
-    beyond: int
+    beyond: int  # ticks in which it exceeded set_us + the margin
 
     def fits(self, margin_us: float) -> bool | None:
         """The margin covers every tick of the run; None if nothing was measured."""

@@ -46,29 +46,18 @@ _MOST = 1e100  # p.u.; the squares of more could overflow
 
 
 class Oscillation(NamedTuple):
-    """A damped or growing sinusoid in a recording.
+    """A damped or growing sinusoid in a recording."""
 
-    Attributes:
-        damping: ratio; negative if it grows.
-        hz: frequency, Hz.
-    """
-
-    damping: float
-    hz: float
+    damping: float  # ratio; negative if it grows
+    hz: float  # frequency, Hz
 
 
 class Acting(NamedTuple):
-    """Until when the events up to one of them act, ticks.
+    """Until when the events up to one of them act, ticks."""
 
-    Attributes:
-        since: when the newest of them happened.
-        held: the end of what is held for a time, as a sag or a fault, or moves.
-        moved: the end of what moves, as a ramp or a course.
-    """
-
-    since: int
-    held: int
-    moved: int
+    since: int  # when the newest of them happened
+    held: int  # the end of what is held for a time, as a sag or a fault, or moves
+    moved: int  # the end of what moves, as a ramp or a course
 
 
 def acting(scenario: Scenario, signals: Columns, done: int) -> list[Acting]:

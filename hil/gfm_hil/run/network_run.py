@@ -21,16 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class NetworkRun(Mapping[str, Run]):
-    """The runs of a network's converters, by their names.
+    """The runs of a network's converters, by their names."""
 
-    Attributes:
-        scenario: of the whole network.
-        runs: of each converter, in the order of the scenario.
-        folder: which has a run folder for each, by its name; None for a run in memory.
-    """
-
-    scenario: Scenario
-    runs: dict[str, Run]
+    scenario: Scenario  # of the whole network
+    runs: dict[str, Run]  # of each converter, in the order of the scenario
+    # which has a run folder for each, by its name; None for a run in memory
     folder: Path | None = None
 
     if TYPE_CHECKING:  # functions of rooms further up, which ``gfm_hil.api.runs`` adds

@@ -35,21 +35,13 @@ _EQUAL = GridUnbalance(type="grid-unbalance", tick=0).label()
 
 
 class Ripple(NamedTuple):
-    """What still moves at the end of a run.
+    """What still moves at the end of a run."""
 
-    Attributes:
-        pu: peak to peak of the strongest sinusoid by signal, p.u.
-        hz: its frequency by signal, Hz.
-        span_s: the stretch at the end that was judged, s.
-        limit: above which a signal oscillates, p.u.
-        oscillates: a signal beyond the limit that is not dying away; "" without one.
-    """
-
-    pu: dict[str, float]
-    hz: dict[str, float]
-    span_s: float
-    limit: float
-    oscillates: str
+    pu: dict[str, float]  # peak to peak of the strongest sinusoid by signal, p.u.
+    hz: dict[str, float]  # its frequency by signal, Hz
+    span_s: float  # the stretch at the end that was judged, s
+    limit: float  # above which a signal oscillates, p.u.
+    oscillates: str  # a signal beyond the limit that is not dying away; "" without one
 
     def words(self) -> str:
         """Signal, value, frequency, limit and stretch."""

@@ -19,21 +19,16 @@ _MOST = 0.5  # of a stall, that a name must explain
 
 @dataclass(frozen=True)
 class Taken:
-    """Who had the processors, and when.
+    """Who had the processors, and when."""
 
-    Attributes:
-        method: "trace": the kernel's trace, so that begin and end are exact; "proc": two readings
-            of /proc, between which the time ``ran`` lay.
-        why: why there is no trace; "" if there is.
-        rows: of ``ROWS``, times in ns of CLOCK_MONOTONIC; ``who`` is an index into ``names``.
-        lost: how often the kernel overwrote its trace before it was read.
-    """
-
+    # "trace": the kernel's trace, so that begin and end are exact; "proc": two readings of /proc,
+    # between which the time ``ran`` lay
     method: Method
-    why: str = ""
+    why: str = ""  # why there is no trace; "" if there is
+    # of ``ROWS``, times in ns of CLOCK_MONOTONIC; ``who`` is an index into ``names``
     rows: NDArray[Any] = field(default_factory=lambda: np.zeros(0, ROWS))
     names: Sequence[str] = ()
-    lost: int = 0
+    lost: int = 0  # how often the kernel overwrote its trace before it was read
 
     def who(self, begin_ns: int, end_ns: int, stall_ns: float, processors: Collection[int]) -> str:
         """Who explains most of a stall within this time, on one of these processors.

@@ -47,19 +47,13 @@ class LinearPart:
 
     It has m states. Currents and voltages are two numbers each, the real and the imaginary part of
     a space vector in the frame that turns with the component's island.
-
-    Attributes:
-        A: the states by themselves, (m, m), 1/s.
-        by_seen: the states by the current or voltage that it sees, (m, 2), 1/s.
-        source: its source by the states, (2, m).
-        turn: what a turn of all space vectors by 1 rad does to the states, (m,).
-        direct: its source by what it sees, (2, 2).
     """
 
-    A: Matrix
-    by_seen: Matrix
-    source: Matrix
-    turn: Matrix
+    A: Matrix  # the states by themselves, (m, m), 1/s
+    by_seen: Matrix  # the states by the current or voltage that it sees, (m, 2), 1/s
+    source: Matrix  # its source by the states, (2, m)
+    turn: Matrix  # what a turn of all space vectors by 1 rad does to the states, (m,)
+    # its source by what it sees, (2, 2)
     direct: Matrix = field(default_factory=lambda: np.zeros((2, 2)))
 
 

@@ -52,16 +52,12 @@ def frame_time(length: int, fd: bool, bitrate: float, data_bitrate: float) -> fl
 
 @dataclass(frozen=True)
 class Budget:
-    """Worst-case cost of an exchange of y and u.
+    """Worst-case cost of an exchange of y and u."""
 
-    Attributes:
-        y, u: time on the bus, s.
-        lengths: payloads of the frames of y, then of u, bytes.
-    """
-
+    # y, u: time on the bus, s
     y: float
     u: float
-    lengths: tuple[int, ...]
+    lengths: tuple[int, ...]  # payloads of the frames of y, then of u, bytes
 
     @property
     def exchange(self) -> float:

@@ -37,48 +37,35 @@ _MOST_BYTES = 16 << 20  # of a DBC file
 
 @dataclass(frozen=True)
 class Layout:
-    """One frame of the DBC.
+    """One frame of the DBC."""
 
-    Attributes:
-        name, number, length: as in the DBC; the length in bytes.
-        dtype: a record with one field per signal.
-        data_id: 16 bits of a hash over the whole definition.
-        index: which elements of the vector it carries, shape (n,); empty for other frames.
-        start: the first byte of each, shape (n,).
-        scale, offset: value = count × scale + offset, shape (n,), p.u.
-    """
-
+    # name, number, length: as in the DBC; the length in bytes
     name: str
     number: int
     length: int
-    dtype: np.dtype
-    data_id: int
+    dtype: np.dtype  # a record with one field per signal
+    data_id: int  # 16 bits of a hash over the whole definition
+    # which elements of the vector it carries, shape (n,); empty for other frames
     index: NDArray[np.int64]
-    start: NDArray[np.int64]
+    start: NDArray[np.int64]  # the first byte of each, shape (n,)
+    # scale, offset: value = count × scale + offset, shape (n,), p.u.
     scale: NDArray[np.float64]
     offset: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The frames of a DBC that a run uses.
+    """The frames of a DBC that a run uses."""
 
-    Attributes:
-        vectors: the frames of each vector, in the order of their identifiers.
-        status: the frame of each sender.
-        transport: the identifier of each sender's ISO-TP frames.
-        digest: hash of all definitions, in a run without an inner stage less the frames of such a
-            stage; both sides compare it.
-        fd: CAN FD rather than classic.
-        inner: the vectors have the signals of an inner stage.
-    """
-
+    # the frames of each vector, in the order of their identifiers
     vectors: dict[Vector, list[Layout]]
-    status: dict[Role, Layout]
-    transport: dict[Role, int]
+    status: dict[Role, Layout]  # the frame of each sender
+    transport: dict[Role, int]  # the identifier of each sender's ISO-TP frames
+    # hash of all definitions, in a run without an inner stage less the frames of such a stage; both
+    # sides compare it
     digest: int
-    fd: bool
-    inner: int = False
+    fd: bool  # CAN FD rather than classic
+    inner: int = False  # the vectors have the signals of an inner stage
 
 
 def _definition(message: Message) -> str:

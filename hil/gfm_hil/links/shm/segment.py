@@ -51,15 +51,10 @@ def myself() -> Identity:
 
 @dataclass(frozen=True)
 class Segment:
-    """A segment that this process has mapped.
+    """A segment that this process has mapped."""
 
-    Attributes:
-        path: of its file.
-        memory: ``SIZE`` bytes.
-    """
-
-    path: Path
-    memory: mmap.mmap
+    path: Path  # of its file
+    memory: mmap.mmap  # ``SIZE`` bytes
 
     @property
     def plant(self) -> Identity:

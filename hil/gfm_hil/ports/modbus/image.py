@@ -23,20 +23,14 @@ Value = float | str | None
 
 @dataclass(frozen=True)
 class SunSpecPoint:
-    """One point of a model.
+    """One point of a model."""
 
-    Attributes:
-        path: e.g. ``"704.WSet"``.
-        address, length: its registers.
-        definition: of pysunspec2's model file: label, desc, units, symbols, access.
-        exponent: of its constant scale factor; 0 if it has none.
-    """
-
-    path: str
+    path: str  # e.g. ``"704.WSet"``
+    # address, length: its registers
     address: int
     length: int
-    definition: Mapping[str, Any]
-    exponent: int
+    definition: Mapping[str, Any]  # of pysunspec2's model file: label, desc, units, symbols, access
+    exponent: int  # of its constant scale factor; 0 if it has none
 
     @property
     def type(self) -> str:

@@ -35,24 +35,16 @@ class Slack:
 
 @dataclass(frozen=True)
 class RunState:
-    """The state of a run at one tick.
+    """The state of a run at one tick."""
 
-    Attributes:
-        row: every column of the recording at the newest tick, by name.
-        tick, misses: of the plant, since the start.
-        state: of the controller, index into ``gfm_runtime.states.STATES``.
-        law: name of the active law.
-        gains: its parameters that differ from its file.
-        reason: why the controller is in SAFE or the plant tripped, or "".
-    """
-
-    row: dict[str, float]
+    row: dict[str, float]  # every column of the recording at the newest tick, by name
+    # tick, misses: of the plant, since the start
     tick: int
     misses: int
-    state: int
-    law: str
-    gains: dict[str, float]
-    reason: str
+    state: int  # of the controller, index into ``gfm_runtime.states.STATES``
+    law: str  # name of the active law
+    gains: dict[str, float]  # its parameters that differ from its file
+    reason: str  # why the controller is in SAFE or the plant tripped, or ""
 
     @property
     def safe(self) -> bool:

@@ -134,26 +134,20 @@ class PointGroup(ABC):
 
 @dataclass(frozen=True)
 class Settings:
-    """What clients have written; None: not written since the function was last disabled.
-
-    Attributes:
-        value, percent: the set-point in W or var, and in % of S_n.
-        value_back, percent_back: their values after the timer expires.
-        timeout: s, 0 for none.
-        until: the device's time at which the timer expires, s; None: not running.
-        before: the reference in force when it was enabled, p.u.
-    """
+    """What clients have written; None: not written since the function was last disabled."""
 
     enabled: bool = False
     mode: int = 0
+    # value, percent: the set-point in W or var, and in % of S_n
     value: float | None = None
     percent: float | None = None
     enabled_back: bool = False
+    # value_back, percent_back: their values after the timer expires
     value_back: float | None = None
     percent_back: float | None = None
-    timeout: int = 0
-    until: float | None = None
-    before: float = 0.0
+    timeout: int = 0  # s, 0 for none
+    until: float | None = None  # the device's time at which the timer expires, s; None: not running
+    before: float = 0.0  # the reference in force when it was enabled, p.u.
 
     def setting(self, name: str, value: float | None) -> Settings:
         """The same with another value of one field."""

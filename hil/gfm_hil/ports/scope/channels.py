@@ -17,24 +17,17 @@ _LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range,
 
 @dataclass(frozen=True)
 class ScopeChannel:
-    """One quantity over time.
+    """One quantity over time."""
 
-    Attributes:
-        name: in messages between page and server.
-        group: y, u, ref, d, plant, wave, inner (of a run with an inner stage) or loop.
-        symbol, unit, description: for display.
-        least: the smallest range of values that fills the height of a plot, in ``unit``.
-        needs: columns of the recording from which it is computed.
-        of: computes its values of the ticks [first, last) from the columns; NaN if there is none.
-    """
-
-    name: str
-    group: str
+    name: str  # in messages between page and server
+    group: str  # y, u, ref, d, plant, wave, inner (of a run with an inner stage) or loop
+    # symbol, unit, description: for display
     symbol: str
     unit: str
     description: str
-    least: float
-    needs: tuple[str, ...]
+    least: float  # the smallest range of values that fills the height of a plot, in ``unit``
+    needs: tuple[str, ...]  # columns of the recording from which it is computed
+    # computes its values of the ticks [first, last) from the columns; NaN if there is none
     of: Callable[[Columns, int, int], NDArray[np.float64]]
 
     def about(self) -> dict[str, Any]:

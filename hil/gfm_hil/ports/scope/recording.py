@@ -21,20 +21,14 @@ _BEHIND = 2000  # ticks: wait for the side that is behind, up to this lag
 
 @dataclass
 class Recording:
-    """Rows of a run as columns by name, and what is known about the run.
-
-    Attributes:
-        scenario: the resolved one; a run can be shown without its law files.
-        columns: all rows recorded so far.
-        laws: the laws by the indices in column ``law``, see ``_law``.
-        live: the run may still be in progress.
-    """
+    """Rows of a run as columns by name, and what is known about the run."""
 
     folder: Path
-    scenario: Scenario
-    columns: Columns = field(default_factory=dict)
+    scenario: Scenario  # the resolved one; a run can be shown without its law files
+    columns: Columns = field(default_factory=dict)  # all rows recorded so far
+    # the laws by the indices in column ``law``, see ``_law``
     laws: list[Law] = field(default_factory=list)
-    live: bool = True
+    live: bool = True  # the run may still be in progress
 
     def __post_init__(self) -> None:
         self.T_s, self.capacity = self.scenario.T_s, self.scenario.ticks

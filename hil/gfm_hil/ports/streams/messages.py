@@ -39,19 +39,13 @@ _GROUPS = ("y", "u", "true", "ref")  # prefixes of columns that become objects i
 
 @dataclass(frozen=True)
 class NewRows:
-    """Rows of one side, as in ``recording.parts.RolePart``.
+    """Rows of one side, as in ``recording.parts.RolePart``."""
 
-    Attributes:
-        role: ``"plant"`` or ``"controller"``.
-        first: tick of the first row.
-        signals: shape (n, columns), the units of the recording; NaN in ticks never recorded.
-        times: shape (n, columns), int64, ns.
-    """
-
-    role: Role
-    first: int
+    role: Role  # ``"plant"`` or ``"controller"``
+    first: int  # tick of the first row
+    # shape (n, columns), the units of the recording; NaN in ticks never recorded
     signals: NDArray[np.float64]
-    times: NDArray[np.int64]
+    times: NDArray[np.int64]  # shape (n, columns), int64, ns
 
     @property
     def columns(self) -> Columns:
@@ -143,15 +137,10 @@ def block_messages(rows: NewRows) -> list[list[bytes]]:
 
 @dataclass(frozen=True)
 class TickBlock:
-    """Rows of one side.
+    """Rows of one side."""
 
-    Attributes:
-        role: ``"plant"`` or ``"controller"``.
-        rows: record array, shape (n,); ``rows["tick"]`` shows gaps.
-    """
-
-    role: str
-    rows: NDArray[np.void]
+    role: str  # ``"plant"`` or ``"controller"``
+    rows: NDArray[np.void]  # record array, shape (n,); ``rows["tick"]`` shows gaps
 
 
 class BlockReader:

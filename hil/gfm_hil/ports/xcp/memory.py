@@ -57,18 +57,14 @@ class Controlled(Protocol):
 
 @dataclass(frozen=True)
 class _Number:
-    """One number: its description, its value in a snapshot, and the command that writes it.
-
-    Attributes:
-        group: of what one command can write: ``_A_REFERENCE``, ``_THE_LAW``, or the law of a gain;
-            empty for what is only measured.
-        key: its name in the command.
-    """
+    """One number: its description, its value in a snapshot, and the command that writes it."""
 
     entry: Entry
     value: Callable[[dict[str, Any]], float]
+    # of what one command can write: ``_A_REFERENCE``, ``_THE_LAW``, or the law of a gain; empty for
+    # what is only measured
     group: str = ""
-    key: str = ""
+    key: str = ""  # its name in the command
 
 
 def _recorded(name: str, now: dict[str, Any]) -> float:

@@ -62,16 +62,12 @@ class GridProfile(PlantEvent):
 
 
 class ProfilePoint(NamedTuple):
-    """What the plant does from a tick of a course on: go to these values, in a line.
+    """What the plant does from a tick of a course on: go to these values, in a line."""
 
-    Attributes:
-        omega_g, V_g: p.u.; None: it stays as it is.
-        ticks: how long that takes; 0: a step.
-    """
-
+    # omega_g, V_g: p.u.; None: it stays as it is
     omega_g: float | None
     V_g: float | None
-    ticks: int
+    ticks: int  # how long that takes; 0: a step
 
     def apply(self, plant: gfm_plant.Network) -> None:
         """Carry it out on the plant's records, between two ticks. Raises ValueError: the grid is
@@ -91,14 +87,10 @@ class ProfilePoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Profile:
-    """A course.
+    """A course."""
 
-    Attributes:
-        t: s after its event, each larger than the one before.
-        omega_g, V_g: p.u., as many as of t; None without such a column.
-    """
-
-    t: list[float]
+    t: list[float]  # s after its event, each larger than the one before
+    # omega_g, V_g: p.u., as many as of t; None without such a column
     omega_g: list[float] | None
     V_g: list[float] | None
 
