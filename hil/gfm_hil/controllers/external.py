@@ -38,19 +38,12 @@ class ControllerError(Exception):
 
 
 class ExternalController:
-    """A controller that computes u in place of the process's own.
+    """A controller that computes u in place of the process's own."""
 
-    Attributes:
-        name: what the run calls it: 1 to 64 printable ASCII characters.
-        real: float64 or float32, for the laws that the controller's process has beside it.
-        has_laws: it runs the run's own laws, between which events may change.
-        count: instructions of the law's step in the last tick; -1 where they are not counted.
-    """
-
-    name: str
-    real = "float64"
-    has_laws = False
-    count = -1
+    name: str  # what the run calls it: 1 to 64 printable ASCII characters
+    real = "float64"  # float64 or float32, for the laws that the controller's process has beside it
+    has_laws = False  # it runs the run's own laws, between which events may change
+    count = -1  # instructions of the law's step in the last tick; -1 where they are not counted
 
     def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
         """Get ready for a run; only one that runs its laws has something to do.

@@ -21,34 +21,22 @@ REASON = "reason"
 
 
 class Scaled(StrictSchema):
-    """A signal and its scale.
+    """A signal and its scale."""
 
-    Attributes:
-        signal: by its name in the signal table.
-        scale: the port's value at 1 p.u.
-    """
-
-    signal: str
-    scale: float = 1.0
+    signal: str  # by its name in the signal table
+    scale: float = 1.0  # the port's value at 1 p.u.
 
 
 class PortMap(StrictSchema):
-    """What a map file holds.
+    """What a map file holds."""
 
-    Attributes:
-        inputs: by port, a signal of the references or measurements, or a constant.
-        outputs: by port, a signal of u.
-        fixed: by signal of u that no port gives, its value, p.u.
-        parameters: by parameter of the controller, its value.
-        blocks: an output that is not 0 when the bridge must be blocked.
-        step_s: time between two steps of the controller, s; by default what it says itself.
-    """
-
+    # by port, a signal of the references or measurements, or a constant
     inputs: dict[str, str | float | Scaled] = Field({})
-    outputs: dict[str, str | Scaled] = Field({})
-    fixed: dict[str, float] = Field({})
-    parameters: dict[str, float] = Field({})
-    blocks: str | None = None
+    outputs: dict[str, str | Scaled] = Field({})  # by port, a signal of u
+    fixed: dict[str, float] = Field({})  # by signal of u that no port gives, its value, p.u.
+    parameters: dict[str, float] = Field({})  # by parameter of the controller, its value
+    blocks: str | None = None  # an output that is not 0 when the bridge must be blocked
+    # time between two steps of the controller, s; by default what it says itself
     step_s: float | None = Field(None, gt=0)
 
 

@@ -10,23 +10,19 @@ from pydantic import BaseModel, ConfigDict, Field
 class Identity(BaseModel):
     """An operator. The command server's socket is in a folder of this user alone, so that only
     programs of this user can say who gives a command; each server reports what it knows of its
-    peer.
-
-    Attributes:
-        through: what passes the command on: scope, modbus, xcp, command or python.
-        name: of the token (scope), of the local user (command, python), or ``timer`` if the Modbus
-            server itself reverts a set-point.
-        peer: address and port of the other end.
-        certificate: subject of the client's TLS certificate.
-        uid, pid: of a local process.
-    """
+    peer."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
+    # what passes the command on: scope, modbus, xcp, command or python
     through: str = Field(max_length=20)
+    # of the token (scope), of the local user (command, python), or ``timer`` if the Modbus server
+    # itself reverts a set-point
     name: str | None = Field(None, max_length=100)
-    peer: str | None = Field(None, max_length=100)
+    peer: str | None = Field(None, max_length=100)  # address and port of the other end
+    # subject of the client's TLS certificate
     certificate: str | None = Field(None, max_length=1000)
+    # uid, pid: of a local process
     uid: int | None = Field(None, ge=0, lt=2**32)
     pid: int | None = Field(None, ge=0, lt=2**32)
 

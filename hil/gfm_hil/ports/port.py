@@ -137,31 +137,20 @@ class OperatorPort(ABC):
 
     Args:
         name: in the registry.
-
-    Attributes:
-        text: what the command does, for its help, if the registry does not say all of it.
-        risk: what may happen at an address that others reach.
-        remedy: what permits such an address, in words.
-        opens: the option by which a user permits it without encryption, and its help.
-        needs: module and package that it needs, who does, and the extra that installs it.
-        commands: it needs a run that takes commands.
-        early: how many lines it prints before the run begins.
-        stays: it goes on when the run is over, until Ctrl-C.
-        or_any: without ``--port`` it takes a free one if its own is in use.
-        socket: its kind.
-        tls: how it encrypts, once the options are checked; None: plainly.
     """
 
-    text = ""
-    risk: str
-    remedy = "--plain if it shall"
-    opens: tuple[str, str]
+    text = ""  # what the command does, for its help, if the registry does not say all of it
+    risk: str  # what may happen at an address that others reach
+    remedy = "--plain if it shall"  # what permits such an address, in words
+    opens: tuple[str, str]  # the option by which a user permits it without encryption, and its help
+    # module and package that it needs, who does, and the extra that installs it
     needs: tuple[str, str, str, str] | None = None
-    commands = False
-    early = 0
-    stays = False
-    or_any = False
-    socket = socket.SOCK_STREAM
+    commands = False  # it needs a run that takes commands
+    early = 0  # how many lines it prints before the run begins
+    stays = False  # it goes on when the run is over, until Ctrl-C
+    or_any = False  # without ``--port`` it takes a free one if its own is in use
+    socket = socket.SOCK_STREAM  # its kind
+    # how it encrypts, once the options are checked; None: plainly
     tls: ssl.SSLContext | None = None
 
     def __init__(self, name: str) -> None:

@@ -111,13 +111,9 @@ class Effect:
 
 
 class PointGroup(ABC):
-    """A group of points that clients write together and that have a common meaning.
+    """A group of points that clients write together and that have a common meaning."""
 
-    Attributes:
-        writable: paths of the points that clients may write.
-    """
-
-    writable: tuple[str, ...]
+    writable: tuple[str, ...]  # paths of the points that clients may write
 
     @abstractmethod
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
@@ -285,16 +281,12 @@ class Adopted:
 
 
 class Curves(PointGroup):
-    """What models 705 and 711 share.
+    """What models 705 and 711 share."""
 
-    Attributes:
-        model, curve: the model's number and its name of a curve.
-        stored: paths within the curve of the points that a client may write.
-    """
-
+    # model, curve: the model's number and its name of a curve
     model: int
     curve: str
-    stored: tuple[str, ...]
+    stored: tuple[str, ...]  # paths within the curve of the points that a client may write
 
     def __init__(self, gains: LawDroops) -> None:
         self._gains = gains

@@ -35,13 +35,9 @@ _HIGHEST_ID = 0x7FF
 
 
 class Transport(ABC):
-    """Where a slave listens, once it is entered as a context.
+    """Where a slave listens, once it is entered as a context."""
 
-    Attributes:
-        most: bytes of a packet.
-    """
-
-    most: int
+    most: int  # bytes of a packet
 
     @abstractmethod
     def __enter__(self) -> Self:

@@ -31,16 +31,11 @@ def nominal_hz(plant: Network) -> float:
 
 
 class EventTarget(Protocol):
-    """What an event acts on: one converter of a run.
-
-    Attributes:
-        plant: in common with the other converters of a network.
-        place: the converter's index in it.
-    """
+    """What an event acts on: one converter of a run."""
 
     scenario: Scenario
-    plant: Network
-    place: int
+    plant: Network  # in common with the other converters of a network
+    place: int  # the converter's index in it
     controller: Controller
 
     def reset_controller(self) -> None:
@@ -48,15 +43,10 @@ class EventTarget(Protocol):
 
 
 class Event(StrictSchema):
-    """One event at its time; each kind adds ``type``, its fields and what it does.
+    """One event at its time; each kind adds ``type``, its fields and what it does."""
 
-    Attributes:
-        side: who carries it out.
-        changes_law: whether it replaces the law in force, or its gains.
-    """
-
-    side: ClassVar[Role]
-    changes_law: ClassVar[bool] = False
+    side: ClassVar[Role]  # who carries it out
+    changes_law: ClassVar[bool] = False  # whether it replaces the law in force, or its gains
     if TYPE_CHECKING:
         type: str  # a Literal of each kind
 
