@@ -54,36 +54,23 @@ class Bounds:
 
 @dataclass(frozen=True)
 class ProvedSequences:
-    """What the bounds say of a constraint "at most n".
+    """What the bounds say of a constraint "at most n"."""
 
-    Attributes:
-        most: the largest n for which every sequence is stable.
-        bounds: those for it.
-        refuted: the least n for which a word is unstable; None if there is none among those tried.
-        tried: the largest n that was tried.
-    """
-
-    most: int
-    bounds: Bounds
+    most: int  # the largest n for which every sequence is stable
+    bounds: Bounds  # those for it
+    # the least n for which a word is unstable; None if there is none among those tried
     refuted: int | None
-    tried: int
+    tried: int  # the largest n that was tried
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """The matrices of which every sequence of a constraint is a concatenation.
+    """The matrices of which every sequence of a constraint is a concatenation."""
 
-    Attributes:
-        matrices: shape (E, N, N).
-        lengths: ticks of each, shape (E,).
-        low: the rate of a word of them, 1/s.
-        ticks: whose they are.
-    """
-
-    matrices: Matrix
-    lengths: NDArray[np.int64]
-    low: float
-    ticks: Ticks
+    matrices: Matrix  # shape (E, N, N)
+    lengths: NDArray[np.int64]  # ticks of each, shape (E,)
+    low: float  # the rate of a word of them, 1/s
+    ticks: Ticks  # whose they are
 
     def proved(self) -> bool:
         """Whether an ellipsoid proves all stable."""

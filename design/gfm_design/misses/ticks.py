@@ -28,22 +28,15 @@ MEANWHILE: tuple[Meanwhile, ...] = "stands still", "steps"
 @dataclass(frozen=True)
 class Ticks:
     """Hit and misses of one loop: x[k+1] = hit x[k], or misses[i] x[k] in the i-th miss in a row;
-    the last of ``misses`` is that of all further ones.
+    the last of ``misses`` is that of all further ones."""
 
-    Attributes:
-        hit: shape (n, n).
-        misses: each (n, n).
-        noise: what a disturbance of the grid's voltage adds to x, shape (n,), p.u.
-        outputs: y = (v_dc, p, omega_u, q, V) before the sensors is ``outputs`` x in a tick with a
-            new u, shape (5, n), p.u.
-        T_s: s.
-    """
-
-    hit: Matrix
-    misses: tuple[Matrix, ...]
-    noise: Matrix
+    hit: Matrix  # shape (n, n)
+    misses: tuple[Matrix, ...]  # each (n, n)
+    noise: Matrix  # what a disturbance of the grid's voltage adds to x, shape (n,), p.u.
+    # y = (v_dc, p, omega_u, q, V) before the sensors is ``outputs`` x in a tick with a new u, shape
+    # (5, n), p.u.
     outputs: Matrix
-    T_s: float
+    T_s: float  # s
 
     def miss(self, i: int) -> Matrix:
         """The matrix of the i-th miss in a row, i from 0."""

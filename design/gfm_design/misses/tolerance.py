@@ -28,17 +28,12 @@ _HALF, _ALL = 0.5, 1.0  # of a tolerance
 
 @dataclass(frozen=True)
 class RowTolerance:
-    """What the loop bears in one of the two cases of ``MEANWHILE``.
+    """What the loop bears in one of the two cases of ``MEANWHILE``."""
 
-    Attributes:
-        lost: the unstable word with the fewest misses; None if up to ``MOST`` in a row are borne.
-        in_a_row: for how many misses in a row every sequence is stable.
-        in_a_window: for how many in any ``WINDOW`` ticks.
-    """
-
+    # the unstable word with the fewest misses; None if up to ``MOST`` in a row are borne
     lost: Word | None
-    in_a_row: ProvedSequences
-    in_a_window: ProvedSequences
+    in_a_row: ProvedSequences  # for how many misses in a row every sequence is stable
+    in_a_window: ProvedSequences  # for how many in any ``WINDOW`` ticks
 
     @property
     def bears(self) -> int:

@@ -19,15 +19,11 @@ _DENSE, _LONGEST, _COARSE = 30, 800, 60  # hits: all up to there, then so many u
 
 @dataclass(frozen=True)
 class Word:
-    """``misses`` in a row, then ``hits``, repeated.
-
-    Attributes:
-        sigma: rate at which it grows, 1/s; stable below 0.
-    """
+    """``misses`` in a row, then ``hits``, repeated."""
 
     misses: int
     hits: int
-    sigma: float
+    sigma: float  # rate at which it grows, 1/s; stable below 0
 
     def __str__(self) -> str:
         return f"{self.misses} misses, {self.hits} hit{'s' * (self.hits > 1)}"

@@ -27,13 +27,9 @@ Result = TypeVar("Result")
 
 
 class WorkerLost(Unfinished):
-    """A worker died or failed; the message says what is known.
+    """A worker died or failed; the message says what is known."""
 
-    Attributes:
-        result: of what was done before, if the study keeps it.
-    """
-
-    result: Any = None
+    result: Any = None  # of what was done before, if the study keeps it
 
 
 class RunFailed(Exception):
