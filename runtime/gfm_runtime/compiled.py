@@ -31,7 +31,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 
-from gfm_runtime.deferred import DeferredDispatcher, Deferring, Kept
+from gfm_runtime.deferred import DeferredDispatcher, Deferring, KeptResult
 
 #: where compiled functions, and constants that they contain, come from
 _PLACES = {
@@ -81,7 +81,7 @@ class _Index(IndexDataCacheFile):
 class _Cache(FunctionCache):
     """numba's cache of a function, current as long as all our compiled code is the same."""
 
-    _impl_class = Kept
+    _impl_class = KeptResult
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)

@@ -6,8 +6,9 @@ part of one loop, so LLVM would work on each as often as there are callers above
 on a function once, as a part of the one that Python or C calls: the first run of an installation
 compiles in less than half the time, and computes the same bits.
 
-``Deferring`` is numba's compiler up to that point, ``Entry`` is what is still to do, ``Kept``
-writes both to numba's cache, and ``DeferredDispatcher`` is what a decorator makes of a function.
+``Deferring`` is numba's compiler up to that point, ``UnlinkedCode`` is what is still to do,
+``KeptResult`` writes both to numba's cache, and ``DeferredDispatcher`` is what a decorator makes of
+a function.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ class _Library(JITCodeLibrary):
         return library
 
 
-class Entry:
+class UnlinkedCode:
     """What Python will call, once it is made; ``nrt``: the function uses numba's runtime."""
 
     def __init__(self, library: Any, fndesc: Any, env: Any, nrt: bool) -> None:
@@ -134,7 +135,7 @@ class Entry:
         self.library = library
 
 
-class Kept(CompileResultCacheImpl):
+class KeptResult(CompileResultCacheImpl):
     """A function in numba's cache, with machine code or without."""
 
     def reduce(self, cres: Any) -> Any:
@@ -152,7 +153,7 @@ class Kept(CompileResultCacheImpl):
         made_of, rest = payload
         if made_of is None:
             cres = super().rebuild(target_context, rest)
-            entry = Entry(cres.library, cres.fndesc, cres.environment, nrt=False)
+            entry = UnlinkedCode(cres.library, cres.fndesc, cres.environment, nrt=False)
             entry.function = cres.entry_point
             return cres._replace(entry_point=entry)
         packed, fndesc, env, nrt = made_of
@@ -166,7 +167,7 @@ class Kept(CompileResultCacheImpl):
             typing_context=target_context.typing_context,
             library=library,
             environment=env,
-            entry_point=Entry(library, fndesc, env, nrt),
+            entry_point=UnlinkedCode(library, fndesc, env, nrt),
             fndesc=fndesc,
             type_annotation="",
             signature=signature,
@@ -194,7 +195,7 @@ class _Lowering(NativeLowering):
         super().run_pass(state)
         if not called_by_c:
             lowered = state["cr"]
-            entry = Entry(library, lowered.fndesc, lowered.env, flags.nrt)
+            entry = UnlinkedCode(library, lowered.fndesc, lowered.env, flags.nrt)
             context.insert_user_function(entry, lowered.fndesc, [library])
             state.reload_init.extend(library._reload_init)
             state["cr"] = lowered._replace(cfunc=entry)

@@ -26,7 +26,7 @@ from gfm_hil.bench.pingpong import HYBRID, SLEEP, SPIN, wait_for
 from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
 from gfm_hil.realtime.clock import AHEAD_NS, now_ns
 from gfm_hil.run.attribution import Times, bursts
-from gfm_hil.run.stalls import Watch
+from gfm_hil.run.stalls import ProcessorWatch
 from gfm_runtime.compiled import cached
 
 #: the kernel's trace itself costs microseconds a wake-up, so it has a row of its own
@@ -91,7 +91,7 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
                     late = outside.measure(wait, cpus, policy, PERIOD_NS, options.seconds)
                     rows[cell].rounds.append(late[None])
                 else:
-                    with Watch() as watch:
+                    with ProcessorWatch() as watch:
                         if wait == WATCHED:
                             watch.begin(loops[policy])
                         first = time.monotonic_ns() + _LEAD_NS
@@ -113,7 +113,7 @@ class _Late:
     names: Counter[str] = field(default_factory=Counter)
     method: str | None = None
 
-    def add(self, first_ns: int, late: Times, watch: Watch) -> None:
+    def add(self, first_ns: int, late: Times, watch: ProcessorWatch) -> None:
         """A round of our own."""
         self.rounds.append(late)
         if watch.taken is None:

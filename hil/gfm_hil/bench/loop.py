@@ -41,7 +41,7 @@ from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.run.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.run.stalls import Watch, loops_of
+from gfm_hil.run.stalls import ProcessorWatch, loops_of
 from gfm_hil.run.taken import Taken
 from gfm_hil.scenario import INPROC, Scenario, check_scenario, load_scenario
 from gfm_plant import plant_advance, plant_sample
@@ -245,7 +245,7 @@ def _run(scenario: Scenario, place: Path, beside: Beside = nullcontext) -> _Run:
     """Run a scenario; in real time, the context ``beside`` and the watch over the processors begin
     with its first ticks, not while it starts."""
     folder, begin = place / f"run-{time.monotonic_ns()}", 0
-    with ExitStack() as during, Watch() as watch:
+    with ExitStack() as during, ProcessorWatch() as watch:
 
         def progress(ticks: int, misses: int) -> None:
             nonlocal begin

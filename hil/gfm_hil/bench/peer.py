@@ -5,7 +5,6 @@ u. The other side is ``gfmhil bench answer``, or any controller of docs/own-cont
 """
 
 import ctypes
-import os
 import re
 import socket
 import subprocess
@@ -34,7 +33,12 @@ from gfm_hil.links import Link, link_kind, link_names
 from gfm_hil.links.base import LinkKind
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.links.pump import ported
-from gfm_hil.realtime.priority import ask_for_real_time, own_processor, restore_priority
+from gfm_hil.realtime.priority import (
+    ask_for_real_time,
+    leave_real_time,
+    own_processor,
+    restore_priority,
+)
 from gfm_hil.run.runner import controller_program
 from gfm_hil.scenario import Scenario, check_scenario, write_scenario
 from gfm_plant import plant_sample
@@ -257,17 +261,13 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     return PingPong(caller.ping, nothing, caller.close, compiled, lambda: caller.sides)
 
 
-def _leave_real_time() -> None:
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
 def _started(c: Contender) -> Callable[[], None]:
     """Start the controller of a contender on our processor, as the other side's spins; returns what
     ends it."""
     with Path(c.options["log"]).open("wb") as log:
         process = subprocess.Popen(
             guarded(c.options["program"], bounded=True), stdout=log, stderr=log,
-            start_new_session=True, preexec_fn=_leave_real_time,
+            start_new_session=True, preexec_fn=leave_real_time,
         )  # fmt: skip
 
     def close() -> None:

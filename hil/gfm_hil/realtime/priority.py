@@ -88,10 +88,15 @@ def _fifo() -> str:
     return f"fifo {PRIORITY}"
 
 
+def leave_real_time() -> None:
+    """Schedule this thread as any other one, whatever it inherited."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def ordinary_priority() -> str:
     """Give this thread the highest ordinary priority: for loops that only spin."""
     try:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        leave_real_time()
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     except (AttributeError, OSError):
         return "as given"
@@ -109,7 +114,7 @@ def _lock_memory() -> bool:
 def restore_priority() -> None:
     """Give the calling thread, which only watches, ordinary priority on its former processors."""
     try:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        leave_real_time()
         if _before:
             os.sched_setaffinity(0, _before)
     except (AttributeError, OSError):

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.recording.columns import bytes_per_tick
-from gfm_hil.run.stalls import Watch
+from gfm_hil.run.stalls import ProcessorWatch
 from gfm_hil.run.taken import Taken
 
 Level = Literal["green", "yellow", "red"]
@@ -47,7 +47,7 @@ class Finding(NamedTuple):
 def examine() -> tuple[Facts, list[Finding]]:
     """The machine's badge and further facts, and the findings; changes nothing."""
     steal, before = StealTime(), interrupt_counts(Path("/"))
-    with Watch() as watch:
+    with ProcessorWatch() as watch:
         watch.begin(dict.fromkeys(os.sched_getaffinity(0), -1), 0)
         time.sleep(_STEAL_OVER_S)
     facts = {**environment(), **look(Path("/")), "steal_pct": steal.percent()}

@@ -17,7 +17,7 @@ from gfm_hil.run.taken import Taken
 LEAST_NS = 5_000  # shorter times make no tick late
 
 
-class Watch:
+class ProcessorWatch:
     """Watches processors from ``begin`` to the end of its context.
 
     Attributes:
@@ -30,7 +30,7 @@ class Watch:
         self.taken: Taken | None = None
         self._by: KernelTrace | ProcWatch | None = None
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> ProcessorWatch:
         return self
 
     def begin(self, loops: Mapping[int, int], least_ns: int = LEAST_NS) -> None:

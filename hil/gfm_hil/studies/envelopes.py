@@ -71,6 +71,10 @@ class Unit:
         """The unit with other damping and inertia, as factors."""
         return Unit(self.D * D, self.H * H, self.X_eff)
 
+    def inertia(self, digits: int = 3) -> str:
+        """H for people; what a fit leaves of none is 0."""
+        return f"H = {round(self.H, 6):.{digits}g} s"
+
     def damping_ratio(self, X: float, omega_b: float = OMEGA_B) -> float:
         """Damping ratio of the swing on a total reactance X, p.u.; omega_b in rad/s."""
         return self.D / 2 * math.sqrt(X / (2 * self.H * omega_b))

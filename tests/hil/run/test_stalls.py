@@ -17,7 +17,7 @@ from gfm_hil.run.attribution import CAUSES, attribute, missed_ticks
 from gfm_hil.run.kernel_trace import tracefs
 from gfm_hil.run.proc_watch import ProcWatch
 from gfm_hil.run.runner import run_scenario
-from gfm_hil.run.stalls import Watch, loops_of
+from gfm_hil.run.stalls import ProcessorWatch, loops_of
 from gfm_hil.run.taken import STOPPED, nobody
 from gfm_hil.scenario import check_scenario
 
@@ -78,7 +78,7 @@ def provoked(tmp_path: Path, stalls_wanted: int, pause_s: float):
         "late_policy": {"hold": 10**9},
     }  # fmt: skip
     folder, children = tmp_path / "run", []
-    with Watch() as watch:
+    with ProcessorWatch() as watch:
 
         def progress(ticks, misses):
             if ticks > 5_000 and not children:

@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -110,6 +111,26 @@ def of_link(name: str, link: str, endpoint: str, limit: str, **options: Any) -> 
 
 def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
     return over_link(open_link(c.link, role, c.endpoint, c.options), own)
+
+
+class PackageEnd:
+    """Base of one end by another package, driven from Python as a link is."""
+
+    port = None
+
+    def __init__(self, role: Role, endpoint: str) -> None:
+        raise NotImplementedError
+
+
+def of_package(
+    name: str, link: str, endpoint: str, kind: type[PackageEnd], peer: str, limit: str
+) -> Contender:
+    """What one would pick instead: an end is ``kind``, of the package ``peer``."""
+    return Contender(name, link, endpoint, partial(_open_package, kind), peer, limit=limit)
+
+
+def _open_package(kind: type[PackageEnd], c: Contender, role: Role, own: Messages) -> PingPong:
+    return over_link(kind(role, c.endpoint), own)
 
 
 def limit(

@@ -5,10 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, udp
-from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, udp
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 #: on the loopback interface without multicast; its receiving thread hands a sample on by itself
 _SETTINGS = """<CycloneDDS><Domain><General>
@@ -22,19 +20,13 @@ _DOMAINS = 230  # numbers that a domain may have
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     if "cyclonedds" in names:
         domain = str(1 + os.getpid() % _DOMAINS)
-        yield Contender("cyclonedds", "cyclonedds", domain, _open, "cyclonedds", limit=udp.LIMIT)
+        yield of_package("cyclonedds", "cyclonedds", domain, Dds, "cyclonedds", udp.LIMIT)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    return over_link(Dds(role, int(c.endpoint)), own)
-
-
-class Dds:
+class Dds(PackageEnd):
     """One end: a writer and a reader, best effort, the last sample alone."""
 
-    port: Port | None = None
-
-    def __init__(self, role: Role, number: int) -> None:
+    def __init__(self, role: Role, domain: str) -> None:
         from cyclonedds.core import Policy, Qos
         from cyclonedds.domain import Domain, DomainParticipant
         from cyclonedds.idl import make_idl_struct, types
@@ -46,13 +38,14 @@ class Dds:
         fields = {"content": kinds.sequence[kinds.uint8]}
         message: Any = make_idl_struct("Message", "gfmhil.Message", fields)
         qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
-        domain = Domain(number, _SETTINGS)
+        number = int(domain)
+        settings = Domain(number, _SETTINGS)
         participant = DomainParticipant(number)
         out, into = ("u", "y") if role == "controller" else ("y", "u")
         self._writer = DataWriter(participant, Topic(participant, out, message), qos)
         self._reader = DataReader(participant, Topic(participant, into, message), qos)
         self._message = message
-        self._keep = [domain, participant]
+        self._keep = [settings, participant]
 
     def send(self, message: bytes) -> bool:
         self._writer.write(self._message(content=message))

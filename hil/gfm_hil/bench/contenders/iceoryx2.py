@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, shm
-from gfm_hil.bench.pingpong import LONGEST, Messages, PingPong, over_link
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, shm
+from gfm_hil.bench.pingpong import LONGEST
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 _ROOM = 64  # messages, as in the links
 
@@ -17,17 +16,11 @@ _ROOM = 64  # messages, as in the links
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     if "iceoryx2" in names:
         name = f"gfmhil-{secrets.token_hex(8)}"
-        yield Contender("iceoryx2", "iceoryx2", name, _open, "iceoryx2", limit=shm.LIMIT)
+        yield of_package("iceoryx2", "iceoryx2", name, Iceoryx2, "iceoryx2", shm.LIMIT)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    return over_link(Iceoryx2(role, c.endpoint), own)
-
-
-class Iceoryx2:
+class Iceoryx2(PackageEnd):
     """One end over two services of its publish-subscribe, driven from Python, as a link is."""
-
-    port: Port | None = None
 
     def __init__(self, role: Role, name: str) -> None:
         import iceoryx2 as iox2

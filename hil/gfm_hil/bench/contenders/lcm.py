@@ -4,28 +4,20 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from gfm_hil.bench.contenders import Contender, udp
-from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, udp
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     if "lcm" in names:
         port = 10_000 + os.getpid() % 20_000
         group = f"udpm://239.255.76.67:{port}?ttl=0"  # ttl 0: the packets stay on this machine
-        yield Contender("lcm", "lcm", group, _open, "lcm", limit=udp.LIMIT)
+        yield of_package("lcm", "lcm", group, Lcm, "lcm", udp.LIMIT)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    return over_link(Lcm(role, c.endpoint), own)
-
-
-class Lcm:
+class Lcm(PackageEnd):
     """One end: two channels of UDP multicast; the caller polls."""
-
-    port: Port | None = None
 
     def __init__(self, role: Role, group: str) -> None:
         from lcm import LCM

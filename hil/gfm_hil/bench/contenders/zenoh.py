@@ -5,10 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, free_port, udp
-from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package, udp
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 _ROOM = 64  # messages, as in the links
 
@@ -16,18 +14,12 @@ _ROOM = 64  # messages, as in the links
 def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
     if "zenoh" in names:
         tcp = f"tcp/127.0.0.1:{free_port()}"
-        yield Contender("zenoh tcp", "zenoh", tcp, _open, "zenoh", limit=udp.LIMIT)
+        yield of_package("zenoh tcp", "zenoh", tcp, Zenoh, "zenoh", udp.LIMIT)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
-    return over_link(Zenoh(role, c.endpoint), own)
-
-
-class Zenoh:
+class Zenoh(PackageEnd):
     """One end of two peers without a router: an express publisher, which does not batch, of the
     highest priority, and a subscriber whose ring the caller polls."""
-
-    port: Port | None = None
 
     def __init__(self, role: Role, endpoint: str) -> None:
         import zenoh

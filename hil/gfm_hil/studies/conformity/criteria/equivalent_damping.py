@@ -48,7 +48,7 @@ def damping_of(unit: Unit, omega_b: float) -> tuple[float, str]:
     omega_b in rad/s."""
     ratio = unit.damping_ratio(unit.X_eff, omega_b)
     return ratio, (
-        f"p answers as a swing equation with D = {unit.D:.3g}, H = {round(unit.H, 6):.3g} s on "
+        f"p answers as a swing equation with D = {unit.D:.3g}, {unit.inertia()} on "
         f"{unit.X_eff:.3g} p.u. would, whose damping ratio is {ratio:.3g}."
     )
 

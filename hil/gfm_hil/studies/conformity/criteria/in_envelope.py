@@ -52,7 +52,7 @@ class InEnvelope(Windowed):
         if found is None:
             return m.cannot("its time is not that of an event with an envelope")
         if not np.isfinite([found.lower, found.upper]).all():
-            return m.cannot(f"its envelope has no finite limits at H = {round(unit.H, 6):.2g} s")
+            return m.cannot(f"its envelope has no finite limits at {unit.inertia(2)}")
         if (droops := _by_droop(m, P_0)) > 0.5 * float(np.min(found.upper - found.lower)):
             return m.cannot(
                 "the envelope of a ramp knows no droop, and the declared one of "
@@ -69,7 +69,7 @@ class InEnvelope(Windowed):
         wrong = checks.envelope(w, low, high, self.longest_s)
         beyond = float(np.max(np.maximum(np.maximum(low - w.x, w.x - high), 0.0)))
         words = "measured " * m.under.measured
-        words += f"D = {unit.D:.3g}, H = {round(unit.H, 6):.3g} s, X_eff = {unit.X_eff:.3g}"
+        words += f"D = {unit.D:.3g}, {unit.inertia()}, X_eff = {unit.X_eff:.3g}"
         if wrong is None:
             text = f"p stays in the envelope of {words}" + (
                 f", but for {beyond:.2g} p.u. for a time." if beyond > 0 else "."
