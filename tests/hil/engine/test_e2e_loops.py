@@ -136,17 +136,22 @@ def lied_to(
     return Found(reader, part, liar, how, time.monotonic() - begin)
 
 
-def honest_then_frozen(liar: Liar) -> None:
-    for tick in range(3):
-        liar.say(tick)
-    liar.keep_saying(2)
+def then_keeps(tick: int) -> Callable[[Liar], None]:
+    """It is honest for three ticks, and then says one tick for ever."""
+
+    def lie(liar: Liar) -> None:
+        for k in range(3):
+            liar.say(k)
+        liar.keep_saying(tick)
+
+    return lie
 
 
 @pytest.mark.attack("1.6", "a plant whose tick stands still", "RUNNING for ever")
 @by_link
 def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now):
     scenario = make(**REALTIME)
-    found = lied_to("controller", scenario, place, link, honest_then_frozen)
+    found = lied_to("controller", scenario, place, link, then_keeps(2))
     status, reason, tick = found.end
     assert (status, reason) == ("safe", REASONS[STALE])
     assert set(found.refused) <= {"tick"}
@@ -169,7 +174,7 @@ def test_a_frozen_plant_leads_to_safe_in_real_time(link, make, place, attack_now
 @by_link
 def test_a_frozen_plant_leads_to_safe_in_lockstep(link, make, place, attack_now):
     timeout = {"type": "inproc", "peer_timeout_s": 0.3}
-    found = lied_to("controller", make(**LOCKSTEP, link=timeout), place, link, honest_then_frozen)
+    found = lied_to("controller", make(**LOCKSTEP, link=timeout), place, link, then_keeps(2))
     assert found.end == ("safe", REASONS[LOST_PEER], 2)
     assert found.reader.e2e == "invalid"
     when, _, state, code = found.liar.last_words()
@@ -196,12 +201,7 @@ def test_one_far_tick_does_not_stop_the_controller(link, make, place, attack_now
 @pytest.mark.attack("1.9", "every y has a far tick", "RUNNING on the held u")
 @by_link
 def test_a_plant_that_is_far_ahead_leads_to_safe(link, make, place, attack_now):
-    def lie(liar: Liar) -> None:
-        for tick in range(3):
-            liar.say(tick)
-        liar.keep_saying(FAR)
-
-    found = lied_to("controller", make(**REALTIME), place, link, lie)
+    found = lied_to("controller", make(**REALTIME), place, link, then_keeps(FAR))
     status, reason, tick = found.end
     assert (status, reason) == ("safe", REASONS[STALE]) and tick <= 2
     when, *_ = found.liar.last_words()
@@ -232,12 +232,7 @@ def test_u_of_another_time_never_acts(link, make, place, attack_now):
 @by_link
 @pytest.mark.parametrize("tick", [2, FAR])
 def test_a_frozen_or_far_controller_leads_to_safe_in_real_time(tick, link, make, place, attack_now):
-    def lie(liar: Liar) -> None:
-        for k in range(3):
-            liar.say(k)
-        liar.keep_saying(tick)
-
-    found = lied_to("plant", make(**REALTIME), place, link, lie)
+    found = lied_to("plant", make(**REALTIME), place, link, then_keeps(tick))
     assert found.end[:2] == ("safe", NO_FRESH_U)
     assert found.reader.e2e == "invalid"
     received = found.part.times[: found.part.progress[0], 3]
