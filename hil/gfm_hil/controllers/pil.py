@@ -30,19 +30,9 @@ from gfm_runtime import LawError
 from gfm_runtime.assembly import SPARE, Controller
 from gfm_runtime.children import end_now, guarded
 from gfm_runtime.counts import COUNTS_STATE
+from gfm_runtime.firmware import loop
 from gfm_runtime.firmware.check import TARGETS, need_tools
 from gfm_runtime.firmware.golden import SHIPPED, Golden, golden
-from gfm_runtime.firmware.loop import (
-    ALIGN,
-    CHANGE,
-    CHECK,
-    FROM,
-    START,
-    TICK,
-    TO,
-    LoopProgram,
-    build_loop,
-)
 from gfm_runtime.firmware.module import RESULTS, Module
 from gfm_runtime.signals import COUNTS, N_ADC, REF_NAMES, carried, names
 from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
@@ -116,7 +106,7 @@ class PilController(ExternalController):
         ]
         try:
             folder = self._ends.enter_context(scratch.temporary("gfmhil-pil-"))
-            program = build_loop(modules, controller.T_s, self._target, folder, self._firmware)
+            program = loop.build_loop(modules, controller.T_s, self._target, folder, self._firmware)
             self._run(program)
             self._check(modules, golden(modules, SHIPPED))
         except (LawError, ControllerError) as problem:
@@ -126,19 +116,19 @@ class PilController(ExternalController):
     def has(self, law: Retuned) -> bool:
         return _numbers(law[1].astype(self._controller.laws.dtype)[0]) in self._places
 
-    def _run(self, program: LoopProgram) -> None:
+    def _run(self, program: loop.LoopProgram) -> None:
         folder = program.folder
         self._program = program
         self._request, self._state, self._answer = (
             np.zeros(1, kind) for kind in (program.request, program.state, program.answer)
         )
         self._none = 0  # what reading the clock takes
-        for name in (TO, FROM):
+        for name in (loop.TO, loop.FROM):
             os.mkfifo(folder / name)
         # we keep both ends of the one, so that none waits for the other to open it
-        self._to = os.open(folder / TO, os.O_RDWR)
+        self._to = os.open(folder / loop.TO, os.O_RDWR)
         self._ends.callback(os.close, self._to)
-        self._from = os.open(folder / FROM, os.O_RDONLY | os.O_NONBLOCK)
+        self._from = os.open(folder / loop.FROM, os.O_RDONLY | os.O_NONBLOCK)
         self._ends.callback(os.close, self._from)
         self._log = self._ends.enter_context((folder / "log").open("w+b"))
         try:
@@ -160,7 +150,7 @@ class PilController(ExternalController):
         ControllerError: a bit is not the kernel's, or the program has ended."""
         differ = []
         for row in rows.words:
-            self._request["what"], self._give_up = CHECK, time.monotonic() + _START_S
+            self._request["what"], self._give_up = loop.CHECK, time.monotonic() + _START_S
             self._send(self._request)
             self._send(row)
             self._receive()
@@ -189,7 +179,7 @@ class PilController(ExternalController):
         k, rests = self._rests
         self._aligns &= c.inner == COUNTS
         request, state = self._request, self._state
-        request["what"], request["law"] = START, self._place(k)
+        request["what"], request["law"] = loop.START, self._place(k)
         request["limited"] = rests["limited"]
         for name in state.dtype.names or ():
             state[name] = rests[name]
@@ -201,9 +191,9 @@ class PilController(ExternalController):
         is not finite."""
         ctl, states = self._controller.ctl, self._controller.states
         request, answer = self._request, self._answer
-        request["what"], self._aligns = ALIGN if self._aligns else TICK, False
+        request["what"], self._aligns = loop.ALIGN if self._aligns else loop.TICK, False
         if changed >= 0:
-            request["what"], request["law"] = CHANGE, self._place(changed)
+            request["what"], request["law"] = loop.CHANGE, self._place(changed)
         request["ref"] = ctl["ref"]
         if counts := len(u) > ctl["out"].shape[1]:
             request["y"], request["measured"] = y[-N_ADC:], ctl["y"]

@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 
 from gfm_hil.links import link_kind, open_link
+from gfm_hil.links.can import emulation
 from gfm_hil.links.can.bus_time import frame_time
-from gfm_hil.links.can.emulation import (
-    PLACES,
-    arrive,
-    bus_dtype,
-    deliver,
-    has_room,
-    is_through,
-    place_dtype,
-    set_bus,
-)
 from gfm_hil.links.can.wire import ERROR, frame_dtype
 
 from ...support.can import frame_of
@@ -28,29 +19,29 @@ class World:
 
     def __init__(self, fd: bool = False) -> None:
         self.now = 100.0
-        self.bus = np.zeros(1, bus_dtype)
-        self.places = np.zeros(2 * PLACES, place_dtype)
-        set_bus(self.bus, fd, BITRATE, 8 * BITRATE)
+        self.bus = np.zeros(1, emulation.bus_dtype)
+        self.places = np.zeros(2 * emulation.PLACES, emulation.place_dtype)
+        emulation.set_bus(self.bus, fd, BITRATE, 8 * BITRATE)
 
     def _ns(self) -> int:
         return round(self.now * 1e9)
 
     def send(self, number: int) -> None:
         """Send a frame of our own."""
-        arrive(self.bus, self.places, frame_of(number, bytes(8)), 0, self._ns())
+        emulation.arrive(self.bus, self.places, frame_of(number, bytes(8)), 0, self._ns())
 
     def arrive(self, *numbers: int, length: int = 8) -> None:
         """Receive frames of other nodes."""
         for number in numbers:
-            arrive(self.bus, self.places, frame_of(number, bytes(length)), 1, self._ns())
-        assert not is_through(self.bus, self.places, self._ns())
+            emulation.arrive(self.bus, self.places, frame_of(number, bytes(length)), 1, self._ns())
+        assert not emulation.is_through(self.bus, self.places, self._ns())
 
     def heard_at(self, after: float) -> list[int]:
         """The frames delivered until ``after`` s after the start."""
         self.now = 100.0 + after
         out, frame = [], np.zeros(1, frame_dtype)
-        while is_through(self.bus, self.places, self._ns()):
-            deliver(self.bus, self.places, frame)
+        while emulation.is_through(self.bus, self.places, self._ns()):
+            emulation.deliver(self.bus, self.places, frame)
             out.append(int(frame["id"][0]))
         return out
 
@@ -107,19 +98,19 @@ def test_an_error_of_the_node_itself_is_heard_at_once():
     world = World()
     world.arrive(5, 6)
     assert not world.heard_at(0.5 * FRAME)
-    arrive(world.bus, world.places, frame_of(ERROR | 0x40, bytes(8)), 1, 0)
+    emulation.arrive(world.bus, world.places, frame_of(ERROR | 0x40, bytes(8)), 1, 0)
     assert world.heard_at(0.5 * FRAME) == [ERROR | 0x40]
     assert world.heard_at(2.001 * FRAME) == [5, 6]
 
 
 def test_it_keeps_no_more_than_it_has_places_for():
     world = World()
-    for k in range(PLACES + 1):  # the first is on the bus
-        assert has_room(world.bus)
+    for k in range(emulation.PLACES + 1):  # the first is on the bus
+        assert emulation.has_room(world.bus)
         world.arrive(k)
-    assert not has_room(world.bus)
-    assert world.heard_at((PLACES + 1.1) * FRAME) == list(range(PLACES + 1))
-    assert has_room(world.bus)
+    assert not emulation.has_room(world.bus)
+    assert world.heard_at((emulation.PLACES + 1.1) * FRAME) == list(range(emulation.PLACES + 1))
+    assert emulation.has_room(world.bus)
 
 
 @pytest.mark.parametrize("portable", [True, False])
