@@ -9,6 +9,7 @@ from gfm_design.tuning.synthesis import UNSTABLE
 from gfm_runtime import LawError, law_file
 from gfm_runtime.lawfile import parse_law, tied
 
+from ..support.files import text_of
 from ..support.laws import every_law
 
 
@@ -64,24 +65,7 @@ def test_affine_or_not(law, affine):
     assert PaperProblem(law_file(law), gains).law.is_affine is affine
 
 
-OWN = """
-name = "own"
-title = "t"
-source = "s"
-[error_map]
-type = "hybrid-angle"
-R = "X / 10"
-X = "X"
-[phi]
-11 = { type = "PI", k = 90.0, k_i = 400.0 }
-22 = [{ type = "IF", k = 0.2, T = "T" }, { type = "D", T = 1.0 }, { type = "I", T = "T" }]
-34 = { type = "PI", k = "k", T = 0.1 }
-35 = { type = "PD", k = "k", T = "T", T_f = "0.01 - T" }
-[parameters]
-X = { value = 0.0174, unit = "p.u.", source = "s", free = [0.01, 0.1] }
-T = { value = 0.005, unit = "s", source = "s", free = [0.001, 0.1] }
-k = { value = 1.0, unit = "p.u.", source = "s", free = [-5.0, 5.0] }
-"""
+OWN = text_of("own_law.toml")
 
 
 @pytest.mark.parametrize("bounds", ["[5.0, 1.0]", "[1.0, 1.0]", "[nan, 5.0]", "[0.1, inf]"])

@@ -41,112 +41,17 @@ from gfm_runtime import LawError, discretise, get_law, load_law, pack_law
 from gfm_runtime.firmware import STYLES, elf_a2l, golden, make_modules
 from gfm_runtime.firmware.report import read_report, reports
 
+from ..support.files import text_of
 from ..support.laws import EVERYTHING
 from .conftest import CORPUS, Parser, Take
 from .mutations import blobs, tables, texts
 
 CATALOGUE = Path(load_law.__code__.co_filename).parent / "laws"
 CONVERTERS = Path(load_converter.__code__.co_filename).parent / "converters"
-RESULTS = """
-{"version": "1.0", "inner": null, "under_test": {"droop": 0.01}, "laws": {"vsg-2": {"lab/jump": {
-"verdict": "pass", "parts": [{"part": "a", "verdict": "pass", "reason": "", "clauses": [
-{"clause": "opposes", "kind": "rise", "verdict": "pass", "value": 0.5, "unit": "s", "text": "x"}]},
-{"part": "b", "verdict": "cannot judge", "reason": "no", "clauses": []}]}}}}
-"""
-CAMPAIGN = """
-title = "two runs"
-scenario = "rig_pref_step"
-laws = ["vsg-2"]
-runs = 2
-[set]
-duration = 1.5
-"references.Q_ref" = 0.0
-[figure]
-x = "plant.factors.L_g"
-[[draw]]
-path = "plant.factors.L_g"
-type = "loguniform"
-low = 0.5
-high = 10.0
-label = "L_g / nominal"
-[[draw]]
-path = "plant.factors.L_f"
-type = "normal"
-mean = 1.0
-sigma = 0.1
-low = 0.7
-high = 1.3
-[[draw]]
-path = "plant.delay.samples"
-type = "choice"
-values = [1, 2]
-[[draw]]
-path = "plant.factors.C_f"
-type = "uniform"
-low = 0.9
-high = 1.1
-also = ["plant.factors.R_f"]
-"""
-PROFILE = """# a course
-t,f_hz,V_g
-0.0,50.0,1.0
-0.5,49.9,0.98
-1.0,50.01,1.0
-"""
-EVENTS = """
-title = "every event"
-duration = 1.0
-T_s = 1e-4
-after_trip = "wait"
-ready_laws = ["vsg-2"]
-seed = 3
-references = { P_ref = 0.5, Q_ref = 0.0 }
-late_policy = { hold = 10, extrapolate = 2 }
-[link]
-type = "can"
-endpoint = "can+udp://127.0.0.1:4000"
-options = { every = 2, heartbeat = 50 }
-impairment = { loss = 0.1, burst = 2.0, bits = 3, corrupt = 0.1, pause_at = 5 }
-[plant]
-converter = "rig"
-delay = { samples = 1, fraction = 0.3 }
-adc = "DS2004"
-factors = { L_g = 2.0, R_g = 0.5 }
-dc_source = { mode = "regulated" }
-[plant.sensors]
-bandwidth_hz = 300.0
-noise_std = { p = 1e-4, V = 1e-4 }
-[plant.grid]
-load_R = 2.0
-load_L = 1.0
-[[events]]
-t = 0.1
-type = "reference"
-P_ref = 0.6
-ramp_s = 0.1
-[[events]]
-tick = 3000
-type = "law"
-law = "vsg-2"
-[[events]]
-t = 0.4
-type = "gains"
-values = { D_p = 0.011 }
-[[events]]
-t = 0.5
-type = "grid-frequency"
-f_hz = 49.9
-rate = 1.0
-[[events]]
-t = 0.6
-type = "grid-impedance"
-L_g = 2.0
-R_g = 1.0
-[[events]]
-t = 0.7
-type = "grid-breaker"
-closed = false
-"""
+RESULTS = text_of("results.json")
+CAMPAIGN = text_of("campaign_of_every_draw.toml")
+PROFILE = text_of("profile.csv")
+EVENTS = text_of("every_event.toml")
 
 
 LINK = """

@@ -14,33 +14,12 @@ from gfm_hil.cli import main
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware import Entry, a2l_text, elf_entries
 
+from ..support.files import text_of
 from ..support.firmware import cc, exported
 
 A2LTOOL = shutil.which("a2ltool", path=str(Path(sys.executable).parent)) or "a2ltool"
-RECORDS = """
-#include "gfm_vsg_2.h"
-static gfm_t law;
-static gfm_law_t gains;
-static gfm_real y[GFM_NY], u[GFM_NU], ref[GFM_NREF], other[GFM_NU];
-int main(void)
-{
-    static struct { int n; gfm_t laws[2]; } pair;
-    gains = gfm_vsg_2_law;
-    gfm_init(&law);
-    gfm_init(&pair.laws[pair.n]);
-    return gfm_step(&gains, &law, ref, y, u) + gfm_step(&gains, &pair.laws[1], ref, y, other);
-}
-"""
-UNROLLED = """
-#include "gfm_vsg_2_cascaded.h"
-static gfm_vsg_2_cascaded_t law;
-static gfm_vsg_2_cascaded_real y[GFM_VSG_2_CASCADED_NY], u[GFM_VSG_2_CASCADED_NU], ref[5];
-int main(void)
-{
-    gfm_vsg_2_cascaded_init(&law);
-    return gfm_vsg_2_cascaded_step(&law, ref, y, u);
-}
-"""
+RECORDS = text_of("records.c")
+UNROLLED = text_of("unrolled.c")
 ARM = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "--specs=nosys.specs")
 SETTINGS = pytest.mark.parametrize(
     ("compiler", "flags"),

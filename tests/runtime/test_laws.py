@@ -19,33 +19,11 @@ from gfm_runtime.elements import IF, PD, Element, P, union
 from gfm_runtime.lawfile import ElementSpec
 from gfm_runtime.signals import NU, NY
 
+from ..support.files import text_of
 from ..support.laws import LAWS, REF, Running
 
 # Table II: name, then the fifteen cells phi_11 to phi_35; {} acts on the feedback only.
-TABLE_II = """
-droop-1     PI 0 0 0 0 | 0 P 0 0 0             | 0 0 0 P 0
-droop-2     PI 0 0 0 0 | 0 0 0 P 0             | 0 I 0 0 I
-droop-3     PI 0 0 0 0 | 0 IF 0 0 0            | 0 0 0 0 0
-droop-4     PI 0 0 0 0 | 0 PD 0 0 0            | 0 0 0 P 0
-droop-5     PI 0 0 0 0 | 0 P{IF*D} 0 0 0       | 0 0 0 P 0
-psc-1       PI 0 0 0 0 | 0 P 0 0 0             | 0 0 0 P 0
-psc-2       PI 0 0 0 0 | 0 IF*PD 0 0 0         | 0 0 0 I 0
-psc-3       PI 0 0 0 0 | 0 IF*PD 0 0 0         | 0 0 0 I 0
-vsg-1       PI 0 0 0 0 | 0 IF 0 0 0            | 0 0 0 0 IF
-vsg-2       PI 0 0 0 0 | 0 IF 0 0 0            | 0 0 0 PI PI
-vsg-3       PI 0 0 0 0 | 0 IF 0 0 0            | 0 0 P P 0
-vsg-4       PI 0 0 0 0 | 0 IF IF 0 0           | 0 0 0 P 0
-vsg-5       PI 0 0 0 0 | 0 IF IF 0 0           | 0 0 0 PI PI
-vsg-6       PI 0 0 0 0 | 0 IF 0 0 IF           | 0 0 0 I I
-vsg-7       PI 0 0 0 0 | 0 O*PD 0 0 0          | 0 0 0 I I
-vsg-8       PI 0 0 0 0 | 0 IF*PD 0 0 0         | 0 0 0 PI PI
-vsg-9       PI 0 0 0 0 | IF*PD IF*PD 0 0 0     | 0 0 0 P 0
-vsg-10      PI 0 0 0 0 | 0 IF{IF*IF*D} 0 0 0   | 0 0 0 PI PI
-vsg-11      PI 0 0 0 0 | 0 O*PD{O*IF*PD*D} 0 0 0 | 0 0 0 I I
-vsg-12      PI 0 0 0 0 | 0 O*PD{O*IF*PD*D} 0 0 0 | 0 0 0 PI PI
-matching-1  P 0 0 0 0  | P 0 0 0 0             | 0 0 0 0 PI
-matching-2  0 0 0 0 0  | P 0 0 0 0             | P 0 0 0 0
-"""
+TABLE_II = text_of("table_ii.txt")
 ROWS = {line.split()[0]: line for line in TABLE_II.strip().splitlines()}
 DEPLOYABLE, RIG = "mimo-gfm-deployable", "mimo-gfm-deployable-rig"
 PRACTICAL, THROUGH = "mimo-gfm-practical", "mimo-gfm-ride-through"

@@ -25,6 +25,8 @@ from gfm_runtime import (
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
+from .files import text_of
+
 repeatable = settings(derandomize=True)  # the same examples in every run
 
 Vector = NDArray[np.float64]
@@ -32,49 +34,7 @@ Vector = NDArray[np.float64]
 REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 
 #: all that a law file can say
-EVERYTHING = """
-name = "custom-1"
-title = "all that a law file can say"
-source = "this test"
-
-[error_map]
-type = "hybrid-angle"
-R = 0.001
-X = "2 * X_half"
-
-[u_0]
-i_u = "P_ref"
-omega_u = 1.0
-E_u = 1
-
-[phi]
-11 = { type = "PI", k = "k_p", k_i = 400 }
-12 = { type = "PI", k = 2.0, T = 0.5 }
-21 = { type = "PD", k = 0.1, T = 0.02, T_f = 0.001 }
-22 = [{ type = "O", k = "D_p", T = 0.03, xi = 0.7 }, { type = "PD", k = 1.0, T = "1 / 50" }]
-23 = { type = "IF", k = 1.0, T = 0.2 }
-34 = { type = "I", T = 2.0 }
-35 = { type = "I", k_i = "-k_p / 10" }
-
-[psi]
-22 = [{ type = "D", T = 0.1 }, { type = "IF", k = 1.0, T = 0.1 }]
-
-[limits]
-i_u = [-2.0, 2]
-omega_u = [0.95, 1.05]
-E_u = [0.1, 1.2]
-T_t = 0.03
-T_off = 0.4
-
-[home_grid]
-L_g = 5.0
-note = "weak"
-
-[parameters]
-k_p = { value = 90.0, unit = "p.u.", source = "chosen" }
-D_p = { value = 0.01, unit = "p.u.", source = "Table III" }
-X_half = { value = 0.05, unit = "p.u.", source = "chosen" }
-"""
+EVERYTHING = text_of("everything.toml")
 
 #: Every shipped law, each stage of a scheduled law separately.
 LAWS = {

@@ -6,30 +6,12 @@ from pathlib import Path
 
 import gfm_hil.ports.modbus
 
+from .files import text_of
 from .processes import GFMHIL
 
 # On a busy machine the controller may stand still for a second in the middle of a step of P_ref:
 # the large C_dc and the trips out of service keep the run going through that.
-SCENARIO = """
-title = "served"
-duration = 600.0
-mode = "realtime"
-T_s = 5e-4
-law = "vsg-2-tuned"
-ready_laws = ["vsg-5-tuned", "droop-3-tuned"]
-after_trip = "wait"
-[link]
-type = "shm"
-peer_timeout_s = 30.0
-[late_policy]
-hold = 10000000
-[plant.factors]
-C_dc = 200.0
-[plant.protection]
-over_current = { enabled = false }
-over_frequency = { enabled = false }
-under_frequency = { enabled = false }
-"""
+SCENARIO = text_of("served.toml")
 MODELS = str(Path(gfm_hil.ports.modbus.__file__).parent / "models")
 SUNS = 40000
 

@@ -21,6 +21,7 @@ from gfm_hil.recording.run import Run
 from gfm_plant import Bases
 from gfm_runtime.signals import carried
 
+from ...support.files import text_of
 from ...support.firmware import STRICT, cc
 from ...support.processes import write
 
@@ -237,26 +238,7 @@ def test_what_is_no_such_library_is_refused(tmp_path, monkeypatch):
 
 TASKS = Path(__file__).parents[3] / "examples" / "task_firmware"
 #: keeps what each call gets; its bridge gives the voltage that it measures
-RECORDER = """
-#include "firmware.h"
-double seen[80000][11];
-int calls, pwm_on = 1;
-void app_task_init(double H, double D, double kDroop)
-{
-    calls = H > 0 && D > 0 && kDroop > 0 ? 0 : -1;
-}
-void app_task_5kHz(double e[3], bool *pwm, const double v[3], const double i[3], double v_dc,
-                   double P, double Q, bool enable, double high, double low)
-{
-    const double all[11] = {v[0], v[1], v[2], i[0], i[1], i[2], v_dc, P, Q, enable, high - low};
-    for (int k = 0; k < 11; k++)
-        seen[calls][k] = all[k];
-    for (int k = 0; k < 3; k++)
-        e[k] = v[k];
-    calls++;
-    *pwm = enable && pwm_on;
-}
-"""
+RECORDER = text_of("recorder.c")
 MEGAWATT = Bases(S_n=1e6, V_n=480.0, V_dcref=900.0, omega_n=2 * math.pi * 60)
 
 

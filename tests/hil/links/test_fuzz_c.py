@@ -24,6 +24,7 @@ from gfm_runtime.firmware.check import HARNESS
 from gfm_runtime.firmware.folder import selftest
 from gfm_runtime.firmware.loop import _states
 
+from ...support.files import text_of
 from ...support.firmware import STAGED, T_S, cc, exported
 from ...support.laws import LAWS
 from ...support.links import Unstuffer
@@ -42,33 +43,7 @@ RUNS = int(os.environ.get("GFMHIL_FUZZ_RUNS", "40000"))
 HELLO = {"kind": "hello", "role": "plant", "boot": "x", "version": 2, "table": "abcdef01",
          "T_s": 1e-4, "laws": "0123456789abcdef", "digest": "fedcba9876543210",
          "run": 17}  # fmt: skip
-SHARED = """
-#include "gfmhil_frames.h"
-static gfmhil_line line;
-size_t take(uint8_t byte, uint8_t *to)
-{
-    const size_t size = gfmhil_take(&line, byte);
-    memcpy(to, line.bytes, size);
-    return size;
-}
-size_t stuff(const void *m, size_t size, uint8_t *to) { return gfmhil_stuff(m, size, to); }
-uint32_t crc(const void *data, size_t size) { return gfmhil_crc32(data, size); }
-int is_y(const void *m, size_t size, uint32_t next) { return gfmhil_is_y(m, size, next); }
-int is_greeting(const char *text, const char *kind) { return gfmhil_is_greeting(text, kind); }
-size_t answer(const char *hello, const char *name, char *to)
-{
-    return gfmhil_answer(hello, "here", name, to);
-}
-void seal(uint64_t tick, uint8_t state, const double *u, void *to)
-{
-    gfmhil_u_frame f = gfmhil_first_u();
-    f.head.tick = tick;
-    f.head.state = state;
-    memcpy(f.u, u, sizeof f.u);
-    gfmhil_seal(&f);
-    memcpy(to, &f, sizeof f);
-}
-"""
+SHARED = text_of("frames_in_c.c")
 
 
 @pytest.fixture(scope="module")

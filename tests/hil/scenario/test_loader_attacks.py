@@ -12,38 +12,13 @@ from gfm_hil.cli import main
 from gfm_hil.scenario import load_scenario, toml_text
 from gfm_runtime.toml_file import MAX_BYTES
 
+from ...support.files import text_of
+
 ROOT = Path(__file__).resolve().parents[3]
 LAWS = ROOT / "runtime" / "gfm_runtime" / "laws"
 CONVERTER = ROOT / "plant_emulator" / "gfm_plant" / "converters" / "paper.toml"
 BASE = 'title = "x"\nduration = 0.05\nlink = { type = "inproc" }\n'
-CAMPAIGN = """\
-title = "x"
-scenario = "pref_step"
-laws = ["mimo-gfm"]
-runs = 2
-[figure]
-x = "plant.factors.L_g"
-[set]
-duration = 1.5
-[[draw]]
-path = "plant.factors.L_g"
-type = "uniform"
-low = 0.9
-high = 1.1
-label = "L"
-also = ["plant.factors.R_g"]
-[[draw]]
-path = "plant.delay.samples"
-type = "choice"
-values = [0, 1]
-[[draw]]
-path = "plant.factors.C_f"
-type = "normal"
-mean = 1.0
-sigma = 0.1
-low = 0.9
-high = 1.1
-"""
+CAMPAIGN = text_of("campaign_of_two_runs.toml")
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,8 @@ import pytest
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import check_scenario, load_scenario, scenario_toml, shipped_scenarios
 
+from ...support.files import text_of
+
 LAW = """
 name = "broken"
 title = "a law with a mistake"
@@ -18,19 +20,7 @@ source = "tests"
 [phi]
 22 = { type = "PD", k = 0.01, T = 0.1 }
 """
-CONVERTER = """
-source = "tests"
-S_n = 1000.0
-V_n = 400.0
-omega_n = 314.0
-V_dcref = 700.0
-L_f = -1e-3
-R_f = 0.1
-C_f = 1e-5
-L_g = 1e-3
-R_g = 0.1
-C_dc = "big"
-"""
+CONVERTER = text_of("broken_converter.toml")
 
 
 def event(**content: Any) -> dict[str, Any]:

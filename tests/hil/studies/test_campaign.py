@@ -29,43 +29,9 @@ from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.campaign.worker import Record, run_chunk
 from gfm_hil.studies.workers import WorkerLost, processes, run_tasks
 
-TEXT = """\
-title = "a small one"
-scenario = "rig_pref_step"
-laws = ["mimo-gfm", "vsg-2"]
-runs = 10
-seed = 3
+from ...support.files import text_of
 
-[set]
-duration = 0.3
-"events.0.t" = 0.1
-
-[[draw]]
-path = "plant.factors.L_g"
-type = "loguniform"
-low = 0.5
-high = 10.0
-
-[[draw]]
-path = "plant.factors.R_f"
-type = "uniform"
-low = 0.0
-high = 1.0
-
-[[draw]]
-path = "plant.sensors.noise_std.p"
-also = ["plant.sensors.noise_std.q"]
-type = "normal"
-mean = 1e-3
-sigma = 1e-3
-low = 0.0
-high = 5e-3
-
-[[draw]]
-path = "plant.delay.samples"
-type = "choice"
-values = [1, 2]
-"""
+TEXT = text_of("campaign.toml")
 
 
 @pytest.fixture

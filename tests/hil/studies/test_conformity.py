@@ -54,6 +54,7 @@ from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 from gfm_plant.options import Grid
 
+from ...support.files import text_of
 from ...support.firmware import cc
 
 Vector = NDArray[np.float64]
@@ -634,32 +635,7 @@ def test_twins_share_what_the_last_machine_gave_by_their_equal_droop():
         assert (settled.low + settled.high) / 2 == pytest.approx(before + x, abs=0.05)
 
 
-LAB = """
-title = "a small jump"
-f_n = 50.0
-
-[source]
-document = "Our lab"
-clause = "jump"
-revision = "1"
-known = "ours"
-
-[scenario]
-duration = 1.5
-references = { P_ref = 0.5 }
-plant = { grid = { scr = 5.0, x_over_r = 6.0 } }
-events = [{ t = 0.5, type = "grid-phase-jump", degrees = -5.0 }]
-
-[[criteria]]
-kind = "no_trip"
-clause = "lasts"
-
-[[criteria]]
-kind = "peak_delta"
-clause = "opposes"
-least = 0.05
-direction = "up"
-"""
+LAB = text_of("jump.toml")
 STRICT = LAB.replace("least = 0.05", "least = 5.0")
 NONE = """
 [[parts]]
@@ -929,21 +905,7 @@ def test_a_plot_is_judged_in_its_bands(band, verdict, at):
         assert found.value == pytest.approx(x[hz == at][0]) and f"At {at:.3g} Hz" in found.text
 
 
-NFP = """
-title = "plot"
-f_n = 50.0
-source = { document = "here", clause = "closed form", revision = "1", known = "ours" }
-[scenario]
-duration = 1.0
-references = { P_ref = 0.0 }
-plant = { grid = { scr = 5.0, x_over_r = 10.0 } }
-[[criteria]]
-kind = "nfp"
-clause = "plot"
-from_hz = 2.0
-to_hz = 10.0
-points = 3
-"""
+NFP = text_of("plot.toml")
 
 
 def test_the_plot_of_a_droop_is_that_of_the_closed_form(tmp_path):

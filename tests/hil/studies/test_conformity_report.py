@@ -25,31 +25,13 @@ from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.verdict import FAIL, PASS, Verdict
 from gfm_runtime.lawfile import shipped_law
 
+from ...support.files import text_of
 from ...support.processes import wait_for
 from ...support.scope import HAS_BROWSER, Browser
 
-LAB = """
-title = "a small jump"
-f_n = 50.0
-
-[source]
-document = "Our lab"
-clause = "jump"
-revision = "1"
-known = "ours"
-
-[scenario]
-duration = 1.5
-references = { P_ref = 0.5 }
-plant = { grid = { scr = 5.0, x_over_r = 6.0 } }
-events = [{ t = 0.5, type = "grid-phase-jump", degrees = -5.0 }]
-
-[[criteria]]
-kind = "peak_delta"
-clause = "opposes <b>"
-least = 0.05
-direction = "up"
-"""
+#: with one clause, whose words HTML would take for a tag
+_TRIP = '[[criteria]]\nkind = "no_trip"\nclause = "lasts"\n\n'
+LAB = text_of("jump.toml").replace(_TRIP, "").replace("opposes", "opposes <b>")
 
 
 @pytest.fixture(scope="module")
