@@ -19,17 +19,13 @@ MOST_MEMORY = 400e6  # most additional bytes that reading any input may take
 
 @dataclass(frozen=True)
 class Parser:
-    """A parser of foreign input.
+    """A parser of foreign input."""
 
-    Attributes:
-        name: its folder in the corpus.
-        open: opens it in an empty folder; yields a function that reads one input and catches the
-            documented exceptions.
-        inputs: strategy of inputs, made once the parser is open.
-    """
-
-    name: str
+    name: str  # its folder in the corpus
+    # opens it in an empty folder; yields a function that reads one input and catches the documented
+    # exceptions
     open: Callable[[Path], AbstractContextManager[Take]]
+    # strategy of inputs, made once the parser is open
     inputs: Callable[[], st.SearchStrategy[bytes]]
 
 

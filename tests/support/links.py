@@ -133,22 +133,18 @@ class Unstuffer:
 
 @dataclass
 class Pair:
-    """The results of a run in two threads.
+    """The results of a run in two threads."""
 
-    Attributes:
-        signals, timing: as in signals.npz and timing.npz.
-        faults: each side's counters of frames.
-        injected: counters of each side's impairment stage.
-        counters: each side's, of a link that carries a message in several frames.
-        log: lines of both event logs.
-    """
-
+    # signals, timing: as in signals.npz and timing.npz
     signals: dict[str, np.ndarray] = field(default_factory=dict)
     timing: dict[str, np.ndarray] = field(default_factory=dict)
+    # each side's counters of frames
     faults: dict[Role, dict[str, int]] = field(default_factory=dict)
+    # counters of each side's impairment stage
     injected: dict[Role, dict[str, int]] = field(default_factory=dict)
+    # each side's, of a link that carries a message in several frames
     counters: dict[Role, dict[str, int]] = field(default_factory=dict)
-    log: list[dict[str, Any]] = field(default_factory=list)
+    log: list[dict[str, Any]] = field(default_factory=list)  # lines of both event logs
 
     def ends(self) -> dict[str, tuple[str, str, int]]:
         """How each side ended: status, reason, tick."""

@@ -34,28 +34,18 @@ _LOOK = {
 
 @dataclass(frozen=True)
 class Sample:
-    """One process at one moment.
+    """One process at one moment."""
 
-    Attributes:
-        t: since the start, s.
-        own: private memory of the process (RssAnon), bytes.
-        pss: private memory and its share of shared memory, mainly the recording, bytes.
-        descriptors, threads: their numbers.
-    """
-
-    t: float
-    own: int
-    pss: int
+    t: float  # since the start, s
+    own: int  # private memory of the process (RssAnon), bytes
+    pss: int  # private memory and its share of shared memory, mainly the recording, bytes
+    # descriptors, threads: their numbers
     descriptors: int
     threads: int
 
 
 def take_sample(pid: int, t: float) -> Sample:
-    """Read a process's figures from /proc.
-
-    Raises:
-        OSError: the process is gone.
-    """
+    """Read a process's figures from /proc. Raises OSError: the process is gone."""
     process = Path(f"/proc/{pid}")
     status = dict(
         line.split(":", 1) for line in (process / "status").read_text().splitlines() if ":" in line

@@ -110,19 +110,14 @@ def test_files_beside_a_scenario_are_found_from_anywhere(tmp_path, monkeypatch):
 
 
 class Dynawo(NamedTuple):
-    """Dynawo's points, its equations, and our bench at the same instants.
+    """Dynawo's points, its equations, and our bench at the same instants."""
 
-    Attributes:
-        t: s.
-        omega, i: published, of droop, dVOC and matching control, p.u., shape (3, points).
-        equations: of the script beside the points.
-        bench: frequencies and currents of the bench, shape (3, points) each.
-    """
-
-    t: np.ndarray
+    t: np.ndarray  # s
+    # omega, i: published, of droop, dVOC and matching control, p.u., shape (3, points)
     omega: np.ndarray
     i: np.ndarray
-    equations: dict[str, Any]
+    equations: dict[str, Any]  # of the script beside the points
+    # frequencies and currents of the bench, shape (3, points) each
     bench: tuple[np.ndarray, np.ndarray]
 
     def solved(self, of: str) -> tuple[np.ndarray, np.ndarray]:
