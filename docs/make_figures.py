@@ -14,6 +14,7 @@ from pathlib import Path
 from _ext.outputs import command
 from _figures import eigenvalues, steps
 from _figures.common import FIGURES, TABLES
+from _figures.dead_time import dead_time
 from _figures.identification import envelope, identification
 from _figures.inner_stage import inner_stage
 from _figures.limit_cycle import limit_cycles
@@ -51,6 +52,7 @@ def main() -> None:
     eigenvalues.couplings_table()
     eigenvalues.q_droop_table()
     limit_cycles()
+    dead_time()
     inner_stage()
     identification()
     envelope()

@@ -25,6 +25,7 @@ from gfm_design.margins.all_margins import (
 from gfm_design.margins.locus import DiskMargin
 from gfm_design.margins.tolerance import POINTS, End, GridStrength, Range, Region, stable_region
 from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.dead_time import with_dead_time
 from gfm_hil.cli.common import EXIT_OTHERWISE, watching
 from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
 from gfm_hil.core.errors import UserError
@@ -44,6 +45,11 @@ def add(kinds: Any) -> None:
     where = add_loop_options(command)
     where.add_argument("--run", type=Path, metavar="DIR", help="run folder: its scenario and delay")
     command.add_argument(
+        "--dead-time", type=float, metavar="S",
+        help="with the dead time of a two-level bridge, by its describing function, s; without"
+        " ranges of elements and grids",
+    )  # fmt: skip
+    command.add_argument(
         "--figures", type=Path, metavar="DIR", help="draw region.png and delay.png into DIR"
     )
     command.set_defaults(call=call)
@@ -57,10 +63,19 @@ def call(options: argparse.Namespace) -> int:
     scenario = chosen_scenario(given, options)
     if options.figures and scenario.network is not None:
         raise UserError("--figures: they are those of one converter on its line to the grid")
+    if options.figures and options.dead_time is not None:
+        raise UserError("--figures: are drawn without a dead time")
     loop, label = scenario_loop(scenario, options.converter)
+    if options.dead_time is not None:
+        try:
+            loop = with_dead_time(loop, options.dead_time)
+        except ValueError as problem:
+            raise UserError(f"--dead-time: {problem}") from None
+        label = f"{label}, {1e6 * options.dead_time:g} µs of dead time"
     console = terminal(highlight=False)
     try:
-        ranges = margins(loop) if scenario.network is None else None
+        whole = scenario.network is None and options.dead_time is None
+        ranges = margins(loop) if whole else None
         found = loop_margins(loop) if ranges is None else ranges.loop
     except UnstableLoop as problem:
         none = "--figures: there is none to draw" if options.figures else ""
