@@ -9,10 +9,12 @@ from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import Weight
 from gfm_hil.api.design import Gamma, NotTuned, Tuning, gamma, latency_tolerance, margins, tune
 from gfm_hil.api.latency import Measured, measured_misses
+from gfm_hil.api.sweeps import GainSweep, StabilityMap, stability_map, sweep
 from gfm_hil.studies.linear_loop import network_loop
 
 __all__ = [
     "ClosedLoop",
+    "GainSweep",
     "Gamma",
     "LatencyTolerance",
     "Margins",
@@ -20,6 +22,7 @@ __all__ = [
     "Misses",
     "NetworkLoop",
     "NotTuned",
+    "StabilityMap",
     "Tuning",
     "Unstable",
     "UnstableLoop",
@@ -30,5 +33,7 @@ __all__ = [
     "margins",
     "measured_misses",
     "network_loop",
+    "stability_map",
+    "sweep",
     "tune",
 ]

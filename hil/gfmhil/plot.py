@@ -1,6 +1,15 @@
 """Figures of linear loops and of frequency scans, with matplotlib."""
 
-from gfm_hil.api.plot import bode, impedance, nyquist, participations, pole_map, step
+from gfm_hil.api.plot import (
+    bode,
+    impedance,
+    nyquist,
+    participations,
+    pole_map,
+    root_locus,
+    stability_map,
+    step,
+)
 from gfm_hil.studies.scan_figures import admittance, nfp, nyquist_on_grid, passivity
 
 __all__ = [
@@ -13,5 +22,7 @@ __all__ = [
     "participations",
     "passivity",
     "pole_map",
+    "root_locus",
+    "stability_map",
     "step",
 ]

@@ -35,7 +35,7 @@ from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
 from gfm_hil.scenario.schema import LatePolicy
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
-from gfm_plant import NoEquilibrium, Plant
+from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_runtime import law_file
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile, shipped_law
@@ -227,7 +227,7 @@ def tune(
         raise UserError("scr: are those of a scenario's grid; say which scenario")
     loops = [
         partial(loop_under, scenario=one, converter=converter)
-        for one in ([] if scenario is None else _at(scenario, scr))
+        for one in ([] if scenario is None else at_short_circuit_ratios(scenario, scr))
     ]
     paper = PAPER_START.get(law.name, {}) if scenario is None else {}
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
@@ -277,14 +277,16 @@ def _in_the_way(none: NotStabilised, problem: PaperProblem, converter: str | Non
     return f"{none}{wanted}; in the way, {where}: {mode}"
 
 
-def _at(scenario: Scenario, scr: Sequence[float]) -> list[Scenario]:
-    """A scenario at several short-circuit ratios; as it is without them. Raises UserError: one
-    cannot be."""
+def at_short_circuit_ratios(scenario: Scenario, scr: Sequence[float]) -> list[Scenario]:
+    """A scenario at several short-circuit ratios; as it is without them. Without an X/R of its own
+    its grid keeps that of its line. Raises UserError: one cannot be."""
     if not scr:
         return [scenario]
     content = scenario.model_dump(mode="json", exclude_unset=True)
     plant = content.get("plant", {})
-    grids = [{**plant.get("grid", {}), "scr": ratio} for ratio in scr]
+    line = make_plant(scenario.plant, scenario.T_s).par[0]
+    own = {"x_over_r": float(line["L_g"] / line["R_g"])} if line["R_g"] > 0.0 else {}
+    grids = [{**own, **plant.get("grid", {}), "scr": ratio} for ratio in scr]
     return [check_scenario({**content, "plant": {**plant, "grid": g}}, "scr") for g in grids]
 
 

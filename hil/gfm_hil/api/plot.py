@@ -18,10 +18,13 @@ from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.figures import COLOURS, GREY, complex_plane, draw_panel, dress, pyplot_panels
 from gfm_hil.studies.linear_loop import title_of
+from gfm_hil.studies.margin_figures import NO_POINT, draw_sigma
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from gfm_hil.api.sweeps import GainSweep, StabilityMap
 
 Vector = NDArray[np.float64]
 
@@ -124,6 +127,45 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     dress(axes, title)
     if isinstance(loop, NetworkLoop):
         axes.legend(fontsize=8, frameon=False, loc="best")
+    return axes
+
+
+def root_locus(sweep: GainSweep) -> Axes:
+    """Draw the poles of ``gfmhil.design.sweep``: sigma [1/s] and frequency [Hz], over symmetric
+    logarithms, in the colour of the parameter's value; those of the law's own value as crosses."""
+    (axes,) = pyplot_panels(1, (6.6, 4.6))
+    values = np.repeat(sweep.values, [len(p) for p in sweep.poles])
+    poles = np.concatenate(sweep.poles)
+    scale = "log" if values.min() > 0.0 else "linear"
+    cloud = axes.scatter(poles.real, poles.imag / (2 * np.pi), 9, values, norm=scale)
+    figure = axes.get_figure()
+    assert figure is not None
+    figure.colorbar(cloud, ax=axes, label=sweep.gain)
+    if sweep.values[0] <= sweep.own <= sweep.values[-1]:
+        near = sweep.poles[int(np.argmin(np.abs(sweep.values - sweep.own)))]
+        axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=f"near {sweep.own:g}")
+        axes.legend(fontsize=8, loc="upper left")
+    axes.axvline(0.0, color="k", lw=0.8)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
+    dress(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
+    return axes
+
+
+def stability_map(stability: StabilityMap) -> Axes:
+    """Draw ``gfmhil.design.stability_map``: sigma [1/s] over the parameter and the short-circuit
+    ratio, its zero as a line, the law's own value dashed."""
+    (axes,) = pyplot_panels(1, (6.6, 4.6))
+    draw_sigma(axes, stability.values, stability.scr, stability.sigma)
+    axes.axvline(stability.own, color="k", lw=0.9, ls=(0, (4, 3)))
+    axes.set_xlim(stability.values[0], stability.values[-1])
+    axes.set_xscale("log" if stability.values[0] > 0.0 else "linear")
+    axes.set_yscale("log")
+    axes.set(xlabel=stability.gain, ylabel="short-circuit ratio")
+    axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
+    if np.isnan(stability.sigma).any():
+        axes.legend(handles=[NO_POINT], fontsize=8, loc="upper left")
     return axes
 
 

@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
@@ -12,21 +14,35 @@ from gfm_hil.results.figures import COLOURS, GREY, dress
 
 _SPAN = 100.0  # 1/s; colours of sigma end there
 _DELAYS = 300
+_NOWHERE = "#dddddd"
+NO_POINT = Line2D([], [], color=_NOWHERE, marker="s", ls="", label="no operating point")
+
+
+def draw_sigma(
+    axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> None:
+    """The largest real part of the poles [1/s], shape (len(y), len(x)), in colour, and its zero as
+    a line; grey where there is no operating point."""
+    axes.set_facecolor(_NOWHERE)
+    # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
+    shown = np.arcsinh(sigma) / np.arcsinh(_SPAN)
+    mesh = axes.pcolormesh(x, y, shown, cmap="RdBu_r", vmin=-1, vmax=1, shading="nearest")
+    finite = np.nan_to_num(shown, nan=1.0)
+    if finite.min() < 0.0 < finite.max():
+        axes.contour(x, y, finite, levels=[0.0], colors="k", linewidths=1.2)
+    ticks = np.array([-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0])
+    figure = axes.get_figure()
+    assert figure is not None
+    bar = figure.colorbar(mesh, ax=axes, ticks=list(np.arcsinh(ticks) / np.arcsinh(_SPAN)))
+    bar.ax.set_yticklabels([f"{t:g}" for t in ticks])
+    bar.set_label("largest σ [1/s]")
 
 
 def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:
     """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
     figure = Figure(figsize=(6.6, 5.2), layout="constrained")
     axes = figure.subplots()
-    axes.set_facecolor("#dddddd")
-    # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
-    shown = np.arcsinh(region.sigma) / np.arcsinh(_SPAN)
-    mesh = axes.pcolormesh(
-        region.L_g, region.R_g, shown, cmap="RdBu_r", vmin=-1, vmax=1, shading="nearest"
-    )
-    finite = np.nan_to_num(shown, nan=1.0)
-    if finite.min() < 0.0 < finite.max():
-        axes.contour(region.L_g, region.R_g, finite, levels=[0.0], colors="k", linewidths=1.2)
+    draw_sigma(axes, region.L_g, region.R_g, region.sigma)
     axes.plot(1.0, 1.0, "o", color="k", ms=6, mfc="none")
     axes.plot(factor(loop, "L_g"), max(factor(loop, "R_g"), region.R_g[0]), "k*", ms=9)
     axes.set_xscale("log")
@@ -34,16 +50,11 @@ def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> Non
     axes.set_xlabel("L_g over its printed value")
     axes.set_ylabel("R_g over its printed value")
     axes.set_title(f"{label}: stable where σ < 0", loc="left", fontsize=10)
-    ticks = np.array([-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0])
-    bar = figure.colorbar(mesh, ax=axes, ticks=list(np.arcsinh(ticks) / np.arcsinh(_SPAN)))
-    bar.ax.set_yticklabels([f"{t:g}" for t in ticks])
-    bar.set_label("largest σ [1/s]")
     marks = [
         Line2D([], [], color="k", marker="o", mfc="none", ls="", label="printed"),
         Line2D([], [], color="k", marker="*", ms=9, ls="", label="scenario"),
     ]
-    if np.isnan(region.sigma).any():
-        marks.append(Line2D([], [], color="#dddddd", marker="s", ls="", label="no operating point"))
+    marks += [NO_POINT] * bool(np.isnan(region.sigma).any())
     axes.legend(handles=marks, fontsize=8, loc="upper left")
     figure.savefig(path, dpi=110)
 

@@ -67,7 +67,7 @@ def call(options: argparse.Namespace) -> int:
     else:
         loop, label = scenario_loop(scenario, options.converter)
     if options.out:
-        _save(options.out, lambda: options.draw(loop, options))
+        save_figure(options.out, lambda: options.draw(loop, options))
     console = terminal(highlight=False)
     try:
         content, table = options.find(loop, options)
@@ -94,7 +94,8 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _save(path: Path, draw: Callable[[], object]) -> None:
+def save_figure(path: Path, draw: Callable[[], object]) -> None:
+    """Save what ``draw`` draws in a figure of pyplot. Raises UserError: it cannot be saved."""
     import matplotlib
     from matplotlib import pyplot
 

@@ -1,0 +1,150 @@
+"""gfmhil design sweep and map: a law's loop over one of its parameters, and over grids."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gfm_hil.api.law import Law, as_law
+from gfm_hil.api.plot import root_locus, stability_map
+from gfm_hil.api.sweeps import POINTS, GainSweep, StabilityMap, sweep
+from gfm_hil.api.sweeps import stability_map as map_stability
+from gfm_hil.cli.common import watching
+from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
+from gfm_hil.cli.design.loop import save_figure
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.report import finite
+from gfm_hil.results.table import Table
+from gfm_hil.scenario import Scenario
+
+_ROWS = 9  # of the table
+
+
+def add(kinds: Any) -> None:
+    for name, text, call, points in (
+        (
+            "sweep",
+            "poles over a parameter of the law, and where the loop is stable",
+            _sweep,
+            POINTS,
+        ),
+        ("map", "where the loop is stable over a parameter and the short-circuit ratio", _map, 31),
+    ):
+        command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
+        command.add_argument(
+            "gain", metavar="PARAMETER", help="of the law, as laws show lists them"
+        )
+        command.add_argument(
+            "--range", metavar="LOW:HIGH", type=_range, default=(None, None),
+            help="of the parameter; default: the law file's bounds, or a decade to both sides",
+        )  # fmt: skip
+        if call is _map:
+            command.add_argument(
+                "--scr", metavar="LOW:HIGH", type=_range, default=(1.0, 20.0),
+                help="short-circuit ratios (default: 1:20)",
+            )  # fmt: skip
+        command.add_argument("--points", type=int, default=points, help="values (%(default)s)")
+        add_loop_options(command)
+        command.add_argument(
+            "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
+        )
+        command.set_defaults(call=call)
+
+
+def _range(text: str) -> tuple[float, float]:
+    low, _, high = text.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be LOW:HIGH, e.g. 1:20") from None
+
+
+def _chosen(options: argparse.Namespace) -> tuple[Scenario, Law]:
+    scenario = chosen_scenario(options.scenario, options)
+    if scenario.network is not None and options.converter is None:
+        raise UserError(f"--converter: must name one of {scenario.converters}")
+    return scenario, as_law((scenario.of(options.converter) if options.converter else scenario).law)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    scenario, law = _chosen(options)
+    with watching("sweep") as watch:
+        found = sweep(
+            law, options.gain, *options.range, points=options.points, on=scenario,
+            converter=options.converter, watch=watch,
+        )  # fmt: skip
+    if options.out:
+        save_figure(options.out, lambda: root_locus(found))
+    if options.json:
+        print(json.dumps(_sweep_as_json(found, scenario), indent=2))
+        return 0
+    ranges = " and ".join(f"{low:.6g} to {high:.6g}" for low, high in found.stable())
+    console = terminal(highlight=False)
+    console.print(f"[bold]{found.law}[/] · {scenario.title}")
+    console.print(_sweep_table(found))
+    console.print(
+        f"stable for {found.gain} of {ranges or 'no value here'}; the law has {found.own:g}",
+        soft_wrap=True,
+    )
+    if options.out:
+        console.print(f"figure: {options.out}", soft_wrap=True)
+    return 0
+
+
+def _sweep_table(found: GainSweep) -> Table:
+    some = np.unique(np.linspace(0, len(found.values) - 1, _ROWS).round().astype(int))
+    modes = found.slowest()
+    rows = []
+    for k in some:
+        mode = modes[k]
+        cells = ["no operating point", "", ""] if mode is None else [
+            mode.sigma, mode.frequency_hz, mode.ratio
+        ]  # fmt: skip
+        rows.append([float(found.values[k]), *cells])
+    heads = [found.gain, "σ of the slowest mode [1/s]", "frequency [Hz]", "damping ratio"]
+    return Table(heads, rows, text=0)
+
+
+def _sweep_as_json(found: GainSweep, scenario: Scenario) -> dict[str, Any]:
+    return {
+        "law": found.law, "scenario": scenario.title, "parameter": found.gain, "own": found.own,
+        "stable": found.stable(), "values": found.values.tolist(),
+        "slowest": [mode and mode.plain() for mode in found.slowest()],
+    }  # fmt: skip
+
+
+def _map(options: argparse.Namespace) -> int:
+    scenario, law = _chosen(options)
+    with watching("map") as watch:
+        found = map_stability(
+            law, options.gain, *options.range, scr=options.scr, points=options.points, on=scenario,
+            watch=watch,
+        )  # fmt: skip
+    if options.out:
+        save_figure(options.out, lambda: stability_map(found))
+    if options.json:
+        rows = {name: getattr(found, name).tolist() for name in ("values", "scr", "sigma")}
+        about = {"law": found.law, "scenario": scenario.title, "parameter": found.gain}
+        print(json.dumps({**about, "own": found.own, **finite(rows)}, indent=2))
+        return 0
+    console = terminal(highlight=False)
+    console.print(f"[bold]{found.law}[/] · {scenario.title}")
+    console.print(_map_table(found))
+    if options.out:
+        console.print(f"figure: {options.out}", soft_wrap=True)
+    return 0
+
+
+def _map_table(found: StabilityMap) -> Table:
+    """Of some grids, between which values of the parameter the loop is stable."""
+    rows = []
+    for i in np.unique(np.linspace(0, len(found.scr) - 1, _ROWS).round().astype(int)):
+        stable = found.values[found.sigma[i] < 0.0]
+        share = f"{100 * len(stable) / len(found.values):.0f} %"
+        ends = [float(stable.min()), float(stable.max())] if len(stable) else [None, None]
+        rows.append([float(found.scr[i]), *ends, share])
+    heads = ["short-circuit ratio", f"least stable {found.gain}", "greatest", "stable values"]
+    return Table(heads, rows, text=0)

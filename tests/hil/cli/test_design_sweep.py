@@ -1,0 +1,62 @@
+"""gfmhil design sweep and map: where a loop is stable, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.cli.main import main
+from gfmhil.design import loop_margins, stability_map, sweep
+
+
+def test_the_edge_of_a_whole_row_is_its_gain_margin():
+    """k_34 and k_35, which is tied to it, are all of VSG-2's row of E_u."""
+    law = gfmhil.Law.load("vsg-2")
+    found = sweep(law, "k_34", points=15)
+    (edge,) = found.edges
+    assert found.stable() == [(found.values[0], edge)]
+    loop = law.closed_loop("pref_step")
+    (E_u,) = (c for c in loop_margins(loop).u if c.name == "E_u")
+    assert edge / found.own == pytest.approx(E_u.gain_phase.gain_high, rel=1e-4)
+    assert found.own == law.file.parameters["k_34"].value
+    for value, stable in ((edge * 0.999, True), (edge * 1.001, False)):
+        one = law.with_gains(k_34=value).closed_loop("pref_step")
+        assert (one.sigma() < 0.0) == stable
+
+
+def test_a_map_has_a_sweep_in_each_row():
+    found = stability_map("mimo-gfm", "k_34", 1.0, 50.0, scr=(2.0, 8.0), points=4)
+    on = gfmhil.load_scenario("pref_step", plant__grid={"scr": 8.0, "x_over_r": 10.0})
+    row = sweep("mimo-gfm", "k_34", 1.0, 50.0, points=4, on=on)
+    again = stability_map("mimo-gfm", "k_34", 1.0, 50.0, scr=(2.0, 8.0), points=4, on=on)
+    np.testing.assert_allclose(again.sigma[-1], row.sigma, rtol=1e-9)
+    assert found.scr == pytest.approx([2.0, 2.0 * 4 ** (1 / 3), 2.0 * 4 ** (2 / 3), 8.0])
+    assert (found.sigma[:, 0] < 0.0).all()
+    assert (found.sigma[:, -1] > 0.0).all()
+
+
+def test_both_commands_print_and_draw(capsys, tmp_path):
+    where = ["k_34", "--law", "mimo-gfm", "--range", "1:20", "--points", "5"]
+    assert main(["design", "sweep", *where, "-o", str(tmp_path / "sweep.svg")]) == 0
+    assert "stable for k_34 of 1 to 7.3" in capsys.readouterr().out
+    assert main(["design", "map", *where, "--json", "-o", str(tmp_path / "map.svg")]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert np.shape(content["sigma"]) == (5, 5)
+    assert all((tmp_path / f"{name}.svg").stat().st_size > 10_000 for name in ("sweep", "map"))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("sweep nope --law vsg-2", "nope: vsg-2 has the parameters ["),
+        ("sweep k_34 --law vsg-2 --range 5:1", "k_34: range 5 to 1 must be finite and ascending"),
+        ("sweep k_34 --law vsg-2 --points 1", "points = 1: must be 2 to 10000"),
+        ("map k_34 --law vsg-2 --scr 0:3", "scr: 0 to 3 must be above 0, finite and ascending"),
+        ("map k_34 --scenario three_share_a_load", "--converter: must name one of ['A', 'B', 'C']"),
+        ("map k_34 --scenario three_share_a_load --converter A", "the scenario has a network"),
+    ],
+)
+def test_what_is_refused(line, words, capsys):
+    assert main(["design", *line.split()]) == 2
+    assert words in capsys.readouterr().err
