@@ -194,7 +194,7 @@ def _values(law: Law, gain: str, low: float | None, high: float | None, points: 
 def _poles(
     law: Law, gain: str, scenario: Scenario, converter: str | None, value: float
 ) -> NDArray[np.complex128]:
-    changed = law.with_gains(**{gain: float(value)})
+    changed = law.with_gains(None, **{gain: float(value)})
     try:
         return changed.closed_loop(scenario, converter=converter).poles()
     except UserError:  # there is no operating point; the scenario was checked before
