@@ -120,3 +120,9 @@ def test_the_command_takes_it_into_the_margins(capsys, refused):
     assert "--dead-time: dead time = 0.0001 s: must lie in [0, 5e-05) s" in said
     said = refused(*words, "--law", "mimo-gfm", "--inner", "cascaded", "--dead-time", "1e-6")
     assert "without an inner stage only" in said
+
+
+def test_three_levels_are_refused():
+    plant = Plant.model_validate({**LOOP, "bridge": {"kind": "t-type"}})
+    with pytest.raises(ValueError, match="is t-type"):
+        with_dead_time(ClosedLoop.of("vsg-2", plant), 1e-6)

@@ -61,14 +61,16 @@ def with_dead_time(loop: ClosedLoop, seconds: float) -> ClosedLoop:
         seconds: the dead time.
 
     Raises:
-        ValueError: the loop is made of matrices, or has an inner stage; or the dead time is not
-            within half a period of the carrier.
+        ValueError: the loop is made of matrices, or has an inner stage; the bridge has three
+            levels; or the dead time is not within half a period of the carrier.
     """
     of = loop.made_of
     r, bridge = of.par[0], of.plant.bridge
     f_c = bridge.carrier_hz or 1 / of.law.T_s
     if loop.stage is not None:
         raise ValueError("dead time: is taken into a loop without an inner stage only")
+    if bridge.kind == "t-type":
+        raise ValueError("dead time: is that of a two-level bridge; plant.bridge.kind is t-type")
     if not 0 <= seconds < 0.5 / f_c:
         raise ValueError(
             f"dead time = {seconds:g} s: must lie in [0, {0.5 / f_c:g}) s, half of the carrier"

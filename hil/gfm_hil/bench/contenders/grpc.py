@@ -1,16 +1,13 @@
 """gRPC, by the package grpcio: unary calls of plain bytes over a Unix socket."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, udp
+from gfm_hil.bench.contenders import Contender, PackageEnd, udp
 from gfm_hil.bench.pingpong import Messages, PingPong, over_link
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 _SERVICE, _METHOD = "gfmhil", "exchange"
 _START_S = 10.0
@@ -24,15 +21,17 @@ def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     """The controller is the server: u answers the call that brings y. Its guide to performance
     prefers unary calls to streams in Python, which need more threads."""
-    return _server(c.endpoint, own) if role == "controller" else over_link(_Client(c.endpoint), own)
+    return (
+        _server(c.endpoint, own)
+        if role == "controller"
+        else over_link(Caller(role, c.endpoint), own)
+    )
 
 
-class _Client:
+class Caller(PackageEnd):
     """The plant's end: it calls and has the answer before it polls for one."""
 
-    port: Port | None = None
-
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, role: Role, endpoint: str) -> None:
         import grpc
 
         self._channel = grpc.insecure_channel(endpoint)
