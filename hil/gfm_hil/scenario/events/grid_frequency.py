@@ -1,5 +1,7 @@
 """The grid's frequency."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 from pydantic import Field

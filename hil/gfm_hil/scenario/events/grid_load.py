@@ -1,5 +1,7 @@
 """The load of a finite grid."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 from pydantic import Field
