@@ -21,6 +21,7 @@ from gfm_runtime import get_law, load_law
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 EXAMPLES = DOCS / "examples"
+CELL = re.compile(r"^```\{code-cell\} python\n(.*?)^```$", re.M | re.S)
 REF = np.array([1.0, 0.5, 1.0, 0.0, 1.0])
 RIG = {"delay": {"samples": 1}, "sensors": {"bandwidth_hz": 300.0}}
 
@@ -93,6 +94,14 @@ def test_no_property_of_the_api_begins_with_a_colon_sentence():
     assert len(said) > 20
     first = {name: re.sub(r"`.*?`", "", doc.partition("\n")[0]) for name, doc in said.items()}
     assert [name for name, line in first.items() if ":" in line] == []
+
+
+def test_files_that_cells_name_are_there():
+    """Cells run in the folder of the pages."""
+    cells = [c for page in DOCS.glob("*.md") for c in CELL.findall(page.read_text("utf-8"))]
+    names = [name for cell in cells for name in re.findall(r'"([^"\s]+/[^"\s]+\.toml)"', cell)]
+    assert len(names) >= 2
+    assert [name for name in names if not (DOCS / name).is_file()] == []
 
 
 def test_readme_names_pages_that_there_are():

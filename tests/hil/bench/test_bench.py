@@ -12,12 +12,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gfm_hil.bench import outside
 from gfm_hil.bench.c_code import compile_twin
 from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
-from gfm_hil.bench.jitter import WAITS, WATCHED
+from gfm_hil.bench.jitter import PERIOD_NS, WAITS, WATCHED, awaited
 from gfm_hil.bench.kernel import compare
 from gfm_hil.bench.sweep import highest
 from gfm_hil.cli import main
@@ -118,6 +119,21 @@ def test_kernel_without_a_compiler(tmp_path, capsys, monkeypatch):
     found = bench(tmp_path, capsys, "kernel", "--laws", "droop-1")
     assert all(r["numba_ns"]["median"] > 0 and r["ratio"] is None for r in found["kernel"])
     assert any("no C compiler" in remark for remark in found["remarks"])
+
+
+def test_others_are_compared_at_the_deadlines_that_both_wait_for():
+    """The loop of cyclictest, beside ours, with the same two stalls: it skips what has passed."""
+    sleeps = np.full(1000, 7_000)  # ns from a deadline to the wake-up
+    sleeps[[50, 700]] = 1_234_000, 100_001
+    dues = PERIOD_NS * np.arange(1000)
+    ours, theirs, now = np.zeros((2, 1000), np.int64), [], -1
+    for k, due in enumerate(dues):
+        if now <= due:
+            now = due + sleeps[k]
+            theirs.append(sleeps[k])
+        ours[:, k] = now - due
+    assert awaited(ours).tolist() == 2 * theirs
+    assert len(theirs) == 1000 - 12 - 1
 
 
 def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
