@@ -17,6 +17,7 @@ from gfm_hil.bench.contenders import free_port
 from gfm_hil.bench.peer import scenario_of
 from gfm_hil.cli import main
 from gfm_hil.scenario import write_scenario
+from gfm_runtime.children import guarded
 
 from .test_bench import bench, processes_with
 
@@ -29,8 +30,10 @@ OWN = Path(__file__).parents[3] / "examples" / "own_controller" / "controller.py
 
 @contextlib.contextmanager
 def other_side(*line):
-    """A program that answers."""
-    with subprocess.Popen([*line], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+    """A program that answers, and ends with this one, even if this one is killed."""
+    with subprocess.Popen(
+        guarded(line), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
         try:
             yield process
         finally:
