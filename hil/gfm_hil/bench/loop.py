@@ -8,7 +8,6 @@ machine right before and after.
 
 import itertools
 import shutil
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -86,8 +85,9 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     show("trying the links", 0.0)
     links = [link for link in options.links if _works(link, remarks)]
     if "lockstep" in options.modes:
-        with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
-            loop["laws"] = list(measure_laws(options.laws, options.rounds, Path(place), show))
+        with ExitStack() as stack:
+            place = memory_folder(stack)
+            loop["laws"] = list(measure_laws(options.laws, options.rounds, place, show))
         loop["lockstep"] = _lockstep(links, options, show, remarks)
     if "realtime" in options.modes:
         loop["realtime"] = _realtime(links, options, show, remarks)

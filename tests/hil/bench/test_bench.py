@@ -233,8 +233,11 @@ def processes_with(mark: str) -> int:
 
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
-    ("kind", "everyone"),  # with the parent: two processes, the CPU load; the product's two sides
-    [("latency", 3 + len(os.sched_getaffinity(0))), ("loop", 5 + len(os.sched_getaffinity(0)))],
+    (
+        "kind",
+        "everyone",
+    ),  # the parent, its folder's guard, the pair, the CPU load; the product's two sides
+    [("latency", 4 + len(os.sched_getaffinity(0))), ("loop", 6 + len(os.sched_getaffinity(0)))],
 )
 def test_ctrl_c_leaves_nothing_behind(kind, everyone, tmp_path):
     mark = f"GFMHIL_TEST={uuid.uuid4()}"

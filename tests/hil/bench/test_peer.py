@@ -175,18 +175,25 @@ def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
 
 
 @pytest.mark.timeout(400)
-def test_a_killed_benchmark_leaves_nothing_behind(tmp_path):
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["latency", "--links", "shm,zmq", "--peers", "none"],
+        ["loop", "--links", "shm", "--laws", "vsg-2"],
+    ],
+)
+def test_a_killed_benchmark_leaves_nothing_behind(line, tmp_path):
     """No process, no memory segment, no folder."""
     shm = Path("/dev/shm")
     mark, before = f"GFMHIL_TEST={uuid.uuid4()}", {*shm.rglob("*")}
-    line = ["bench", "latency", "--links", "shm,zmq", "--peers", "none", "--seconds", "8"]
+    line = ["bench", *line, "--seconds", "8"]
     with subprocess.Popen(
         [*GFMHIL, *line, "--out", str(tmp_path / "bench")],
         env={**os.environ, **dict([mark.split("=")])},
     ) as process:  # fmt: skip
         try:
             until = time.monotonic() + 90
-            while processes_with(mark) < 3 + len(os.sched_getaffinity(0)):
+            while processes_with(mark) < 4 + len(os.sched_getaffinity(0)):
                 assert process.poll() is None and time.monotonic() < until
                 time.sleep(0.2)
             time.sleep(5)

@@ -7,6 +7,7 @@ two processes, each of which opens its end.
 from __future__ import annotations
 
 import socket
+import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
@@ -159,6 +160,14 @@ def free_port() -> int:
 
 
 def memory_folder(stack: ExitStack) -> Path:
-    """A folder with a short path that goes with the stack; in memory if /dev/shm exists."""
+    """A folder with a short path that goes with the stack, or with this process if it is killed; in
+    memory if /dev/shm exists."""
     place = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gfmhil-", dir=place)))
+    folder = tempfile.mkdtemp(prefix="gfmhil-", dir=place)
+    # a second time: a process that ends with this one may have written a file meanwhile
+    remove = 'read _; rm -rf "$0" 2>&- || { sleep 5; rm -rf "$0"; }'
+    guard = subprocess.Popen(
+        ["sh", "-c", remove, folder], stdin=subprocess.PIPE, start_new_session=True
+    )
+    stack.callback(guard.communicate)
+    return Path(folder)
