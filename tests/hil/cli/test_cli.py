@@ -126,6 +126,35 @@ def test_a_start_file_runs_is_stable_and_is_never_overwritten(call, here):
     assert call("new", "law", "../Mine")[0] == 2 and not list(here.parent.glob("*.toml"))
 
 
+def test_other_start_files_run(call, here):
+    for kind in ("network", "campaign", "conformity"):
+        assert call("new", kind, f"a-{kind}")[:2] == (0, f"a-{kind}.toml\n")
+    runs = gfmhil.run_network("a-network.toml", duration=0.7)
+    assert {name: run.status for name, run in runs.items()} == {"A": "completed", "B": "completed"}
+    code, out, _ = call(
+        "conform", "--law", "droop-3", "--against", "a-conformity.toml", "--no-figures",
+        "--workers", "1", "-o", "verdict",
+    )  # fmt: skip
+    assert code == 0 and f"{here.name}/a-conformity  pass" in out
+    with_few_runs(Path("a-campaign.toml"))
+    assert call("campaign", "a-campaign.toml", "--workers", "1", "-o", "runs")[0] == 0
+
+
+def with_few_runs(campaign):
+    campaign.write_text(campaign.read_text().replace("runs = 200", "runs = 2"))
+
+
+@pytest.mark.full
+def test_a_new_project_passes_its_own_tests(call, here, monkeypatch):
+    assert call("new", "project", "mine")[:2] == (0, "mine\n")
+    monkeypatch.chdir("mine")
+    tested = subprocess.run([sys.executable, "-m", "pytest", "-q"], capture_output=True, text=True)
+    assert "2 passed" in tested.stdout, tested.stdout
+    with_few_runs(Path("campaign.toml"))
+    for line in re.findall(r"^gfmhil (.*)$", Path("README.md").read_text(), re.M):
+        assert call(*line.split())[0] == 0, line
+
+
 def test_a_scheduled_law_shows_each_stage(call):
     assert len(json.loads(call("laws", "show", "mimo-gfm-scheduled", "--json")[1])["discrete"]) > 1
     assert "stage 1" in call("laws", "show", "mimo-gfm-scheduled")[1]

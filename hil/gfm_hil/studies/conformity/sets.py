@@ -162,7 +162,7 @@ def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
 
 def _load_case(path: Path) -> Case:
     test = _read(path, Test)
-    case = Case(f"{path.parent.name}/{path.stem}", path, test)
+    case = Case(f"{path.resolve().parent.name}/{path.stem}", path, test)
     for part in test.runs():
         if part.cannot is None:
             content = _content(case, part, {})
