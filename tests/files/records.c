@@ -8,5 +8,6 @@ int main(void)
     gains = gfm_vsg_2_law;
     gfm_init(&law);
     gfm_init(&pair.laws[pair.n]);
-    return gfm_step(&gains, &law, ref, y, u) + gfm_step(&gains, &pair.laws[1], ref, y, other);
+    return gfm_step(&gains, &law, ref, y, u) + gfm_step(&gains, &pair.laws[1], ref, y, other)
+        + gfm_vsg_2_id[law.reason];
 }

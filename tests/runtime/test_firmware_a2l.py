@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,10 @@ def built(place: Path, compiler: str, flags: tuple[str, ...], main_c: str, style
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return place / "program.elf"
+
+
+def source(place: Path) -> str:
+    return (place / "gfm_vsg_2.c").read_text()
 
 
 def addresses(text: str) -> dict[str, int]:
@@ -88,6 +93,12 @@ def test_a_record_in_ram_is_calibrated_where_the_symbols_are(tmp_path, compiler,
     }.items():  # fmt: skip
         assert found[first] == symbols[symbol]
     assert found["u.E_u"] == symbols["u"] + 8 and found["law.offset.i_u"] == symbols["law"] + 12
+    (told,) = re.findall(r'const char gfm_vsg_2_id\[\d+\] =\s+"(.*)"', source(tmp_path))
+    assert told.startswith(f"gfmhil {version('gfmhil')}; vsg-2; ")
+    assert told.endswith("; float32; T_s = 0.0001 s; f_n = 50 Hz")
+    assert f'  EPK "{told}"' in text and f"ADDR_EPK {symbols['gfm_vsg_2_id']:#x}" in text
+    at = re.search(rb"gfmhil [^\0]*", elf.read_bytes())
+    assert at is not None and at[0].decode() == told
     assert "pair.laws[1].reason" in found and not any(n.startswith("other") for n in found)
     flash = text.partition("CHARACTERISTIC gfm_vsg_2_law.A ")[2].partition("/end")[0]
     ram = text.partition("CHARACTERISTIC gains.A ")[2].partition("/end")[0]
@@ -149,7 +160,9 @@ def test_text_of_any_entry_is_read_by_a_parser(tmp_path):
         Entry("d", "", "SWORD", 0, shape=(2, 3), calibrated=True),
     ]
     file = tmp_path / "x.a2l"
-    file.write_text(a2l_text("1 x", "about", entries, big_endian=True))
+    texts = [(0x40, 'one "law"'), (0x80, "another")]
+    file.write_text(a2l_text("1 x", "about", entries, True, (), texts))
+    assert 'VERSION "one \\"law\\" | another"' in file.read_text()
     subprocess.run([A2LTOOL, file, "--strict", "--check"], check=True, capture_output=True)
     assert "MSB_FIRST" in file.read_text()
     with pytest.raises(LawError, match="d: two variables have this name"):

@@ -2,7 +2,8 @@
 
 The laws of the run are built as one program for a target of ``gfmhil firmware check``. QEMU runs it
 and gives it two pipes, through which it gets references and measurements tick by tick and answers
-with u. Before tick 0 the program has to give the kernel's bits in golden rows. The bench keeps what
+with u. Before tick 0 the program has to say that it has the run's laws, and to give the kernel's
+bits in golden rows. The bench keeps what
 is not a law: ramps, checks, the choice of a scheduled law's stage.
 """
 
@@ -108,6 +109,7 @@ class PilController(ExternalController):
             folder = self._ends.enter_context(scratch.temporary("gfmhil-pil-"))
             program = loop.build_loop(modules, controller.T_s, self._target, folder, self._firmware)
             self._run(program)
+            self._identify()
             self._check(modules, golden(modules, SHIPPED))
         except (LawError, ControllerError) as problem:
             self.close()
@@ -144,6 +146,22 @@ class PilController(ExternalController):
         self._give_up = time.monotonic() + _START_S
         self._receive()
         self._none = int(self._answer["count"][0])
+
+    def _identify(self) -> None:
+        """Ask the program which laws it has. Raises ControllerError: another one, as a
+        firmware that brings its own code may have."""
+        text: NDArray[Any] = np.zeros(1, self._program.identification)
+        for k, expected in enumerate(self._program.identifications):
+            self._request["what"], self._request["law"] = loop.IDENTIFY, k
+            self._give_up = time.monotonic() + _START_S
+            self._send(self._request)
+            self._receive()
+            self._receive(text)
+            found = text[0].decode("ascii", "replace")
+            if found != expected:
+                raise ControllerError(
+                    f"{self.name}: its code is of another law: {found!r}, the run has {expected!r}"
+                )
 
     def _check(self, modules: Sequence[Module], rows: Golden) -> None:
         """Step the program through golden rows; from then on reading waits for ever. Raises
@@ -224,9 +242,9 @@ class PilController(ExternalController):
     def _send(self, what: NDArray[Any]) -> None:
         os.write(self._to, what.view(np.uint8).data)
 
-    def _receive(self) -> None:
-        """The next answer. Raises ControllerError: the program has ended."""
-        into = self._answer.view(np.uint8).data
+    def _receive(self, what: NDArray[Any] | None = None) -> None:
+        """The next answer, or what follows it. Raises ControllerError: the program has ended."""
+        into = (self._answer if what is None else what).view(np.uint8).data
         while len(into):
             while self._starts and not self._starts.poll(_LOOK_S * 1e3):
                 if self._process.poll() is not None:

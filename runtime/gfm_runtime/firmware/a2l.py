@@ -60,6 +60,7 @@ def a2l_text(
     entries: Sequence[Entry],
     big_endian: bool = False,
     more: Iterable[str] = (),
+    identifications: Sequence[tuple[int, str]] = (),
 ) -> str:
     """The text of an A2L file.
 
@@ -69,6 +70,8 @@ def a2l_text(
         entries: in their order.
         big_endian: byte order of the memory.
         more: lines of the module, such as an IF_DATA block.
+        identifications: texts in the memory by which a tool knows that the file is of this program,
+            with their addresses. The first one becomes the EPK, of which there can be one only.
 
     Raises:
         LawError: two entries of one name, or an address of more than 32 bits.
@@ -87,7 +90,12 @@ def a2l_text(
         kinds |= {entry.kind} if entry.calibrated else set()
     name = f"gfmhil_{identifier(project)}"
     order = "MSB_FIRST" if big_endian else "MSB_LAST"
-    module = ['/begin MOD_COMMON ""', f"  BYTE_ORDER {order}", "/end MOD_COMMON", *more]
+    module = ['/begin MOD_COMMON ""', f"  BYTE_ORDER {order}", "/end MOD_COMMON"]
+    for address, text in identifications[:1]:
+        every = " | ".join(text for _, text in identifications)
+        module += ['/begin MOD_PAR ""', f"  VERSION {_quoted(every)}"]
+        module += [f"  ADDR_EPK {address:#x}", f"  EPK {_quoted(text)}", "/end MOD_PAR"]
+    module += more
     module += [line for lines in methods.values() for line in lines]
     for kind in sorted(kinds):
         module += [f"/begin RECORD_LAYOUT {kind}_rows", f"  FNC_VALUES 1 {kind} ROW_DIR DIRECT",

@@ -2,8 +2,8 @@
 
 Looks for variables, also of C's file scope and inside of structs, of the types that
 ``gfm_runtime.firmware.module`` writes: instances of a law (``gfm_..._t``), its record
-(``gfm_law_t``, style ``records``), and vectors named ``y``, ``u`` or ``ref`` of the law's numbers
-(``gfm_..._real``). Needs pyelftools.
+(``gfm_law_t``, style ``records``), its identification (``gfm_..._id``), and vectors named ``y``,
+``u`` or ``ref`` of the law's numbers (``gfm_..._real``). Needs pyelftools.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import Signal, carried_rows, command_rows, group
 
 _INSTANCE = re.compile(r"gfm(_\w+)?_t")
+_IDENTIFICATION = re.compile(r"gfm_\w+_id")
 _RECORD = "gfm_law_t"
 _REAL = re.compile(r"gfm(_\w+)?_real")
 _MOST_ELEMENTS = 64  # of an array of instances
@@ -117,15 +118,16 @@ def elf_a2l(path: Path) -> tuple[str, int, int]:
         LawError: it is no linked ELF file, has no debug information, or no exported law.
         OSError: it cannot be opened, is no regular file or is too large.
     """
-    entries, big_endian = elf_entries(path)
+    entries, big_endian, identifications = elf_entries(path)
     about = f"laws of gfmhil in {path.name}"
     calibrated = sum(entry.calibrated for entry in entries)
-    text = a2l_text(path.stem, about, entries, big_endian)
+    text = a2l_text(path.stem, about, entries, big_endian, (), identifications)
     return text, len(entries) - calibrated, calibrated
 
 
-def elf_entries(path: Path) -> tuple[list[Entry], bool]:
-    """What can be measured and calibrated, by address; and whether the program is big-endian.
+def elf_entries(path: Path) -> tuple[list[Entry], bool, list[tuple[int, str]]]:
+    """What can be measured and calibrated, by address; whether the program is big-endian; and the
+    addresses and texts of the laws' identifications.
 
     Raises:
         LawError, OSError: as ``elf_a2l``.
@@ -143,9 +145,13 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
             if not elf.has_dwarf_info(strict=True):
                 raise LawError(where, "has no debug information; compile and link with -g")
             found: dict[str, Entry] = {}
+            identifications = dict[int, str]()
             for place, kind in _variables(elf.get_dwarf_info()):
                 for entry in _entries(place, kind):
                     found.setdefault(entry.name, entry)
+                if _IDENTIFICATION.fullmatch(place.symbol) and len(kind.shape) == 1:
+                    data = _bytes(elf, place.address, kind.shape[0])
+                    identifications[place.address] = data.rstrip(b"\0").decode("ascii")
             big_endian = not elf.little_endian
     except LawError:
         raise
@@ -156,7 +162,17 @@ def elf_entries(path: Path) -> tuple[list[Entry], bool]:
     if not found:
         why = "has no variable of an exported law (gfm_..._t, gfm_law_t); compile its file with -g"
         raise LawError(where, why)
-    return sorted(found.values(), key=lambda entry: entry.address), big_endian
+    entries = sorted(found.values(), key=lambda entry: entry.address)
+    return entries, big_endian, sorted(identifications.items())
+
+
+def _bytes(elf: Any, address: int, size: int) -> bytes:
+    """What the program has in its memory when it starts; none if that is not in the file."""
+    for segment in elf.iter_segments("PT_LOAD"):
+        at = address - segment["p_vaddr"]
+        if at >= 0 and at + size <= segment["p_filesz"]:
+            return bytes(segment.data()[at : at + size])
+    return b""
 
 
 def _variables(dwarf: Any) -> Iterator[tuple[_Place, _Type]]:

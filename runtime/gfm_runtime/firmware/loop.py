@@ -24,8 +24,8 @@ from gfm_runtime.kernel import N_MAX
 from gfm_runtime.signals import COUNTS, N_ADC, NU, NY, NY_INNER, carried
 
 #: what a request asks for before its tick: nothing, a change to its law, that its frame be aligned;
-#: or to start at a state, or to step through a golden row
-TICK, START, CHANGE, CHECK, ALIGN = range(5)
+#: or to start at a state, to step through a golden row, or to say what a law's code is
+TICK, START, CHANGE, CHECK, ALIGN, IDENTIFY = range(6)
 #: the pipes in the program's folder, by which it gets requests and gives answers
 TO, FROM = "to", "from"
 
@@ -41,6 +41,8 @@ class LoopProgram:
     request: np.dtype[Any]
     state: np.dtype[Any]
     answer: np.dtype[Any]
+    identification: np.dtype[Any]  #: what follows the answer to IDENTIFY: text, then zeros
+    identifications: tuple[str, ...]  #: of the laws
 
 
 def build_loop(
@@ -61,15 +63,24 @@ def build_loop(
     """
     where = need_tools(target)
     check_modules(modules)
+    expected = tuple(m.identification(T_s) for m in modules)
     real, stages = modules[0].real, modules[0].stages
     texts = {**sources(modules, T_s, "unrolled"), **selftest(modules, "unrolled")}
-    for name, text in (texts | {"states.h": _states(modules)}).items():
+    for name, text in (texts | {"states.h": _states(modules, max(map(len, expected)) + 1)}).items():
         (folder / name).write_text(text, encoding="utf-8")
     program = [str(HARNESS.joinpath("loop.c"))]
     if firmware is not None:
         if not modules[0].counts:
             raise LawError("counts", f"missing; the interrupt of {firmware} begins with them")
-        program += [str(file.absolute()) for file in sorted(firmware.glob("*.c"))]
+        own = {
+            file
+            for m in modules
+            for end in "ch"
+            if (file := firmware / f"{m.prefix}.{end}").is_file()
+        }
+        for file in own:  # a firmware may bring the code of its laws
+            (folder / file.name).write_bytes(file.read_bytes())
+        program += [str(file.absolute()) for file in sorted(set(firmware.glob("*.c")) - own)]
         program += ["-DLOOP_FIRMWARE", f"-I{HARNESS}", f"-I{firmware.absolute()}"]
     build(folder, folder, where, [m.prefix for m in modules], program)
     real, word = (
@@ -89,11 +100,13 @@ def build_loop(
     kept = [(name, real, (size,) if size > 1 else ()) for name, size, _ in COUNTS_STATE if counts]
     request += [("y", real, (y,)), *[("measured", real, (NY_INNER,))] * counts]
     dtypes = [np.dtype(fields) for fields in (request, state + kept, answer + kept)]
-    return LoopProgram(where, folder, *dtypes)
+    own_text = np.dtype(f"S{max(map(len, expected)) + 1}")
+    return LoopProgram(where, folder, dtypes[0], dtypes[1], dtypes[2], own_text, expected)
 
 
-def _states(modules: Sequence[Module]) -> str:
-    """states.h: what loads a whole state into an instance of a law, and its channel."""
+def _states(modules: Sequence[Module], size: int) -> str:
+    """states.h: what loads a whole state into an instance of a law, its channel, and what it is;
+    that is cut at ``size`` bytes."""
     stages = modules[0].stages
     parts = {"x": 0, "offset": N_MAX, "u": N_MAX + NU, "trend": N_MAX + 2 * NU}
     end = N_MAX + 3 * NU
@@ -102,7 +115,7 @@ def _states(modules: Sequence[Module]) -> str:
     if modules[0].counts:
         parts, end = parts | {"counts": end}, end + sum(size for _, size, _ in COUNTS_STATE)
     lines = [
-        f"enum {{ STATE_REALS = {end} }};",
+        f"enum {{ STATE_REALS = {end}, ID_SIZE = {size} }};",
         f"#define STAGES {int(stages)}",
         f"#define COUNTS {int(modules[0].counts)}",
         f"#define NOW_E {', now.e' * stages}",
@@ -130,6 +143,12 @@ static void *{m.prefix}_at(int k)
               "    void (*load)(int k, const golden_real *from, int limited);",
               "    int (*channel)(int k);",
               "    void *(*at)(int k);",
+              "    const char *id;",
+              "    unsigned long id_size;",
               "} states[] = {"]  # fmt: skip
-    lines += [f"    {{{m.prefix}_load, {m.prefix}_channel, {m.prefix}_at}}," for m in modules]
+    lines += [
+        f"    {{{m.prefix}_load, {m.prefix}_channel, {m.prefix}_at, {m.prefix}_id, "
+        f"sizeof {m.prefix}_id}},"
+        for m in modules
+    ]
     return "\n".join([*lines, "};", ""])

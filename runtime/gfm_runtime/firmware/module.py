@@ -7,12 +7,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.metadata import version
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -117,6 +120,18 @@ class Module:
     def prefix(self) -> str:
         """What the names of its module begin with, e.g. ``gfm_vsg_1``."""
         return f"gfm_{identifier(self.name)}"
+
+    def identification(self, T_s: float) -> str:
+        """What stands in its code, in ASCII: which gfmhil made it, of which law, with which numbers
+        (the first half of a SHA-256), for which T_s, s, and nominal frequency, Hz."""
+        names = itertools.chain(*fields(self.stages, self.fixed is not None, self.counts))
+        numbers = b"".join(self.record[name].tobytes() for name in names)
+        f_n = float(self.record["half_turn"]) / (math.pi * T_s)
+        return (
+            f"gfmhil {version('gfmhil')}; {plain(self.name)}; "
+            f"{hashlib.sha256(numbers).hexdigest()[:32]}; {self.precision}; "
+            f"T_s = {T_s:g} s; f_n = {f_n:.6g} Hz"
+        )
 
     @property
     def inputs(self) -> tuple[Signal, ...]:
@@ -245,7 +260,8 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         out, proofs = dict[str, str](), dict[str, str]()
         for m in modules:
             tick = m.fixed_tick if m.fixed else m.tick
-            keys = keys_of(m) | {"TYPES": "", "LAW": "", "law": ""}
+            keys = keys_of(m) | {"LAW": "", "law": ""}
+            keys["TYPES"], keys["IDENTIFICATION"] = _identified(m, T_s)
             if m.counts:
                 rows, which = carried_rows("y", INNER), not_bounded(m.record)
                 keys["PIN_CHECKS"] = _checks("y", rows, _literals(rows, m.real), which)
@@ -267,6 +283,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     names = [name for name in INNER_CONSTANTS if name not in SHARED]
     if counts:
         names += [f"{name}[{n}]" if n > 1 else name for name, n in COUNTS_CONSTANTS.items()]
+    common["IDENTIFICATION"] = ""
     types = common | {
         "COUNTS_INTEGERS": ", ".join(COUNTS_INTEGERS),
         "KINDS": "; ".join(
@@ -286,12 +303,22 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         guard = f"{m.prefix.upper()}_H"
         out[f"{m.prefix}.h"] = (
             f"{about(m, T_s)}\n#ifndef {guard}\n#define {guard}\n\n"
-            f'#include "gfm.h"\n\nextern const gfm_law_t {m.prefix}_law;\n\n#endif\n'
+            f'#include "gfm.h"\n\nextern const gfm_law_t {m.prefix}_law;\n'
+            f"{_identified(m, T_s)[0]}\n\n#endif\n"
         )
         out[f"{m.prefix}.c"] = (
             f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
+            f"{_identified(m, T_s)[1]}"
         )
     return out
+
+
+def _identified(m: Module, T_s: float) -> tuple[str, str]:
+    """Its identification in C: the declaration and the definition."""
+    text = m.identification(T_s)
+    name = f"const char {m.prefix}_id[{len(text) + 1}]"
+    about = "/* What this code is; a tool compares it. Refer to it, or a linker may drop it. */"
+    return f"{about}\nextern {name};", f"\n{name} =\n    {json.dumps(text)};\n"
 
 
 def _shell(keys: Mapping[str, str], choices: Choices) -> str:

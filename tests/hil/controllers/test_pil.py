@@ -198,6 +198,34 @@ def test_a_firmware_that_cannot_run_is_refused(content, where, said, tmp_path, c
 
 
 @qemu
+@pytest.mark.parametrize(("gain", "ends"), [(1.9048, 0), (1.9049, 2)])
+def test_a_firmware_that_brings_the_code_of_another_law_is_refused(
+    gain, ends, tmp_path, monkeypatch, capsys
+):
+    """Its own copy of the laws' C has to be of the laws of the run."""
+    monkeypatch.chdir(tmp_path)
+    for part in CORTEX_M.iterdir():
+        (tmp_path / part.name).write_bytes(part.read_bytes())
+    law = tmp_path / "vsg-2.toml"
+    law.write_text(f"base = 'vsg-2'\nname = 'vsg-2'\nparameters.k_34 = {gain}\n")
+    export = ["firmware", "export", "vsg-2.toml", "--counts", "board.toml", "--real", "float64"]
+    assert main([*export, "-o", "own"]) == 0
+    for end in "ch":
+        name = f"gfm_vsg_2.{end}"
+        (tmp_path / name).write_bytes((tmp_path / "own" / name).read_bytes())
+    command = ["run", "scenario.toml", "--controller", "pil:host:.", "--quiet", "--no-figures"]
+    assert main([*command, "--out", "run"]) == ends
+    said = capsys.readouterr().err.strip()
+    if ends:
+        assert re.fullmatch(
+            r"gfmhil: controller pil: gfmhil on host: its code is of another law: "
+            r"'gfmhil [\d.]+; vsg-2; [0-9a-f]{32}; float64; T_s = 0.0001 s; f_n = 50 Hz', "
+            r"the run has 'gfmhil .*'",
+            said,
+        )
+
+
+@qemu
 @pytest.mark.parametrize(
     ("number", "link", "reason"),
     [

@@ -84,6 +84,11 @@ def test_the_answers_of_a_session_are_those_of_the_tables(run):
     assert line(b"\xfd") == bytes.fromhex("ff 00 00 00 0000")  # GET_STATUS
     assert line(b"\xfb") == bytes.fromhex("ff 00 00 00 00 00 00 10")  # GET_COMM_MODE_INFO
     assert line(b"\xfa\x00") == bytes.fromhex("ff 01 0000 06000000") + b"gfmhil"  # GET_ID
+    epk = line(b"\xfa\x05")  # what the memory is of; also where the A2L file says
+    assert re.fullmatch(rb"gfmhil [\d.]+; [0-9a-f]{32}", epk[8:]) and epk[4] == len(epk) - 8
+    assert line(b"\xf4\x07\0\0" + (0x800).to_bytes(4, "little"))[1:] == epk[8:15]
+    assert line(b"\xf5\x05")[1:] == epk[15:20]  # and on
+    assert line(b"\xf4\x07\0\0" + (0x830).to_bytes(4, "little")) == b"\xfe\x22"
     assert line(b"\xfa\x03") == bytes.fromhex("ff 01 0000 00000000")  # no URL
     assert line(b"\xfc") == b"\xfe\x00"  # SYNCH is answered by ERR_CMD_SYNCH
     assert line(b"\xf8\x00\x01") == b"\xfe\x20"  # GET_SEED: ERR_CMD_UNKNOWN

@@ -1,7 +1,8 @@
-"""What a calibration tool sees as the memory of a live controller: cells of float64.
+"""What a calibration tool sees as the memory of a live controller: cells of float64, and a text.
 
 | from | what | writable |
 |---|---|---|
+| 0x800 | a text: what the memory is of, so that a tool can compare its A2L file (EPK) | no |
 | 0x1000 | every recorded column of both sides at the newest tick, and its number | no |
 | 0x8000 | the references in force | yes |
 | 0x9000 | the law in force, index of the laws that are ready | yes |
@@ -10,12 +11,15 @@
 A write becomes a command to the run's command server, whose checks and limits hold therefore.
 """
 
+import hashlib
+import json
 import math
 import struct
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from typing import Any, Protocol
 
 from gfm_hil.core.errors import UserError
@@ -26,12 +30,19 @@ from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.c_text import identifier
 from gfm_runtime.lawfile import LawFile, build_law, tied
-from gfm_runtime.signals import SIGNALS, group
+from gfm_runtime.signals import SIGNALS, group, table_hash
 
 #: error codes
 OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
 CELL = 8  # bytes
-_MEASURED, _REFERENCES, _LAW, _GAINS, _LAW_BYTES = 0x1000, 0x8000, 0x9000, 0x10000, 0x1000
+_EPK, _MEASURED, _REFERENCES, _LAW, _GAINS, _LAW_BYTES = (
+    0x800,
+    0x1000,
+    0x8000,
+    0x9000,
+    0x10000,
+    0x1000,
+)
 _A_REFERENCE, _THE_LAW = "a reference", "the law"  # no law has such a name
 _RECORDED_S = 1.0  # how long a write waits until the recording has it
 #: the columns that are a signal of the table, with its range
@@ -88,6 +99,10 @@ class Memory:
         self._laws = list(laws)
         self._files = {name: law_file(name) for name in self._laws}
         self._cells: dict[int, _Number] = {}
+        content = json.dumps([inner, *(f.model_dump_json() for f in self._files.values())])
+        digest = hashlib.sha256(f"{table_hash()}{content}".encode()).hexdigest()[:32]
+        #: what the memory is of: which gfmhil, and a digest of the laws and of the signals
+        self.epk = f"gfmhil {version('gfmhil')}; {digest}"
         names = ["tick", *signals_of("plant", inner), *signals_of("controller", inner)]
         for k, name in enumerate(names):
             self._add(self._measured(name, _MEASURED + k * CELL))
@@ -140,11 +155,15 @@ class Memory:
     def a2l(self, name: str, more: Iterable[str] = ()) -> str:
         """The A2L text of this memory; ``more``: lines of its module."""
         entries = [cell.entry for cell in self._cells.values()]
-        return a2l_text(name, "a controller on the bench of gfmhil", entries, more=more)
+        return a2l_text(
+            name, "a controller on the bench of gfmhil", entries, False, more, [(_EPK, self.epk)]
+        )
 
     def read(self, address: int, size: int) -> bytes:
         """Bytes of the memory, all of the same tick. Raises Refusal: there is no such memory, or
         the run has not begun."""
+        if address >= _EPK and address + size <= _EPK + len(self.epk):
+            return self.epk.encode()[address - _EPK :][:size]
         first = address - address % CELL
         cells = [self._at(at) for at in range(first, address + size, CELL)]
         now = self._now()

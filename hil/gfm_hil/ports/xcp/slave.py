@@ -27,7 +27,8 @@ CMD_SYNCH, CMD_UNKNOWN, CMD_SYNTAX = 0x00, 0x20, 0x21
 _CAL = 1  # RESOURCE: calibration
 _GET_COMM_MODE_INFO_IS_THERE = 0x80  # COMM_MODE_BASIC: little-endian, addresses count bytes
 _VERSION, _DRIVER = 1, 0x10
-_TEXT, _NAME, _FILE = 0, 1, 4  # types of GET_ID: ASCII, name of the A2L file, the file itself
+# types of GET_ID: ASCII, name of the A2L file, the file itself, what the memory is of
+_TEXT, _NAME, _FILE, _EPK = 0, 1, 4, 5
 _A2L = 1  # address extension of the A2L file
 _LEAST = {  # bytes of a command, by its code
     CONNECT: 2, DISCONNECT: 1, GET_STATUS: 1, SYNCH: 1, GET_COMM_MODE_INFO: 1, GET_ID: 2,
@@ -150,7 +151,8 @@ class Slave:
         return b""
 
     def _identification(self, kind: int) -> bytes:
-        text = {_TEXT: self._name.encode(), _NAME: self._name.encode()}.get(kind, b"")
+        texts = {_TEXT: self._name, _NAME: self._name, _EPK: self._memory.epk}
+        text = texts.get(kind, "").encode()
         if kind == _FILE:
             self._at = (_A2L, 0)
             return struct.pack("<BHI", 0, 0, len(self._a2l))  # the master reads it by UPLOAD

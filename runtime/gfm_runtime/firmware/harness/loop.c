@@ -1,7 +1,8 @@
 /* The program of a processor in the loop: waits for a request in the file `to`, and answers in the file
  * `from`. A request is what a tick does first, the number of a law, whether its stage limits, the
  * references and the measurements; at a start the law's whole state follows. At a check a golden row
- * follows, and the answer's result is how many of its words differ. The first answer says that the
+ * follows, and the answer's result is how many of its words differ; to IDENTIFY the law's
+ * identification follows the answer. The first answer says that the
  * program runs; its count is what reading the clock takes. The number of a law that is not there ends
  * the program. */
 #define GOLDEN_NO_MAIN
@@ -14,7 +15,7 @@
 #include "loop.h"
 #endif
 
-enum { TICK, START, CHANGE, CHECK, ALIGN };
+enum { TICK, START, CHANGE, CHECK, ALIGN, IDENTIFY };
 
 static struct {
     golden_word what, law, limited;
@@ -125,6 +126,15 @@ int main(void)
                 break;
             answer.result = golden_row(row);
             board_write(from, &answer, sizeof answer);
+            continue;
+        }
+        if (request.what == IDENTIFY) {
+            static char text[ID_SIZE];
+            const unsigned long size = states[request.law].id_size;
+            memset(text, 0, sizeof text);
+            memcpy(text, states[request.law].id, size < sizeof text ? size : sizeof text);
+            board_write(from, &answer, sizeof answer);
+            board_write(from, text, sizeof text);
             continue;
         }
         answer.bump = 0;

@@ -15,7 +15,7 @@ typedef char @P@_shifts_keep_the_sign[(-1 >> 1) == -1 ? 1 : -1];
 /* @end@ */
 
 typedef @P@_real real;
-
+@IDENTIFICATION@
 /* What a tick works on beside the state. */
 /* @if fixed@ */
 typedef struct {
