@@ -37,8 +37,9 @@ from gfm_hil.studies.campaign import loading
 from gfm_hil.studies.conformity.diff import Results, compare_results, read_results
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test
 from gfm_plant import NoEquilibrium, load_converter
-from gfm_runtime import LawError, discretise, get_law, load_law, pack_law
+from gfm_runtime import LawError, discretise, get_law, law_file, load_law, pack_law
 from gfm_runtime.firmware import STYLES, elf_a2l, golden, make_modules
+from gfm_runtime.firmware.module import tunable
 from gfm_runtime.firmware.report import read_report, reports
 
 from ..support.files import text_of
@@ -152,11 +153,14 @@ def _firmware(file: Path) -> None:
 
 def _reports() -> list[str]:
     laws = (get_law("psc-1"), load_law("psc-1", "cascaded").laws[0])
-    return [
-        reports(make_modules({"psc-1": law}, 1e-4, "float32"), 1e-4, style)["report.json"]
-        for law in laws
-        for style in STYLES
-    ]
+    out = []
+    for law in laws:
+        modules = make_modules({"psc-1": law}, 1e-4, "float32")
+        for style in STYLES:
+            of = [tunable(m, law_file("psc-1"), 1e-4) for m in modules]
+            chosen = of if style == "tunable" else modules
+            out.append(reports(chosen, 1e-4, style)["report.json"])
+    return out
 
 
 @contextlib.contextmanager

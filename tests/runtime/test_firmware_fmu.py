@@ -13,7 +13,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
 from gfm_hil.cli import main
-from gfm_runtime import load_law
+from gfm_runtime import law_file, load_law
 from gfm_runtime.firmware import FMI
 from gfm_runtime.signals import carried_rows, command_rows, group
 from gfm_runtime.states import BAD_Y, RUNNING
@@ -45,6 +45,9 @@ class Unit:
 
     def _all(self, causality: str) -> list[int]:
         return [v.valueReference for v in self._of.modelVariables if v.causality == causality]
+
+    def place(self, name: str) -> int:
+        return int(self._at[name])
 
     def set(self, references: list[int], values: Any) -> None:
         (self.it.setReal if self.two else self.it.setFloat64)(references, list(values))
@@ -174,7 +177,15 @@ def test_what_the_unit_says_of_itself(built, fmi):
         **{f"start.{s.name}": s for s in command_rows(True)},
     }
     found = {v.name: v for v in of.modelVariables}
-    assert found.keys() == rows.keys() | {"reason"} | ({"time"} if fmi == "3" else set())
+    gains = law_file("vsg-2").parameters
+    own = {f"gain.{name}": one for name, one in gains.items() if one.tied is None}
+    others = own.keys() | {"reason"} | ({"time"} if fmi == "3" else set())
+    assert found.keys() == rows.keys() | others
+    for name, one in own.items():
+        v = found[name]
+        assert (v.variability, v.unit, float(v.start)) == ("tunable", one.unit, one.value)
+        if one.free:
+            assert (float(v.min), float(v.max)) == one.free
     for name, s in rows.items():
         v = found[name]
         assert (v.unit, float(v.min), float(v.max)) == (s.unit, s.low, s.high)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime import BuiltLaw, LawSet, discretise, load_law, pack_law, state_dtype
+from gfm_runtime import BuiltLaw, LawSet, discretise, law_file, load_law, pack_law, state_dtype
 from gfm_runtime.assembly import Controller
 from gfm_runtime.counts import align, measure, modulate
 from gfm_runtime.firmware import export
@@ -17,6 +17,7 @@ from gfm_runtime.firmware.module import at_rest
 from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
 from gfm_runtime.kernel import advance_with_inner, look_with_inner
+from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import NU, carried_rows, group
 from gfm_runtime.switchover import settle_into, settle_with_inner
 
@@ -59,10 +60,16 @@ def exported(
 ) -> Path:
     """A folder with laws, all by default."""
     laws = {name: of[name] for name in names} or of
-    for name, text in export(laws, T_S, real, style).items():
+    for name, text in export(laws, T_S, real, style, files=files_of(laws)).items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
     return folder
+
+
+def files_of(laws: Mapping[str, BuiltLaw]) -> dict[str, LawFile]:
+    """The files of laws of the catalogue, by their names in an export; a stage is a law."""
+    alone = {"schedule": None}
+    return {name: law_file(law.name).model_copy(update=alone) for name, law in laws.items()}
 
 
 def cc(folder: Path, *arguments: str, compiler: str = "gcc") -> subprocess.CompletedProcess[str]:

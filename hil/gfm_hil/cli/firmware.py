@@ -14,7 +14,7 @@ from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
-from gfm_runtime import BuiltLaw, LawSet, law_names, load_law
+from gfm_runtime import BuiltLaw, LawSet, law_file, law_names, load_law
 from gfm_runtime.firmware import (
     CHECKED,
     EVA,
@@ -38,6 +38,7 @@ from gfm_runtime.firmware import (
     prove,
     stage_names,
 )
+from gfm_runtime.lawfile import LawFile
 
 ALL = "all"
 _SHOWN = 8  # files of laws that export names one by one
@@ -50,7 +51,8 @@ def add(command: argparse.ArgumentParser) -> None:
     _add_laws(out, (*REALS, FIXED))
     out.add_argument(
         "--style", choices=STYLES, default=STYLES[0],
-        help="unrolled: constants in the code (default); records: a generic step for records",
+        help="unrolled: constants in the code (default); tunable: gains in RAM, changed by a call; "
+        "records: a generic step for records",
     )  # fmt: skip
     out.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     out.set_defaults(call=call_export)
@@ -121,16 +123,17 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
 def call_export(options: argparse.Namespace) -> int:
     sets = _sets(options.laws, options.inner, options.counts)
     scheduled = [one for one in sets if one.schedule is not None]
-    if ALL in options.laws and options.real == FIXED and scheduled:
+    which = "fixed point" if options.real == FIXED else "--style tunable"
+    if ALL in options.laws and scheduled and (options.real == FIXED or options.style == "tunable"):
         sets = [one for one in sets if one.schedule is None]
         names = ", ".join(one.name for one in scheduled)
-        print(
-            f"gfmhil: {names}: left out, since fixed point does not cover schedules",
-            file=sys.stderr,
-        )
+        print(f"gfmhil: {names}: left out, since {which} does not cover schedules", file=sys.stderr)
         scheduled = []
     laws, omega_b = _laws(sets), _omega_b(options.f_n)
-    files = export(laws, options.T_s, options.real, options.style, omega_b, scheduled)
+    files = export(
+        laws, options.T_s, options.real, options.style, omega_b, scheduled,
+        _files(options.laws) if options.style == "tunable" else None,
+    )  # fmt: skip
     options.out.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
         (options.out / name).parent.mkdir(exist_ok=True)
@@ -225,6 +228,12 @@ def _sets(names: Sequence[str], inner: str | None, counts: str | None) -> list[L
     their own."""
     given = (name for one in names for name in (law_names() if one == ALL else [one]))
     return [load_law(name, inner, counts) for name in given]
+
+
+def _files(names: Sequence[str]) -> dict[str, LawFile]:
+    """The files of the laws of these names, by their names."""
+    given = (name for one in names for name in (law_names() if one == ALL else [one]))
+    return {file.name: file for file in map(law_file, given)}
 
 
 def _laws(sets: Sequence[LawSet]) -> dict[str, BuiltLaw]:

@@ -41,6 +41,7 @@ from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 if TYPE_CHECKING:
     from gfm_hil.controllers.external import Retuned
 
+_SHOWN = 120  # characters of an identification
 _START_S, _LOOK_S = 30.0, 0.05
 _LINES, _BYTES = 3, 2000  # of what QEMU says, at most
 _SIGNALS = {BAD_Y: carried("y", True), BAD_SENSOR: names("adc"), RESULTS["BAD_REF"][0]: REF_NAMES}
@@ -160,7 +161,8 @@ class PilController(ExternalController):
             found = text[0].decode("ascii", "replace")
             if found != expected:
                 raise ControllerError(
-                    f"{self.name}: its code is of another law: {found!r}, the run has {expected!r}"
+                    f"{self.name}: its code is of another law: {found[:_SHOWN]!r}, the run has "
+                    f"{expected!r}"
                 )
 
     def _check(self, modules: Sequence[Module], rows: Golden) -> None:

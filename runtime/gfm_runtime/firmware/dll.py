@@ -19,6 +19,7 @@ from gfm_runtime.firmware.c_text import Choices, identifier, plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
+from gfm_runtime.firmware.tuning import Tuning
 from gfm_runtime.signals import TABLE_VERSION, Signal, command_rows, group, table_hash
 
 _INTERFACE = "IEEE_Cigre_DLLInterface.h"
@@ -40,7 +41,8 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
     assert m.law is not None
     schedule = laws.schedule is not None
     u = command_rows(m.stages)
-    choices: Choices = {**m.choices, "schedule": schedule}
+    # what is kept in words as a whole: integers are among what changes
+    choices: Choices = {**m.choices, "whole": schedule or m.tuning is not None}
     single = m.real == np.float32
     keys = keys_of(m) | {
         "NAME": _string(m.name),
@@ -54,8 +56,12 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
         "OUTPUTS": _ports(m.outputs),
         "REASON": _string(RESULT_TEXT),
         "STATES": "FloatStates" if single else "DoubleStates",
-        "FLOATS": "REALS" if single and not schedule else "0",
-        "DOUBLES": "0" if single or schedule else "REALS",
+        "FLOATS": "REALS" if single and not choices["whole"] else "0",
+        "DOUBLES": "0" if single or choices["whole"] else "REALS",
+        "PARAMETERS": _parameters(m.tuning) if m.tuning else "",
+        "GAINS": ", &gains" * bool(m.tuning),
+        "GAINS_IN": f", const {m.prefix}_gains_t *gains" * bool(m.tuning),
+        "GAINS_OUT": f", {m.prefix}_gains_t *gains" * bool(m.tuning),
         "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
         "E_IN_USE": ", &u[2]" * m.stages,
     }
@@ -97,6 +103,19 @@ def build_library(
 
 def _string(text: str) -> str:
     return json.dumps(plain(text))
+
+
+def _parameters(tuning: Tuning) -> str:
+    """The gains, which may change at any time."""
+    return "\n".join(
+        f"    {{{_string(name)}, {_string('Gains')}, {_string(of.source)}, {_string(of.unit)}, "
+        "IEEE_Cigre_DLLInterface_DataType_real64_T, 0, "
+        f"{{.Real64_Val = {value!r}}}, {{.Real64_Val = {low!r}}}, {{.Real64_Val = {high!r}}}}},"
+        for (name, value), (low, high), of in (
+            (gain, tuning.ranges[gain[0]], tuning.file.parameters[gain[0]])
+            for gain in tuning.gains.items()
+        )
+    )
 
 
 def _ports(signals: Iterable[Signal]) -> str:

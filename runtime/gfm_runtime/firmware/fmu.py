@@ -46,9 +46,10 @@ _HERE = {"2": {"x86_64": "linux64"}, "3": {}}
 _WINDOWS = {"2": "win64", "3": "x86_64-windows"}
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all files, so that the same law gives the same bytes
 _CAUSALITIES = {
-    "input": {"variability": "continuous"},
-    "output": {"variability": "discrete", "initial": "calculated"},
-    "parameter": {"variability": "fixed", "initial": "exact"},
+    "input": {"causality": "input", "variability": "continuous"},
+    "output": {"causality": "output", "variability": "discrete", "initial": "calculated"},
+    "parameter": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
+    "gain": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
 }
 _OF_FMI_3 = ("<Output valueReference", "<InitialUnknown valueReference")
 
@@ -89,7 +90,7 @@ def _sources(
     """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
     follows from both."""
     u, two = command_rows(m.stages), fmi == "2"
-    inside = (*group("ref"), *m.inputs)
+    inside, gains = (*group("ref"), *m.inputs), _gains(m)
     keys = (
         keys_of(m)
         | _NAMES[fmi]
@@ -98,12 +99,14 @@ def _sources(
             "U_START": ", ".join(repr(s.default) for s in u),
             "IN_START": ", ".join(repr(s.default) for s in inside),
             "E_IN_USE": ", &u[2]" * m.stages,
+            "GAIN_LOW": ", ".join(repr(s.low) for s in gains),
+            "GAIN_HIGH": ", ".join(repr(s.high) for s in gains),
             "REFUSALS": "@REFUSALS@",
             "TOKEN": "@TOKEN@",
         }
     )
     keys["FIRST"] = written("first.c", keys, m.choices)
-    interface = written("fmi.c", keys, {"fmi2": two})
+    interface = written("fmi.c", keys, {"fmi2": two, "tuned": m.tuning is not None})
     code = {
         **own,
         f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
@@ -133,12 +136,14 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
         *((f"u.{s.name}", "output", f"{s.description}, of {s.base}", s) for s in m.outputs),
         ("reason", "output", RESULT_TEXT, None),  # of a tick, an integer
         *((f"start.{s.name}", "parameter", f"where u.{s.name} begins, of {s.base}", s) for s in u),
+        *((f"gain.{s.name}", "gain", s.description, s) for s in _gains(m)),
     ]
     lines, units = list[str](), {s.unit for *_, s in rows if s}
     for reference, (name, causality, about, s) in enumerate(rows, 1):
-        base = {"name": name, "valueReference": str(reference), "causality": causality}
+        base = {"name": name, "valueReference": str(reference)}
         base |= _CAUSALITIES[causality] | {"description": plain(about)}
-        number = {"unit": s.unit, "min": repr(s.low), "max": repr(s.high)} if s else {}
+        number = {"min": repr(s.low), "max": repr(s.high)} if s else {}
+        number |= {"unit": s.unit} if s and s.unit else {}
         number |= {"start": repr(s.default)} if s and causality != "output" else {}
         kind = ("Real" if two else "Float64") if s else ("Integer" if two else "Int32")
         lines += (
@@ -154,7 +159,7 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
         str(k - first + last + 1) if k < first + len(u) else "" for k in range(first, last + 1)
     ]
     return {
-        "UNITS": "\n".join(f"    <Unit name={_quoted(x)} />" for x in sorted(units)),
+        "UNITS": "\n".join(f"    <Unit name={_quoted(x)} />" for x in sorted(filter(None, units))),
         "VARIABLES": "\n".join(lines),
         "OUTPUTS": "\n".join(
             f'    {tags[0]}="{k}" dependencies="" />' for k in range(first, last + 1)
@@ -163,6 +168,18 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
             f'    {tags[1]}="{k}" dependencies="{at}" />' for k, at in enumerate(begins, first)
         ),
     }
+
+
+def _gains(m: Module) -> list[Signal]:
+    """The gains of a law that can be tuned, as rows of the signal table are."""
+    if m.tuning is None:
+        return []
+    of, ranges = m.tuning.file.parameters, m.tuning.ranges
+    return [
+        Signal("ref", name, "", of[name].unit, "", 1.0, *ranges[name], value,
+               of[name].source or "gain of the law")
+        for name, value in m.tuning.gains.items()
+    ]  # fmt: skip
 
 
 def _quoted(text: str) -> str:

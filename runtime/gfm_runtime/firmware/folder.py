@@ -12,11 +12,12 @@ from gfm_runtime.firmware.c_text import written
 from gfm_runtime.firmware.check import script
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
-from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources
+from gfm_runtime.firmware.module import C_TYPES, MADE, Module, Style, make_modules, sources, tunable
 from gfm_runtime.firmware.report import reports
 from gfm_runtime.firmware.schedule import schedule_sources, stage_names
 from gfm_runtime.firmware.tick import SIZE
 from gfm_runtime.law import BuiltLaw
+from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import COUNTS, N_ADC, NU, carried
 from gfm_runtime.states import BAD_U
 
@@ -33,6 +34,7 @@ def export(
     style: Style,
     omega_b: float = 100 * math.pi,
     scheduled: Iterable[LawSet] = (),
+    files: Mapping[str, LawFile] | None = None,
 ) -> dict[str, str]:
     """The files of a firmware folder by name.
 
@@ -42,6 +44,7 @@ def export(
         real: float32 or float64, or ``FIXED``, which has one style only.
         style: see ``gfm_runtime.firmware.module``.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
+        files: of the laws, for style ``tunable``.
         scheduled: laws whose stages, under the names of ``stage_names``, are among ``laws``.
 
     Raises:
@@ -49,13 +52,18 @@ def export(
     """
     fixed = real == FIXED
     if fixed and style != "unrolled":
-        raise LawError("--style records", "fixed point has its constants in the code; leave it out")
-    for one in scheduled if fixed else ():
+        raise LawError(
+            f"--style {style}", "fixed point has its constants in the code; leave it out"
+        )
+    for one in scheduled if fixed or style == "tunable" else ():
+        what = "fixed point" if fixed else "--style tunable"
         raise LawError(
             f"law {one.name!r}",
-            "is scheduled, which fixed point does not cover; export its stages as laws",
+            f"is scheduled, which {what} does not cover; export its stages as laws",
         )
     modules = make_modules(laws, T_s, real, omega_b)
+    if style == "tunable":
+        modules = [tunable(m, (files or {})[m.name], T_s) for m in modules]
     by_name = {m.name: m for m in modules}
     choosing: dict[str, str] = {}
     for one in scheduled:
@@ -76,13 +84,15 @@ def export(
 
 def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     """selftest.h and selftest.c."""
-    adapters, table, own = [], [], style == "unrolled"
+    adapters, table, own = [], [], style != "records"
     parts: tuple[str, ...] = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
+    tuned = modules[0].tuning is not None
+    parts += ("tune",) * tuned
     parts += ("go_on", "align") * modules[0].counts
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     counts = modules[0].counts
-    choices = {"stages": stages, "fixed": fixed, "counts": counts}
+    choices = {"stages": stages, "fixed": fixed, "counts": counts, "tuned": tuned}
     e = {"E": ", const golden_real *e" * stages, "e": ", e" * stages, "NOW_E": ", now.e" * stages}
     for m in modules:
         keys = {
@@ -91,6 +101,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
             "ARGUMENT": "" if own else f"&{m.prefix}_law, ",
             "N": str(m.n),
             "REST": str(2 * NU + m.n),
+            "SETS": ",\n        ".join(map(m.tuning.initialiser, m.sets())) if m.tuning else "",
             **e,
         }
         adapters.append(written("adapter.c", keys, choices))

@@ -47,7 +47,8 @@ from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
 #: what a row does before its step: nothing, init, a bumpless change to the row's law, reset and
 #: settle at the last u, or an error of memory: no number in the law's state, or in its stage's
-STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE = range(6)
+#: and from TUNE on the sets of gains of a law that can be tuned
+STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE, TUNE = range(7)
 SEGMENT = 30  # ticks of one kind
 KINDS = 7
 INSIDE = 1e-3  # of a range; stays off its ends, which differ in float32
@@ -108,7 +109,12 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     real, stages, counts = modules[0].real, modules[0].stages, modules[0].counts
     states = max([1, *(m.n for m in modules)])
     word = np.dtype(f"u{real.itemsize}")
-    laws = np.array([m.record for m in modules])
+    records = [m.record for m in modules]
+    places = []  # of each law's records with other gains
+    for m in modules:
+        places.append(len(records))
+        records += [m.tuning.tuned(gains) for gains in m.sets() if m.tuning]
+    laws = np.array(records)
     instances = np.zeros((len(modules), 2), state_dtype(real))
     signals = (*carried_rows("y", stages), *group("ref"))
     ranges = np.array([[getattr(s, e) for s in signals] for e in ("low", "high")], real)
@@ -116,7 +122,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     fresh["u"] = _, omega, E = [s.default for s in group("u")]
     fresh["omega_pll"], fresh["pll"], fresh["e"] = omega, (1.0, 0.0), (E, 0.0)
     fresh["angle"], fresh["sensed"], fresh["speed"] = (1.0, 0.0), at_rest(), omega
-    now, io = np.zeros(3, np.int64), np.zeros(1, _io_dtype(real))
+    now, io = np.zeros(5, np.int64), np.zeros(1, _io_dtype(real))
     parts = []
     for k, module in enumerate(modules):
         seed = zlib.crc32(module.prefix.encode())
@@ -124,12 +130,15 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         if counts:
             op, ys = _adc(op, seed, module.record)
         op[0] = INIT if k == 0 else SWITCH
+        for nth, at in enumerate(range(SEGMENT // 3, ticks, SEGMENT) if module.tuning else ()):
+            if op[at] == STEP:
+                op[at] = TUNE + nth % len(module.sets())
         n_u = len(carried("u", COUNTS if counts else stages))
         result, u = np.zeros(ticks, np.int64), np.zeros((ticks, n_u), real)
         bump = np.zeros(ticks, real)
         after: NDArray[Any] = np.zeros(ticks, instances.dtype)
         own = now, io, result, u, bump, after
-        _drive(laws, instances, fresh, ranges, op, k, refs, ys, *own)
+        _drive(laws, instances, fresh, ranges, op, k, places[k] - TUNE, refs, ys, *own)
         integers = [op, np.full(ticks, k), result]
         numbers = [refs, ys, u, bump, after["x"][:, :states]]
         numbers += [after[name] for name in ("offset", "u", "trend")]
@@ -196,11 +205,13 @@ def _io_dtype(real: np.dtype[Any]) -> np.dtype[Any]:
 
 
 @compiled
-def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, bump, after):
+def _drive(laws, instances, fresh, ranges, op, k, tuned, refs, ys, now, io, result, u, bump, after):
     """The rows of law k, as the self-test has them: two instances of each law, one in use.
 
-    ``now`` is the law and the instance in use and the result that is latched; ``now`` and ``io``
-    go on from call to call. ``result``, ``u``, ``bump`` and ``after`` are what the rows say.
+    ``now`` is the law and the instance in use, the result that is latched, the record in use, and
+    that of gains which wait for a tick, or -1; ``now`` and ``io`` go on from call to call. A row
+    that tunes has its record at ``tuned`` and its op. ``result``, ``u``, ``bump`` and ``after`` are
+    what the rows say.
     """
     c = io[0]
     n_y, n_u = min(ys.shape[1], NY_INNER), u.shape[1]
@@ -221,7 +232,7 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
             for j in range(n_y):
                 c.y[j] = ys[i, j]
         if op[i] == INIT:
-            now[0], now[1], now[2] = k, 0, OK
+            now[0], now[1], now[2], now[3], now[4] = k, 0, OK, k, -1
             instances[k, 0] = fresh[0]
             c.bump = 0
             for j in range(NU_COUNTS):
@@ -229,24 +240,28 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
         elif op[i] == SWITCH:
             old = now[0]
             old_state, new_state = instances[old, now[1]], instances[k, 1 - now[1]]
-            c.bump = change_law(laws[old], old_state, laws[k], new_state, c.ref, c.y, c.u)
+            c.bump = change_law(laws[now[3]], old_state, laws[k], new_state, c.ref, c.y, c.u)
             if inner:
                 take_measurements(new_state, c.y)
                 settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
             if counts:
                 go_on_with(new_state, old_state)
-            now[0], now[1] = k, 1 - now[1]
+            now[0], now[1], now[3], now[4] = k, 1 - now[1], k, -1
         elif op[i] == RESET:
             now[2] = OK
+            if now[4] >= 0:
+                now[3], now[4] = now[4], -1
             old_state = instances[now[0], now[1]]
             for j in range(NU):
                 c.u[j] = old_state.u[j]
             if inner:
                 e_d, e_q = old_state.e[0], old_state.e[1]
-                settle_with_inner(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
+                settle_with_inner(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
             else:
-                settle_into(laws[now[0]], old_state, c.ref, c.y, c.u, c.zero)
-        law, state = laws[now[0]], instances[now[0], now[1]]
+                settle_into(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero)
+        elif op[i] >= TUNE:
+            now[4] = tuned + op[i]
+        law, state = laws[now[3]], instances[now[0], now[1]]
         if op[i] == SPOIL:
             state.offset[1] = math.nan
         elif op[i] == SPOIL_STAGE:
@@ -259,6 +274,13 @@ def _drive(laws, instances, fresh, ranges, op, k, refs, ys, now, io, result, u, 
                 now[2] = BAD_SENSOR
         if now[2] == OK:
             now[2] = _refusal(ranges, c.ref, c.y, n_y)
+        if now[2] == OK and now[4] >= 0:
+            new = laws[now[4]]
+            change_law(law, state, new, state, c.ref, c.y, c.u)
+            if inner:
+                take_measurements(state, c.y)
+                settle_inner(new, state, state.e[0], state.e[1])
+            law, now[3], now[4] = new, now[4], -1
         if now[2] == OK:
             if inner:
                 look_with_inner(law, state, c.ref, c.y, c.out)

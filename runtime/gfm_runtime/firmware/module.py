@@ -1,8 +1,10 @@
-"""The C modules of a set of laws: one header and one source for each, in one of two styles.
+"""The C modules of a set of laws: one header and one source for each, in one of three styles.
 
 * ``unrolled``: each law is a module of its own with its constants in the code.
+* ``tunable``: as ``unrolled``, but what follows from the law's gains is in RAM, and a function
+  makes it from new gains while the law runs.
 * ``records``: each law is a constant record (``gfm_<law>_law``) for the generic step of
-  ``gfm.h`` and ``gfm.c``. Firmware that changes gains while it runs keeps such a record in RAM.
+  ``gfm.h`` and ``gfm.c``. A calibration tool may write such a record in RAM.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import itertools
 import json
 import math
 import textwrap
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,10 +30,12 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, written
 from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
 from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
+from gfm_runtime.firmware.tuning import Tuning
 from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
 from gfm_runtime.law import BuiltLaw
+from gfm_runtime.lawfile import LawFile
 from gfm_runtime.signals import (
     INNER,
     N_LEGS,
@@ -54,7 +59,7 @@ from gfm_runtime.tustin import discretise
 
 MADE = "Made by gfmhil firmware export; do not edit."
 
-Style = Literal["unrolled", "records"]
+Style = Literal["unrolled", "tunable", "records"]
 STYLES: tuple[Style, ...] = get_args(Style)
 REALS = ("float32", "float64")
 
@@ -91,13 +96,12 @@ COUNTS_INTEGERS = tuple(name for name, _ in COUNTS_NUMBERS if name != "counts")
 
 
 def fields(
-    stages: bool, fixed: bool = False, counts: bool = False
+    stages: bool, rows: bool = False, counts: bool = False
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The fields of a law's record that are integers, and those in its precision."""
-    if fixed:
-        return (*INTEGERS, "row"), NUMBERS
+    """The fields of a law's record that are integers, and those in its precision; ``rows``: also
+    without a stage the row of u that each state belongs to."""
     if not stages:
-        return INTEGERS, NUMBERS
+        return (*INTEGERS, *["row"] * rows), NUMBERS
     integers, numbers = INTEGERS + STAGE_INTEGERS, NUMBERS + INNER_CONSTANTS
     if counts:
         return integers + COUNTS_INTEGERS, numbers + tuple(COUNTS_CONSTANTS)
@@ -115,6 +119,7 @@ class Module:
     stages: bool = False
     counts: bool = False  #: whether the laws of its folder measure and modulate
     fixed: FixedLaw | None = None  #: the law in fixed point; None in a floating-point precision
+    tuning: Tuning | None = None  #: how its gains change while it runs, in style tunable
 
     @property
     def prefix(self) -> str:
@@ -156,6 +161,7 @@ class Module:
             "stages": self.stages,
             "counts": self.counts,
             "fixed": fixed,
+            "tuned": self.tuning is not None,
             "own": not fixed,
             "mapped": code != LINEAR,
             "angle": code == HYBRID_ANGLE,
@@ -165,13 +171,19 @@ class Module:
     @cached_property
     def tick(self) -> Tick:
         """The functions of its step in floating point."""
-        return Tick(self.record, self.real, max(1, self.n), self.stages, counts=self.counts)
+        tuned = self.tuning.fields() if self.tuning else None
+        n = max(1, self.n)
+        return Tick(self.record, self.real, n, self.stages, counts=self.counts, tuned=tuned)
 
     @cached_property
     def fixed_tick(self) -> FixedTick:
         """The functions of its step in fixed point."""
         assert self.fixed is not None
         return FixedTick(self.fixed)
+
+    def sets(self) -> list[dict[str, float]]:
+        """The gains of its golden rows."""
+        return self.tuning.sets(zlib.crc32(self.prefix.encode())) if self.tuning else []
 
     @property
     def real(self) -> np.dtype[Any]:
@@ -223,6 +235,21 @@ def make_modules(
     return modules
 
 
+def tunable(module: Module, file: LawFile, T_s: float) -> Module:
+    """The module with gains that can change while it runs.
+
+    Args:
+        file: of the module's law, whose own parameters have the values in force.
+        T_s: sampling time, s.
+
+    Raises:
+        LawError: as ``Tuning``.
+    """
+    if module.law is not None:
+        file = file.model_copy(update={"parameters": dict(module.law.parameters)})
+    return replace(module, tuning=Tuning(file, module.record, T_s))
+
+
 def check_modules(modules: Sequence[Module]) -> None:
     """Refuse what C cannot hold.
 
@@ -256,12 +283,14 @@ def check_modules(modules: Sequence[Module]) -> None:
 
 def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
     """The headers and sources by file name."""
-    if style == "unrolled":
+    if style != "records":
         out, proofs = dict[str, str](), dict[str, str]()
         for m in modules:
             tick = m.fixed_tick if m.fixed else m.tick
             keys = keys_of(m) | {"LAW": "", "law": ""}
             keys["TYPES"], keys["IDENTIFICATION"] = _identified(m, T_s)
+            if m.tuning:
+                keys |= m.tuning.keys(m.prefix)
             if m.counts:
                 rows, which = carried_rows("y", INNER), not_bounded(m.record)
                 keys["PIN_CHECKS"] = _checks("y", rows, _literals(rows, m.real), which)
@@ -274,7 +303,7 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         return out | proofs
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
-    choices = {**modules[0].choices, "own": False}
+    choices = {**modules[0].choices, "own": False, "tuned": False}
     counts = modules[0].counts
     common = _keys("gfm", real, states, stages, counts) | {
         "LAW": "const gfm_law_t *law, ",
@@ -431,7 +460,7 @@ def at_rest() -> list[float]:
 
 
 def keys_of(m: Module) -> dict[str, str]:
-    """What the templates of an unrolled law ask for."""
+    """What the templates of an unrolled or tunable law ask for."""
     keys = _keys(m.prefix, m.real, m.n, m.stages, m.counts) | {
         "MADE": MADE,
         "LAW_NAME": plain(m.name),

@@ -20,10 +20,11 @@ from gfm_runtime.error_maps import DVOC
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literal
 from gfm_runtime.firmware.fixed import FIXED, G_MOST, NEAR, FixedLaw, deviations, make_fixed
-from gfm_runtime.firmware.module import REALS, STYLES, Module, Style, check_modules, fields
+from gfm_runtime.firmware.module import REALS, STYLES, Module, Style, check_modules, fields, tunable
 from gfm_runtime.firmware.tick import SHARED, SIZE, Tick
 from gfm_runtime.inner import INNER_CONSTANTS
 from gfm_runtime.kernel import law_dtype
+from gfm_runtime.lawfile import LawFile
 from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import NU, NY, U_NAMES, carried_rows, group, table_hash
 
@@ -55,6 +56,7 @@ class Exported(NamedTuple):
 def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, str]:
     """report.json and report.md."""
     fixed = modules[0].fixed is not None
+    rows = fixed or style == "tunable"
     laws = [
         {
             "name": m.name,
@@ -65,8 +67,9 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
             "bytes": sizes(m, style),
             "operations": operations(m, style),
             "record": {
-                n: _hex(m.record[n]) for part in fields(m.stages, fixed, m.counts) for n in part
+                n: _hex(m.record[n]) for part in fields(m.stages, rows, m.counts) for n in part
             },
+            **({"file": m.tuning.file.model_dump(exclude_unset=True)} if m.tuning else {}),
             **({"deviation": _deviations(m.fixed, m.record, T_s)} if m.fixed else {}),
         }
         for m in modules
@@ -118,7 +121,7 @@ def _exported(whole: Any) -> Exported:
     fixed = whole["real"] == FIXED
     dtype = law_dtype("float64" if fixed else whole["real"])
     stages, counts = (bool(whole.get(key)) and not fixed for key in ("stages", "counts"))
-    named = fields(stages, fixed, counts)
+    named = fields(stages, fixed or whole["style"] == "tunable", counts)
     modules = [
         Module(str(law["name"]), None, _record(law["record"], dtype, named), stages, counts)
         for law in whole["laws"]
@@ -126,6 +129,10 @@ def _exported(whole: Any) -> Exported:
     if not modules:
         raise LawError("laws", "there must be one")
     check_modules(modules)
+    if whole["style"] == "tunable":
+        files = [LawFile(**law["file"]) for law in whole["laws"]]
+        T_s = float(whole["T_s"])
+        modules = [tunable(m, file, T_s) for m, file in zip(modules, files, strict=True)]
     if fixed:
         modules = [replace(m, fixed=make_fixed(m.name, m.record)) for m in modules]
     return Exported(modules, whole["real"], whole["style"])
@@ -176,6 +183,8 @@ def sizes(m: Module, style: Style) -> dict[str, int]:
         constants += sum(COUNTS_CONSTANTS.values()) * m.counts
     else:
         constants = m.tick.constants()
+    if m.tuning:
+        state += 2 * len(m.tuning.first)
     return {"state": state * m.real.itemsize, "constants": constants * m.real.itemsize}
 
 

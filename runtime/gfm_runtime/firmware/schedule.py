@@ -5,17 +5,18 @@ It has the functions of a law, so that a model for EMT programs or an FMU takes 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gfm_runtime.assembly import Controller
-from gfm_runtime.catalogue import LawSet
+from gfm_runtime.catalogue import LawSet, law_file
 from gfm_runtime.controller import choose
 from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import literals, plain, written
-from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources
+from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources, tunable
 from gfm_runtime.firmware.tick import place
 from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
 from gfm_runtime.impedance import estimate
@@ -32,7 +33,8 @@ def stage_names(laws: LawSet) -> list[str]:
 def one_module(
     laws: LawSet, T_s: float, real: str, omega_b: float
 ) -> tuple[Module, dict[str, str]]:
-    """A law or a scheduled one as what has its name, with its sources in style unrolled.
+    """A law or a scheduled one as what has its name, with its sources: in style tunable, or in
+    unrolled if it is scheduled or its form follows from its gains.
 
     Raises:
         LawError: as ``make_modules``.
@@ -41,9 +43,11 @@ def one_module(
         why = "is scheduled, which has no interrupt from counts; use its stages, or --counts none"
         raise LawError(f"law {laws.name!r}", why)
     modules = make_modules(dict(zip(stage_names(laws), laws.laws, strict=True)), T_s, real, omega_b)
-    code = sources(modules, T_s, "unrolled")
     if laws.schedule is None:
-        return modules[0], code
+        with contextlib.suppress(LawError):
+            modules = [tunable(modules[0], law_file(laws.asked or laws.name), T_s)]
+        return modules[0], sources(modules, T_s, "tunable")
+    code = sources(modules, T_s, "unrolled")
     whole = replace(modules[0], name=laws.name)  # has the stages' signals
     return whole, code | schedule_sources(laws, modules, T_s, omega_b, "unrolled")
 

@@ -104,6 +104,7 @@ class Tick:
         n: states that an instance has room for.
         stages: whether it has an inner stage's variables.
         counts: whether it measures and modulates.
+        tuned: fields of the law whose numbers are coefficients in RAM, by ``Tuning.fields``.
         all_terms: count zeros too, as the generic step does.
     """
 
@@ -115,6 +116,7 @@ class Tick:
         stages: bool,
         all_terms: bool = False,
         counts: bool = False,
+        tuned: Mapping[str, Any] | None = None,
     ) -> None:
         self._n, own = n, record is not None
         of = law_dtype(real)  # the constants as members of a record in C
@@ -124,7 +126,8 @@ class Tick:
             fields |= {name: number(0) for name, _ in INNER_NUMBERS} | {"k_pll": number(0.0)}
         law = Struct(fields)
         if record is not None:
-            law = Struct({name: record[name] for name in record.dtype.names or ()})
+            constant = {name: record[name] for name in record.dtype.names or ()}
+            law = Struct(constant | dict(tuned or {}))
             all_terms = all_terms or bool(np.any(np.signbit(record["u_0"]) & (record["u_0"] == 0)))
         translate = Translator(own, Algebra(all_terms))
         records = [law, _state(real, n)]
@@ -172,6 +175,8 @@ class Tick:
                 size = f"[{sizes.get(key, NY)}]" * (key not in ("omega", "suspect"))
                 kind = "int" if key in INTEGERS else "real"
                 lines.append(f"    {kind} {name}{size}; /* {what} */")
+        if "t->c" in used:
+            lines.append("    const real *c; /* the coefficients in use */")
         lines += ["} tick_t;", ""]
         if "t->m" in used:
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]

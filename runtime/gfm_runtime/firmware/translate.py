@@ -657,7 +657,7 @@ class _Body:
         if isinstance(of, tuple | list):
             return _constant(of[at[0].args[0]])
         value = of[tuple(i.args[0] for i in at)]
-        return value if np.ndim(value) else number(value)
+        return value if np.ndim(value) or isinstance(value, Expr) else number(value)
 
     def call(self, node: ast.Call, out: list[Any], alone: bool = False) -> Any:
         values = [self.value(a, out) for a in node.args]

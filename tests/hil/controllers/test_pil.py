@@ -24,7 +24,8 @@ from gfm_hil.engine import setup
 from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
 from gfm_hil.scenario import find_scenario, load_scenario
-from gfm_runtime.firmware import TARGETS
+from gfm_runtime import load_law
+from gfm_runtime.firmware import TARGETS, make_modules
 from gfm_runtime.firmware.check import HARNESS
 from gfm_runtime.signals import FULL_SCALES
 
@@ -303,6 +304,8 @@ print("the machine is on fire", flush=True)
 while request := os.read(to, {asks}):
     if (what := request[0]) == 0:
         {does}
+    elif what == 5:
+        os.write(from_, bytes({size}) + {identification!r})
     else:
         os.read(to, 4096)  # a state, or a golden row of which no word differs
         what == 3 and os.write(from_, bytes({size}))
@@ -325,7 +328,11 @@ def test_a_wrong_answer_is_named(does, reason, tmp_path, monkeypatch):
     machine = tmp_path / "qemu-system-arm"
     asks, size = 4 * (3 + 5 + 5), 4 * (4 + 3 + 3 + 1 + 2)
     does = does.replace("{size}", str(size))
-    machine.write_text(IMPOSTOR.format(python=sys.executable, asks=asks, size=size, does=does))
+    (module,) = make_modules({"0 vsg-2": load_law("vsg-2").laws[0]}, 1e-4, np.float32)
+    text = module.identification(1e-4).encode() + b"\0"
+    machine.write_text(IMPOSTOR.format(
+        python=sys.executable, asks=asks, size=size, does=does, identification=text
+    ))  # fmt: skip
     machine.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     found = run(tmp_path, "m4f")
@@ -375,7 +382,7 @@ def test_a_program_with_other_bits_is_refused_before_tick_0(content, tmp_path, m
             "qemu-system-arm has ended by SIGABRT: qemu: fatal: Lockup: can't escalate 3 to Hard",
         ),
         ("echo no machine; echo for you; exec sleep 60", "for 0.5 s: no machine; for you"),
-        ("yes > from", r"answers a golden row with 175704697, which no law does"),
+        ("yes > from", r"its code is of another law: 'y\ny\n"),
     ],
 )
 def test_what_is_no_such_machine_is_refused_with_what_it_says(does, reason, tmp_path, monkeypatch):

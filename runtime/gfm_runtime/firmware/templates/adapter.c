@@ -103,6 +103,16 @@ static void @P@_do_go_on(int k, const golden_real *counts)
 }
 
 /* @end@ */
+/* @if tuned@ */
+static void @P@_do_tune(int k, int set)
+{
+    static const @P@_gains_t sets[] = {
+        @SETS@
+    };
+    (void)@P@_tune(&@P@_of[k], &sets[set]);
+}
+
+/* @end@ */
 static void @P@_do_spoil(int k, int stage)
 {
 /* @if fixed@ */

@@ -14,11 +14,16 @@ typedef @P@_real real;
 #define T_S @T_S@
 
 /* Value references: 0 is the time; then the inputs (references, measurements), the outputs, the result
- * of the last tick, and where the outputs begin. */
+ * of the last tick, where the outputs begin, and the gains. */
 enum { NREF = @GUARD@_NREF, NY = @GUARD@_NY, NU = @GUARD@_NU };
 
 @FIRST@
-enum { TIME, IN, OUT = IN + NREF + NIN, REASON = OUT + NOUT, START, END = START + NU };
+/* @if tuned@ */
+enum { NGAINS = @GUARD@_NGAINS };
+/* @else@ */
+enum { NGAINS = 0 };
+/* @end@ */
+enum { TIME, IN, OUT = IN + NREF + NIN, REASON = OUT + NOUT, START, GAIN = START + NU, END = GAIN + NGAINS };
 enum { INSTANTIATED, INITIALIZATION, STEPPING };
 
 /* All that changes in an instance. It is copied as a whole, and holds no pointer. */
@@ -27,12 +32,20 @@ typedef struct {
     law_t law;
     real u[NOUT];
     double in[NREF + NIN], start[NU];
+/* @if tuned@ */
+    double gains[NGAINS];
+    int tunes; /* whether they are new */
+/* @end@ */
     double begin, ticks; /* time of tick 0, s, and ticks since */
     int reason, started, mode;
 } state_t;
 
 static const double start_low[] = {@U_LOW@}, start_high[] = {@U_HIGH@};
 
+/* @if tuned@ */
+static const double gain_low[] = {@GAIN_LOW@}, gain_high[] = {@GAIN_HIGH@};
+
+/* @end@ */
 static void reset_state(state_t *s)
 {
     static const double in[] = {@IN_START@}, start[] = {@U_START@};
@@ -44,6 +57,9 @@ static void reset_state(state_t *s)
     for (i = 0; i < NU; i++)
         s->u[i] = (real)start[i];
     @P@_init(&s->law);
+/* @if tuned@ */
+    memcpy(s->gains, &@P@_gains, sizeof s->gains);
+/* @end@ */
 }
 
 static double time_of(const state_t *s)
@@ -81,6 +97,15 @@ static const char *step(state_t *s, double t, double h)
         return "the communication step is not a whole number of ticks of @T_S@ s";
     if (!(fabs(t - time_of(s)) <= 0.5 * T_S))
         return "the communication step does not begin where the last one ended";
+/* @if tuned@ */
+    if (s->tunes) {
+        @P@_gains_t gains;
+        memcpy(&gains, s->gains, sizeof gains);
+        s->tunes = 0;
+        if (@P@_tune(&s->law, &gains) != 0)
+            return "these gains together give no stable law; the old ones stay";
+    }
+/* @end@ */
     for (; n > 0; n -= 1)
         tick(s);
     return NULL;
@@ -91,6 +116,12 @@ static const char *get_number(const state_t *s, unsigned k, double *value)
 {
     if (k >= END || k == REASON)
         return "no real variable has this value reference";
+/* @if tuned@ */
+    if (k >= GAIN) {
+        *value = s->gains[k - GAIN];
+        return NULL;
+    }
+/* @end@ */
     if (k >= START)
         *value = s->start[k - START];
     else if (k >= OUT)
@@ -108,6 +139,16 @@ static const char *set_number(state_t *s, unsigned k, double value)
     }
     if (k < START || k >= END)
         return "no input and no parameter has this value reference";
+/* @if tuned@ */
+    if (k >= GAIN) {
+        k -= GAIN;
+        if (!(value >= gain_low[k] && value <= gain_high[k]))
+            return "a gain is out of its range";
+        s->tunes |= value != s->gains[k];
+        s->gains[k] = value;
+        return NULL;
+    }
+/* @end@ */
     k -= START;
     if (s->mode == STEPPING)
         return "a parameter is set before the end of the initialisation";

@@ -7,6 +7,9 @@
 /* @elif counts@ */
 #include <stdint.h>
 
+/* @elif tuned@ */
+#include <stdint.h>
+
 /* @end@ */
 #ifdef __cplusplus
 extern "C" {
@@ -38,6 +41,21 @@ typedef struct {
 } @P@_counts_t;
 
 /* @end@ */
+/* @if tuned@ */
+/* The law's gains, in the units of its file; a parameter that the file ties to others follows them. */
+typedef struct {
+@GAIN_MEMBERS@
+} @P@_gains_t;
+
+enum { @GUARD@_NGAINS = @N_GAINS@, @GUARD@_NCOEFFICIENTS = @N_COEFFICIENTS@ };
+
+/* What follows from them. */
+typedef struct {
+    @P@_real c[@GUARD@_NCOEFFICIENTS];
+    uint32_t crc;
+} @P@_set_t;
+
+/* @end@ */
 /* One instance. All that changes is in here, so there may be several. Treat it as read-only. */
 typedef struct {
     @P@_real x[@GUARD@_NX];      /* states of the law, scaled */
@@ -56,7 +74,25 @@ typedef struct {
 /* @end@ */
     int reason;                 /* 0, or why it is in the safe state */
     int channel;                /* which signal was the reason, or -1 */
+/* @if tuned@ */
+    @P@_set_t set[2];
+    volatile int active, ready; /* which set is in use, and whether the other one shall be */
+/* @end@ */
 } @P@_t;
+
+/* @if tuned@ */
+/* The gains of the law file. */
+extern const @P@_gains_t @P@_gains;
+
+/* Gives the law other gains, without a bump: the next step or settle takes them, all in one tick. Not
+ * for an interrupt; a step may interrupt it. Returns 0; or k + 1 if gain k is out of range; or
+ * @GUARD@_NGAINS + 1 if the gains together give no stable law: then the old ones stay. init goes back
+ * to the gains of the law file, reset keeps them. */
+int @P@_tune(@P@_t *s, const @P@_gains_t *gains);
+
+/* Whether the coefficients in use are as init or tune has left them, by their CRC-32. */
+int @P@_intact(const @P@_t *s);
+/* @end@ */
 
 /* Makes an instance ready: states 0, the last u as by default in the signal table. */
 void @P@_init(@P@_t *s);

@@ -46,6 +46,9 @@ typedef struct {
         const golden_real *trend@E@, golden_real *bump);
     view_t (*view)(int k);
     void (*spoil)(int k, int stage);
+/* @if tuned@ */
+    void (*tune)(int k, int set);
+/* @end@ */
 /* @if counts@ */
     void (*go_on)(int k, const golden_real *counts);
     void (*align)(int k, const golden_real *y);
@@ -138,7 +141,12 @@ unsigned golden_row(const golden_word row[])
     case 5: /* no number in its stage's */
         laws[law].spoil(k, (int)row[0] == 5);
         break;
-    default:
+    default: /* 6 and more: other gains */
+/* @if tuned@ */
+        if (row[0] >= 6) {
+            laws[law].tune(k, (int)row[0] - 6);
+        }
+/* @end@ */
         break;
     }
     result = laws[law].step(k, ref, y, u);

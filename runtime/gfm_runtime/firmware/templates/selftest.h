@@ -18,7 +18,7 @@ enum { GOLDEN_WORDS = @WORDS@ };
 
 /* One row: the number of words that differ. Rows go in their order; the first row starts anew.
  * row[0] says what comes before the step: 0 nothing, 1 init of the law row[1], 2 a change to it, 3 reset
- * and settle, 4 and 5 an error of memory: NaN in the state of the law, and of its stage.
+ * and settle, 4 and 5 an error of memory: NaN in the state of the law, and of its stage; 6 and more a set of gains.
  * row[2] is what step returns; its inputs follow, then u and the state after the step. */
 unsigned golden_row(const golden_word row[]);
 

@@ -10,8 +10,16 @@ typedef char @P@_shifts_keep_the_sign[(-1 >> 1) == -1 ? 1 : -1];
 #include <limits.h>
 #include <math.h> /* fabs, which is no call, and sqrt */
 #include <stdbool.h>
+/* @if tuned@ */
+#include <string.h>
+/* @end@ */
 
 @GUARDS@
+/* @if tuned@ */
+#if DBL_MANT_DIG != 53
+#error "double is not the IEEE 754 type of 64 bits, in which gains become coefficients"
+#endif
+/* @end@ */
 /* @end@ */
 
 typedef @P@_real real;
@@ -128,10 +136,102 @@ static int out_of_range(const real ref[], const real y[], int *channel)
 }
 /* @end@ */
 
+/* @if tuned@ */
+const @P@_gains_t @P@_gains = @GAINS@;
+
+static uint32_t crc_of(const real c[])
+{
+    const uint32_t none = 0U, polynomial = 0xEDB88320U;
+    uint32_t crc = ~none, words[sizeof(real) / sizeof(uint32_t)];
+    unsigned i, k, bit;
+    for (i = 0; i < @GUARD@_NCOEFFICIENTS; i++) {
+        (void)memcpy((void *)words, (const void *)&c[i], sizeof words);
+        for (k = 0; k < sizeof words / sizeof words[0]; k++) {
+            crc ^= words[k];
+            for (bit = 0; bit < 32U; bit++) {
+                crc = (crc >> 1) ^ ((crc & 1U) != 0U ? polynomial : none);
+            }
+        }
+    }
+    return ~crc;
+}
+
+/* In double, whatever the step has; 0, or what is wrong. */
+static int coefficients(const @P@_gains_t *gains, real c[])
+{
+    int i;
+@GAIN_RANGES@
+@GAIN_STEPS@
+    if (!(@GAINS_HOLD@)) {
+        return @GUARD@_NGAINS + 1;
+    }
+@COEFFICIENTS@
+    for (i = 0; i < @GUARD@_NCOEFFICIENTS; i++) {
+        if (!(c[i] - c[i] == @0@)) {
+            return @GUARD@_NGAINS + 1;
+        }
+    }
+    return 0;
+}
+
+int @P@_tune(@P@_t *s, const @P@_gains_t *gains)
+{
+    real c[@GUARD@_NCOEFFICIENTS];
+    const int why = coefficients(gains, c);
+    if (why == 0) {
+        volatile @P@_set_t *set;
+        int i;
+        s->ready = 0; /* from here on no step changes the set in use */
+        set = &s->set[1 - s->active];
+        for (i = 0; i < @GUARD@_NCOEFFICIENTS; i++) {
+            set->c[i] = c[i];
+        }
+        set->crc = crc_of(c);
+        s->ready = 1;
+    }
+    return why;
+}
+
+int @P@_intact(const @P@_t *s)
+{
+    const @P@_set_t *set = &s->set[s->active];
+    return crc_of(set->c) == set->crc;
+}
+
+/* As a change to another law: to u[k] under the old gains, and on from there. */
+APART
+static void take_gains(@P@_t *s, const real ref[], const real y[])
+{
+    tick_t t;
+    real u[@N_ROWS@];
+    const real *trend = s->trend;
+/* @if stages@ */
+    const real e[2] = {s->stage.e[0], s->stage.e[1]};
+/* @end@ */
+    t.c = s->set[s->active].c;
+    @LOOK@;
+    s->active = 1 - s->active;
+    s->ready = 0;
+    t.c = s->set[s->active].c;
+    @SETTLE@;
+}
+
+/* @end@ */
 void @P@_init(@P@_t *s)
 {
     static const real start[] = {@U_DEFAULT@};
+/* @if tuned@ */
+    static const real first[] = {@FIRST@};
+/* @end@ */
     int i;
+/* @if tuned@ */
+    for (i = 0; i < @GUARD@_NCOEFFICIENTS; i++) {
+        s->set[0].c[i] = first[i];
+    }
+    s->set[0].crc = crc_of(first);
+    s->active = 0;
+    s->ready = 0;
+/* @end@ */
 /* @if stages@ */
     s->stage.e[0] = start[2];
     s->stage.e[1] = @0@;
@@ -204,6 +304,15 @@ int @P@_step(@LAW@@P@_t *s, const real ref[], const real y[], real u[])
 /* @if fixed@ */
     t.ref = ref;
     t.y = y;
+/* @elif tuned@ */
+    if (s->ready != 0) {
+        take_gains(s, ref, y);
+    }
+/* @if counts@ */
+    t->c = s->set[s->active].c;
+/* @else@ */
+    t.c = s->set[s->active].c;
+/* @end@ */
 /* @end@ */
     @OUTPUT@;
 /* @if fixed@ */
@@ -241,6 +350,8 @@ int @P@_look(@LAW@const @P@_t *s, const real ref[], const real y[], real u[])
 /* @if fixed@ */
         t.ref = ref;
         t.y = y;
+/* @elif tuned@ */
+        t.c = s->set[s->active].c;
 /* @end@ */
         @LOOK@;
     }
@@ -269,6 +380,12 @@ int @P@_settle(@LAW@@P@_t *s, const real ref[], const real y[], real u[], const 
 /* @if fixed@ */
         t.ref = ref;
         t.y = y;
+/* @elif tuned@ */
+        if (s->ready != 0) {
+            s->active = 1 - s->active;
+            s->ready = 0;
+        }
+        t.c = s->set[s->active].c;
 /* @end@ */
         @SETTLE@;
     }
