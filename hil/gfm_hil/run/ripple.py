@@ -4,9 +4,13 @@ The ripple of a signal is the peak-to-peak value of its strongest sinusoid, so t
 spread over all frequencies, counts for little. It is judged over the last second, or, if less time
 has passed since the last disturbance, over the second half of that time: what a disturbance set
 going has had as long to die away before. A ripple that has halved since the stretch before, of the
-same length, is dying away, and one that the last half of the stretch does not show was a step. An
-unbalance of the grid, or an unbalanced fault, that is still there explains the even multiples of
-the grid's frequency.
+same length, is dying away, and one that the last half of the stretch does not show was a step.
+
+What repeats in every cycle of the grid is a harmonic and no oscillation. An unbalance of the grid,
+or an unbalanced fault, that is still there explains the even multiples of the grid's frequency. A
+switched bridge explains the multiples of three times that: its three legs do the same a third of a
+cycle apart, so the currents have the orders 3 k + 1 forwards and 3 k - 1 backwards, which p and the
+magnitudes show at 3 k. ``gfmhil waveforms`` shows how large they are.
 """
 
 from collections.abc import Sequence
@@ -70,7 +74,7 @@ def remaining_ripple(
     n = round(span / T_s)
     if span < _LEAST - 0.5 * T_s or n < 20:
         return None
-    explained = _even_multiples(scenario, signals, log, done)
+    explained = _harmonics(scenario, signals, log, done)
     limit = max(
         scenario.expect_ripple, _NOISE * max(scenario.plant.sensors.noise_std.values(), default=0.0)
     )
@@ -102,28 +106,32 @@ def _last_disturbance(scenario: Scenario, log: Sequence[dict[str, Any]], done: i
     return max([*happened, *over], default=-done)
 
 
-def _even_multiples(
+def _harmonics(
     scenario: Scenario, signals: Columns, log: Sequence[dict[str, Any]], done: int
-) -> list[float]:
-    """Frequencies, Hz, that an unbalance in force explains."""
+) -> NDArray[np.float64]:
+    """Frequencies, Hz, that an unbalance in force and a switched bridge explain."""
+    f_g = float(signals["true_omega_g"][done - 1 : done][0]) * nominal_frequency(scenario)
+    orders = [2, 4] if _is_unbalanced(scenario, log) else []
+    if scenario.plant.bridge.kind != "average":
+        orders += range(3, int(0.5 / (scenario.T_s * f_g)) + 1, 3)
+    return f_g * np.array(orders)
+
+
+def _is_unbalanced(scenario: Scenario, log: Sequence[dict[str, Any]]) -> bool:
+    """Whether an unbalance of the grid, or an unbalanced fault, is still there at the end."""
     timed = [
         (e.type, e.at(scenario.T_s))
         for e in scenario.events
         if isinstance(e, GridUnbalance | Fault) and e.duration is not None
     ]
     last = [_last(log, "grid-unbalance"), _last(log, "fault", "fault-clear")]
-    here = [
-        e
-        for e in last
-        if e is not None
+    return any(
+        e is not None
         and e["label"] != _EQUAL
         and not e["label"].startswith("fault")  # of three phases, or cleared
         and (e["event"], e["tick"]) not in timed
-    ]
-    if not here:
-        return []
-    f_g = float(signals["true_omega_g"][done - 1 : done][0]) * nominal_frequency(scenario)
-    return [2 * f_g, 4 * f_g]
+        for e in last
+    )
 
 
 def _last(log: Sequence[dict[str, Any]], *kinds: str) -> dict[str, Any] | None:
@@ -132,7 +140,7 @@ def _last(log: Sequence[dict[str, Any]], *kinds: str) -> dict[str, Any] | None:
 
 
 def _sinusoids(
-    x: NDArray[Any], T_s: float, explained: Sequence[float]
+    x: NDArray[Any], T_s: float, explained: NDArray[np.float64]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Peak-to-peak values and frequencies [Hz], shape (signals,), of the strongest sinusoid in each
     row of x (signals, ticks), beside those of the ``explained`` frequencies."""

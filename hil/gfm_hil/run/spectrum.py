@@ -1,10 +1,9 @@
 """Spectra of currents and voltages between ticks, grouped as IEC 61000-4-7 groups them.
 
 IEC 61000-4-7:2002 with its amendment 1 of 2008: a rectangular window of 10 cycles at 50 Hz, or of
-12 at 60 Hz (clause 4.4.1), whose lines lie 5 Hz apart; harmonic groups and subgroups of them
-(clause 5.5.1); and the distortions THD, THDG and THDS (clause 3.3). The window is synchronous to
-the nominal frequency: of a converter that turns at another one the lines leak, which groups are
-there for.
+12 at 60 Hz, whose lines lie 5 Hz apart; harmonic groups and subgroups of them; and the distortions
+THD, THDG and THDS. The window is synchronous to the nominal frequency: of a converter that turns at
+another one the lines leak, which groups are there for.
 
 The value between two instants is a straight line (a current) or a constant (the voltage of a leg).
 Both are averaged exactly over equal cells; what the averaging takes from a line is known.

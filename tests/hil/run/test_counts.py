@@ -98,6 +98,15 @@ def test_predicted_compensation_keeps_vsg_2_where_dead_time_loses_it(tmp_path):
     assert np.all(harmonics[0] > 5 * harmonics[1])
 
 
+def test_the_shipped_scenario_ends_as_it_expects():
+    """The 22nd harmonic, 1050 Hz in p, which dead time leaves 25 Hz beside the resonance of the
+    filter, is none of its oscillations."""
+    run = gfmhil.run("rig_switched")
+    assert run.status == "completed" and run.summary["unmet"] == []
+    p = np.asarray(run.signals["true_p"])[-5000:]
+    assert 2 * abs(np.mean(p * np.exp(-2j * np.pi * 1050e-4 * np.arange(5000)))) > 0.015
+
+
 def test_the_shipped_scenario_runs_with_either_bridge():
     for bridge in ({"kind": "average"}, {"kind": "two-level", "dead_time_s": 2e-6}):
         run = rig(plant__bridge=bridge, counts="rig-dead-time" if len(bridge) > 1 else "rig")

@@ -79,6 +79,20 @@ def test_an_unbalanced_fault_explains_even_multiples_until_it_is_cleared():
     assert ripple(wave, events=[{**fault, "kind": "LG"}, clear]).oscillates == "p"
 
 
+@pytest.mark.parametrize("kind", ["two-level", "t-type"])
+def test_a_switched_bridge_explains_its_harmonics_and_no_oscillation_beside_them(kind):
+    """Of order 22 forwards, 1100 Hz, a current shows in p at 1050 Hz."""
+    plant = {"bridge": {"kind": kind}}
+    for hertz in (300.0, 1050.0):
+        wave = 0.1 * np.sin(2 * np.pi * hertz * t)
+        assert not ripple(wave, plant=plant).oscillates
+        assert ripple(wave).oscillates == "p"
+        beside = 0.02 * np.sin(2 * np.pi * (hertz - 7.0) * t)
+        found = ripple(wave + beside, plant=plant)
+        assert found.oscillates == "p" and found.hz["p"] == pytest.approx(hertz - 7.0, abs=0.6)
+    assert ripple(0.1 * np.sin(2 * np.pi * 1074.7 * t), plant=plant).oscillates == "p"
+
+
 def test_a_run_is_judged_over_what_follows_its_last_event():
     wave = 0.1 * np.sin(2 * np.pi * 50 * t)
     assert ripple(wave, ticks=12_200).span_s == pytest.approx(0.11)
