@@ -15,7 +15,7 @@ from gfm_hil.core.files import check_empty
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table, shown
 from gfm_hil.scenario import find_scenario, shipped_scenarios
-from gfm_hil.studies.scan import AMPLITUDE, POINTS, WINDOW_S, FrequencyScan
+from gfm_hil.studies.scan import AMPLITUDE, POINTS, SWITCHED_AMPLITUDE, WINDOW_S, FrequencyScan
 from gfm_runtime import grid_names, law_names, tuned_names
 from gfm_runtime.errors import meant
 from gfm_runtime.toml_file import read_toml
@@ -39,8 +39,9 @@ def add(command: argparse.ArgumentParser) -> None:
                          help="highest frequency; 1000 by default")  # fmt: skip
     command.add_argument("--points", type=int, default=POINTS, metavar="N",
                          help=f"frequencies, {POINTS} by default")  # fmt: skip
-    command.add_argument("--amplitude", type=float, default=AMPLITUDE, metavar="A",
-                         help=f"of each tone, p.u. and rad; {AMPLITUDE:g} by default")  # fmt: skip
+    command.add_argument("--amplitude", type=float, metavar="A",
+                         help=f"of each tone, p.u. and rad; {AMPLITUDE:g} by default, "
+                         f"{SWITCHED_AMPLITUDE:g} of a switched bridge")  # fmt: skip
     command.add_argument("--settle", type=float, metavar="S",
                          help="time before each window, s; chosen by default")  # fmt: skip
     command.add_argument("--window", type=float, default=WINDOW_S, metavar="S",

@@ -15,6 +15,12 @@ w' = A w + B s, a window from t_0 of length T has
 Nothing aliases in them, although the samples have images of the injection and of the held commands
 at multiples of the sampling frequency. That the recorded states follow this equation from tick to
 tick is checked: where a limit of the bridge acts, they do not.
+
+The voltage of a switched bridge is no phasor, and that of a law with compare counts is not in its
+commands. There it follows from the states: the voltage which, held over the tick, takes i_f to what
+the next tick has. Of it all but the ripple within the tick is in the sum. A run without tones is
+taken away from the two with them, for what repeats in every cycle may lie on a tone. The tones have
+to be well above a count of the timer, and the ripple keeps the ends of a window apart.
 """
 
 from __future__ import annotations
@@ -39,6 +45,8 @@ from gfm_design.margins.admittance import (
     line_impedance,
     passivity,
 )
+from gfm_design.model.closed_loop import ClosedLoop
+from gfm_design.model.dead_time import with_dead_time
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.run import Run, controlled_by
@@ -55,6 +63,7 @@ Vector = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 POINTS, AMPLITUDE, SETTLE_S, WINDOW_S = 40, 1e-4, 2.0, 0.2
+SWITCHED_AMPLITUDE = 1e-3  # of a bridge whose timer has 10,000 counts in a period
 _PERIODS = 5  # of the slowest tone of a band in its window, at least
 _LINES = 40  # of the profile in a period of the fastest tone of a band, at least
 _MOST_LINES = 90_000  # of a file; a profile may have 100,000
@@ -258,7 +267,7 @@ def measure_admittance(
     start_hz: float = 1.0,
     stop_hz: float = 1000.0,
     points: int = POINTS,
-    amplitude: float = AMPLITUDE,
+    amplitude: float | None = None,
     settle_s: float | None = None,
     window_s: float = WINDOW_S,
     controller_command: Sequence[str] = (),
@@ -271,10 +280,12 @@ def measure_admittance(
             event.
         start_hz, stop_hz, points: the frequencies, evenly apart on a logarithmic axis; each is
             moved to the nearest multiple of the inverse of its window.
-        amplitude: of each tone, p.u. of the grid's voltage, and rad of its angle.
+        amplitude: of each tone, p.u. of the grid's voltage, and rad of its angle. If None it is
+            1e-4, of a switched bridge 1e-3.
         settle_s: how long each band of tones sounds before its window, s. If None, it follows from
             the slowest mode of the linear model, or is 2 s where there is none, and is doubled, up
-            to 60 s, while the two ends of a window differ; noise needs a given one.
+            to 60 s, while the two ends of a window differ; noise needs a given one. Those of a
+            switched bridge always differ, so it is not doubled.
         window_s: least length of a window, s; a longer one averages noise out.
         controller_command: program and arguments of another controller, which runs over the
             scenario's link; it has no model.
@@ -290,7 +301,10 @@ def measure_admittance(
     if not external:
         name, Y_of, slowest = _model(scenario)
     bands = _bands(start_hz, stop_hz, points, scenario.T_s, window_s)
-    given = settle_s is not None
+    switched = scenario.plant.bridge.kind != "average"
+    if amplitude is None:
+        amplitude = SWITCHED_AMPLITUDE if switched else AMPLITUDE
+    given = switched or settle_s is not None
     if settle_s is None:
         settle_s = SETTLE_S
         if slowest is not None:
@@ -306,6 +320,9 @@ def measure_admittance(
             sides.append(spectra)
             name = controlled_by(summary) if external else name
         settled = max(side.ends for side in sides)
+        if switched:
+            without, _ = _inject(scenario, plan, 0.0, "d", external)
+            sides = [side.less(without) for side in sides]
         if given or settled <= _SETTLED:
             break
         if 2.0 * settle_s > _LONGEST_S:
@@ -329,7 +346,8 @@ def _check(scenario: Scenario, external: bool) -> None:
 
 
 def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float]:
-    """The name of the law, its admittance by the linear model, and its slowest mode, 1/s."""
+    """The name of the law, its admittance by the linear model, and its slowest mode, 1/s; with the
+    dead time of a two-level bridge if its describing function takes the loop."""
     try:
         loop, name = scenario_loop(scenario)
     except NoEquilibrium as problem:
@@ -339,6 +357,13 @@ def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float
         raise UserError(
             f"{name} is unstable on this grid: a mode at {worst.frequency_hz:.4g} Hz grows with "
             f"{worst.sigma:.4g} 1/s; nothing can be measured"
+        )
+
+    dead_time = scenario.plant.bridge.dead_time_s
+    if scenario.plant.bridge.kind == "two-level" and dead_time > 0.0 and loop.stage is None:
+        dead = with_dead_time(loop, dead_time)
+        loop = ClosedLoop(
+            dead.plant, loop.law, loop.T_s, loop.u_delay, loop.y_delay, origin=loop.origin
         )
 
     def admittance(hz: Vector) -> Response:
@@ -451,7 +476,17 @@ def _inject(
                 file = Path(place) / f"{axis}-{tick}.csv"
                 np.savetxt(file, part, "%.17g", ",", header="t,omega_g,V_g", comments="")
                 events.append({"type": "grid-profile", "tick": tick, "file": str(file)})
-        kept = {"law", "inner", "T_s", "seed", "references", "plant", "link", "late_policy"}
+        kept = {
+            "law",
+            "inner",
+            "counts",
+            "T_s",
+            "seed",
+            "references",
+            "plant",
+            "link",
+            "late_policy",
+        }
         content = scenario.model_dump(mode="json", exclude_none=True, include=kept)
         content |= {
             "title": f"{scenario.title}: injection along {axis}",
@@ -503,6 +538,11 @@ class _Spectra:
         v, i_o, v_g = np.concatenate(parts, axis=1)
         return cls(v, i_o, v_g, (rest[0], rest[1], rest[2]), ends)
 
+    def less(self, other: _Spectra) -> _Spectra:
+        """These without the coefficients of another run."""
+        v, i_o, v_g = (getattr(self, x) - getattr(other, x) for x in ("v", "i_o", "v_g"))
+        return replace(self, v=v, i_o=i_o, v_g=v_g)
+
 
 @dataclass(frozen=True)
 class _Path:
@@ -517,13 +557,14 @@ class _Path:
     delta: Vector  # angle of the converter's frame, shape (N,), rad
     # of a period: its begin and length, s, and the bridge's and the grid's phasors and speeds,
     # shape (N, 2) each
-    stretches: list[tuple[float, float, Response, Vector]]
+    stretches: list[_Stretch]
     # rates, states, modes, drive: of the circuit, see ``gfm_plant.circuit.Modes``, the rates in
     # that frame and the drive of bridge and grid alone
     rates: Response
     states: Response
     modes: Response
     drive: Response
+    by_states: bool  # whether the bridge's voltage follows from the states
 
     @classmethod
     def of(cls, run: Run) -> _Path:
@@ -539,25 +580,18 @@ class _Path:
         theta = np.concatenate([[0.0], np.cumsum(speed_g[:-1] * T_s)])
         v_g = signals["V_g"] * np.exp(1j * theta)
         delta = signals["delta"] + theta
-        u = {name: _through_dac(signals, name, plant.par[0]) for name in _COMMANDS[1:]}
-        bridge, speed_u = u["E_u"] + 1j * u["E_q"], omega_b * (u["omega_u"] - omega_0)
-        delay, part = scenario.plant.delay.samples, scenario.plant.delay.fraction
-        stretches, angle = [], delta
-        for begin, end, age in ((0.0, part, delay + 1), (part, 1.0, delay)):
-            if end == begin:
-                continue
-            E, speed = np.roll(bridge, age), np.roll(speed_u, age)
-            at = np.column_stack([E * np.exp(1j * angle), v_g * np.exp(1j * speed_g * begin * T_s)])
-            speeds = np.column_stack([speed, speed_g])
-            stretches.append((begin * T_s, (end - begin) * T_s, at, speeds))
-            angle = angle + speed * (end - begin) * T_s
         modes, sources = plant.wiring.modes(frozenset(), None)
         drive = modes.drive[:, [sources.index(plant.wiring.units[0].bridge),
                                 sources.index(GRID_SOURCE)]]  # fmt: skip
         rates, by_w = modes.rates - 1j * steady, modes.modes[:, :3].copy()
         if LINE in plant.wiring.order:  # behind a second inductor, with the same current
             by_w[:, 2] += modes.modes[:, plant.wiring.order.index(LINE)]
-        return cls(T_s, w, v_g, delta, stretches, rates, modes.states[:3], by_w, drive)
+        by_states = scenario.plant.bridge.kind != "average" or "u_cmp_a" in signals
+        if by_states:
+            stretches = _one_stretch(T_s, w, v_g, speed_g, rates, modes.states[0], by_w, drive)
+        else:
+            stretches = _stretches_of(scenario, signals, plant.par[0], delta, v_g, speed_g)
+        return cls(T_s, w, v_g, delta, stretches, rates, modes.states[:3], by_w, drive, by_states)
 
     def angle(self, window: slice) -> float:
         """Mean angle of the converter's frame, rad."""
@@ -566,13 +600,13 @@ class _Path:
     def check(self, window: slice) -> None:
         """Compare each state with what the circuit makes of the one before. Raises UserError: they
         differ: a limit of the bridge acts."""
+        if self.by_states:
+            return
         z = self.w[window] @ self.modes.T
         for _, length, at, speeds in self.stretches:
             z = z * np.exp(self.rates * length)
             for k in range(2):
-                # (e^(j Omega h) - e^(lambda h)) / (j Omega - lambda); no speed is a mode's own rate
-                x = 1j * speeds[window, k, None]
-                gain = (np.exp(x * length) - np.exp(self.rates * length)) / (x - self.rates)
+                gain = _gain(self.rates, speeds[window, k], length)
                 z = z + self.drive[:, k] * gain * at[window, k, None]
         then = self.w[window.start + 1 : window.stop + 1]
         off = float(np.abs(z @ self.states.T - then).max())
@@ -603,6 +637,53 @@ class _Path:
         x = np.array(both).T * np.exp(-1j * self.angle(window))
         plus, minus = x[:, : len(hz)], x[:, len(hz) :].conj()
         return np.stack([(plus + minus) / 2, (plus - minus) / 2j], axis=-1)
+
+
+_Stretch = tuple[float, float, Response, Vector]
+
+
+def _gain(rates: Response, speed: Vector, length: float) -> Response:
+    """What a phasor of a speed, (N,), rad/s, makes of each mode in a time: (e^(j Omega h)
+    - e^(lambda h)) / (j Omega - lambda), shape (N, modes); no speed is a mode's rate."""
+    x = 1j * speed[:, None]
+    return np.asarray((np.exp(x * length) - np.exp(rates * length)) / (x - rates))
+
+
+def _stretches_of(
+    scenario: Scenario, signals: Any, par: Any, delta: Vector, v_g: Response, speed_g: Vector
+) -> list[_Stretch]:
+    """The bridge as its commands are, and the grid; as ``_Path.stretches``."""
+    T_s, omega_b = scenario.T_s, float(par["omega_b"])
+    u = {name: _through_dac(signals, name, par) for name in _COMMANDS[1:]}
+    bridge, speed_u = (
+        u["E_u"] + 1j * u["E_q"],
+        omega_b * (u["omega_u"] - scenario.plant.grid.omega_g),
+    )
+    delay, part = scenario.plant.delay.samples, scenario.plant.delay.fraction
+    stretches, angle = [], delta
+    for begin, end, age in ((0.0, part, delay + 1), (part, 1.0, delay)):
+        if end == begin:
+            continue
+        E, speed = np.roll(bridge, age), np.roll(speed_u, age)
+        at = np.column_stack([E * np.exp(1j * angle), v_g * np.exp(1j * speed_g * begin * T_s)])
+        speeds = np.column_stack([speed, speed_g])
+        stretches.append((begin * T_s, (end - begin) * T_s, at, speeds))
+        angle = angle + speed * (end - begin) * T_s
+    return stretches
+
+
+def _one_stretch(
+    T_s: float, w: Response, v_g: Response, speed_g: Vector, rates: Response, i_f: Response,
+    modes: Response, drive: Response,
+) -> list[_Stretch]:  # fmt: skip
+    """The bridge as the voltage which, held over each tick, takes i_f (a row of ``_Path.states``)
+    to its next value, and the grid; as ``_Path.stretches``. The last tick has none."""
+    z = (w @ modes.T) * np.exp(rates * T_s)
+    z += drive[:, 1] * _gain(rates, speed_g, T_s) * v_g[:, None]
+    by_bridge = i_f @ (drive[:, 0] * _gain(rates, np.zeros(1), T_s)[0])
+    bridge = np.append((w[1:, 0] - (z @ i_f)[:-1]) / by_bridge, 0.0)
+    at = np.column_stack([bridge, v_g])
+    return [(0.0, T_s, at, np.column_stack([np.zeros(len(w)), speed_g]))]
 
 
 def _through_dac(signals: Any, name: str, par: Any) -> Vector:

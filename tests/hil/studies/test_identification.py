@@ -73,6 +73,33 @@ def test_one_percent_from_1_hz_to_1_khz(law, inner):
     assert found.nfp == pytest.approx(found.nfp_model, rel=0.01)
 
 
+def switched(law, bridge, **how):
+    """A scan with a bridge of 10 kHz and 10,000 counts, one sample of delay and real sensors."""
+    plant = {**REAL["plant"], "delay": {"samples": 1}, "dc_source": {"mode": "regulated"}}
+    plant |= {"bridge": {"kind": "two-level", **bridge}, "grid": {}}
+    return gfmhil.scan(law, gfmhil.load_scenario("pref_step", plant=plant), settle_s=2.0, **how)
+
+
+def test_a_switched_bridge_has_the_admittance_of_its_average():
+    """750 Hz is a harmonic of the bridge in this frame, which a run without tones takes away; Y is
+    small there."""
+    found = switched("mimo-gfm", {}, start_hz=50, stop_hz=1000, points=7, window_s=1.0)
+    assert found.amplitude == 1e-3
+    assert found.deviation is not None and found.deviation.max() < 0.04
+    at = switched("mimo-gfm", {}, start_hz=150, stop_hz=750, points=2, window_s=1.0)
+    assert at.deviation is not None and at.deviation.max() < 0.1
+
+
+def test_dead_time_changes_the_admittance_as_its_describing_function_says():
+    """From 60 Hz on it is off by more, but without it all is wrong."""
+    how = {"start_hz": 5, "stop_hz": 40, "points": 5}
+    with_it = switched("mimo-gfm", {"dead_time_s": 2e-6}, **how)
+    without = switched("mimo-gfm", {}, **how)
+    assert with_it.deviation is not None and with_it.deviation.max() < 0.2
+    off = np.linalg.norm(with_it.Y - without.model, axis=(1, 2))
+    assert np.all(off > 0.8 * np.linalg.norm(without.model, axis=(1, 2)))
+
+
 @pytest.mark.full
 def test_judges_other_grids_as_their_poles_do():
     law = gfmhil.Law.load("droop-5").with_inner("cascaded").with_gains("steep", D_p=0.3)
