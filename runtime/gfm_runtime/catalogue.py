@@ -1,8 +1,9 @@
 """The catalogue: every law that ships, one TOML file each in ``gfm_runtime/laws``.
 
 ``laws/tuned`` holds the same laws with the gains that the law comparison found for the paper's
-converter, ``laws/grid`` those for grid codes, with a declared droop of 5 %. They load by name like
-the others, but ``law_names`` does not list them.
+converter, ``laws/grid`` those for grid codes, with a declared droop of 5 %, ``laws/industry`` the
+models that grid operators know by name, for the converter of their own. They load by name like the
+others, but ``law_names`` does not list them.
 """
 
 import contextlib
@@ -78,6 +79,12 @@ def grid_names() -> tuple[str, ...]:
     return _names("grid")
 
 
+@cache
+def industry_names() -> tuple[str, ...]:
+    """Names of the laws that are models of the industry, e.g. ``regfm-a1``."""
+    return _names("industry")
+
+
 def _names(group: str) -> tuple[str, ...]:
     folder = files("gfm_runtime").joinpath("laws", group)
     found = [p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")]
@@ -104,11 +111,11 @@ def law_file(name: str) -> LawFile:
         return read_law_file(name)
     if (shipped := _shipped(name)) is not None:
         return shipped
-    close = meant(name, [*law_names(), *tuned_names(), *grid_names()])
+    close = meant(name, [*law_names(), *tuned_names(), *grid_names(), *industry_names()])
     with contextlib.suppress(OSError, ValueError):  # of what can be no path
         if Path(f"{name}.toml").is_file():
             close = f"; did you mean '{name}.toml'?"
-    known = f"one of {list(law_names())}, or with -tuned or -grid (gfmhil laws --tuned, --grid)"
+    known = f"one of {list(law_names())}, or of gfmhil laws --tuned, --grid, --industry"
     raise LawError(f"law {name!r}", f"unknown{close or ';'} use a .toml file or {known}")
 
 

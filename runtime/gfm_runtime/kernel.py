@@ -18,6 +18,7 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.inner import (
     INNER_NUMBERS,
     NONE,
+    STIFF,
     faded,
     inner_fields,
     inner_state_fields,
@@ -191,7 +192,10 @@ def advance(law, state):
     n = law.n
     for i in range(NU):
         excess = state.now[i] - state.raw[i]
-        if i == 1 and law.inner != NONE:  # the power limiter moves omega_u too
+        if law.inner == STIFF:  # its limits are beside the law's, but for the integrator of E_u
+            if i == 2:
+                excess += state.push
+        elif i == 1 and law.inner != NONE:  # the power limiter moves omega_u too
             excess = state.omega - state.raw[i]
         if excess != 0:
             for j in range(n):

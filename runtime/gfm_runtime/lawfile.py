@@ -375,7 +375,7 @@ def tied(file: LawFile, values: Mapping[str, float]) -> dict[str, float]:
 
 def shipped_law(name: str) -> str | None:
     """The text of a law that ships, whatever its group; None if no law has this name."""
-    for group in ("", "tuned", "grid"):
+    for group in ("", "tuned", "grid", "industry"):
         path = files("gfm_runtime").joinpath("laws", group, f"{name}.toml")
         if re.fullmatch("[a-z0-9-]{1,64}", name) and path.is_file():
             return path.read_text(encoding="utf-8")

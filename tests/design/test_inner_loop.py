@@ -34,7 +34,7 @@ PLANT: dict[str, Any] = {
     "delay": {"samples": 1, "fraction": 0.3},
     "modulation": "space-vector",
 }
-SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance", "dual-sequence")
+SHIPPED = ("virtual-stator", "cascaded", "threshold-impedance", "dual-sequence", "stiff-source")
 #: every block of the stage once with and once without its states
 STAGES = {
     **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},

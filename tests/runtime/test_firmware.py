@@ -363,7 +363,7 @@ def test_the_report_counts_the_operations_of_a_stage_as_by_hand():
         "square_roots": 1 + 1,
         "comparisons": 1 + 1 + 2 + 6,  # limit, modulation, what fades, inputs
     }
-    assert staged["bytes"]["state"] - plain["bytes"]["state"] == 4 * 27  # of all kinds
+    assert staged["bytes"]["state"] - plain["bytes"]["state"] == 4 * 35  # of all kinds
 
 
 # --- refusals ---

@@ -14,7 +14,7 @@ from gfm_runtime.counts import align, measure, modulate
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
 from gfm_runtime.firmware.module import at_rest
-from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, settle
+from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, StiffSource, settle
 from gfm_runtime.inner_file import NO_INNER, inner_names
 from gfm_runtime.kernel import advance_with_inner, look_with_inner
 from gfm_runtime.lawfile import LawFile
@@ -49,6 +49,11 @@ def _staged() -> dict[str, BuiltLaw]:
     for name, law in laws.items():
         if isinstance(law.inner, DualSequence):
             laws[name] = replace(law, inner=law.inner.model_copy(update={"f_seq": 20.0}))
+        elif isinstance(law.inner, StiffSource):  # what a low-pass hides; with and without windows
+            k = PRIORITIES.get(name.split()[1], 0)
+            quick = {"TPf": 0.0, "TQf": 0.0, "Qmax": 0.4, "Qmin": -0.4, "E_max": 1.15, "E_min": 0.5}
+            windows = {"ImaxSS": (0.0, 1.0)[k % 2], "PQFlag": k // 2}
+            laws[name] = replace(law, inner=law.inner.model_copy(update=quick | windows))
     return laws | {"no stage": LAWS["mimo-gfm"]}
 
 

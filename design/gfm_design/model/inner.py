@@ -20,6 +20,7 @@ from gfm_runtime.inner import (
     INNER_NUMBERS,
     DualSequence,
     InnerStage,
+    StiffSource,
     ThresholdImpedance,
     VirtualStator,
     inner_fields,
@@ -111,6 +112,12 @@ def linearise_stage(
     Raises:
         NoEquilibrium: a limit of the stage acts at ``op``.
     """
+    if isinstance(inner, StiffSource):  # the bridge produces E_u itself
+        _check_limits(inner, op, 0.0)
+        none, D_u = np.zeros((0, 0)), np.eye(NU_INNER, NU)
+        B_u, B_y, C = np.zeros((0, NU)), np.zeros((0, NY_INNER)), np.zeros((NU_INNER, 0))
+        D_y, C_pll = np.zeros((NU_INNER, NY_INNER)), np.zeros((1, 0))
+        return LinearStage(none, B_u, B_y, C, D_u, D_y, C_pll, D_y[:1], states=())
     c = np.zeros(1, np.dtype([*INNER_NUMBERS, *inner_fields(np.dtype(float))]))[0]
     pack_inner(inner, c, T_s, omega_b)
     omega_0, dual = float(op.u[1]), isinstance(inner, DualSequence)
@@ -190,6 +197,8 @@ def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
         )
     elif isinstance(inner, ThresholdImpedance) and size > inner.I_thr:
         why = f"the threshold impedance acts: |i| is {size:.4g} p.u., I_thr is {inner.I_thr:g}"
+    elif isinstance(inner, StiffSource) and not inner.rests(e, float(op.y[3])):
+        why = f"a limit of E or q acts: E is {e:.4g} p.u., q {op.y[3]:.4g} p.u."
     elif e > most + _ROUNDING:
         why = f"the limit of modulation acts: |e| is {e:.4g} p.u., m v_dc is {most:.4g}"
     if why:

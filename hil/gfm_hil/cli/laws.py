@@ -1,12 +1,14 @@
-"""gfmhil laws: the catalogue, the inner stages, and one law with its transfer functions."""
+"""gfmhil laws: the catalogue, the inner stages, one law, and laws of a dynamic data file."""
 
 import argparse
 import inspect
 import json
+from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
 
+from gfm_hil.api.dyr import read_dyr
 from gfm_hil.api.law import cell_text
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -16,6 +18,7 @@ from gfm_runtime import (
     DiscreteLaw,
     discretise,
     grid_names,
+    industry_names,
     law_file,
     law_names,
     load_law,
@@ -37,18 +40,32 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--grid", action="store_true", help="those for grid codes, with a droop of 5 %%"
     )
-    show = command.add_subparsers(metavar="show").add_parser(
-        "show", help="one law, with its transfer functions"
+    command.add_argument(
+        "--industry", action="store_true", help="models of the industry: REGFM_A1, REGFM_B1"
     )
+    kinds = command.add_subparsers(metavar="show|import")
+    show = kinds.add_parser("show", help="one law, with its transfer functions")
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
     show.add_argument("--json", action="store_true", help="as JSON, with discrete matrices")
     show.set_defaults(call=call_show)
+    read = kinds.add_parser("import", help="laws of a dynamic data file (.dyr) of PSS/E")
+    read.add_argument("file", help="the file; records REGFMA1 and REGFMB1, others are left out")
+    read.add_argument(
+        "--impedance", type=float, nargs=2, required=True, metavar=("R_e", "X_L"),
+        help="source impedance (ZSORCE of the raw data file), p.u.",
+    )  # fmt: skip
+    read.add_argument("-o", "--out", default=".", metavar="FOLDER", help="for the law files")
+    read.set_defaults(call=call_import)
 
 
 def call(options: argparse.Namespace) -> int:
     rows = []
-    groups = [(options.tuned, tuned_names), (options.grid, grid_names)]
+    groups = [
+        (options.tuned, tuned_names),
+        (options.grid, grid_names),
+        (options.industry, industry_names),
+    ]
     chosen = [names for asked, names in groups if asked] or [law_names]
     for name in (name for names in chosen for name in names()):
         laws, file = load_law(name), law_file(name)
@@ -86,6 +103,13 @@ def call(options: argparse.Namespace) -> int:
     ]
     console.print()
     console.print(Table(("inner stage", "what it is"), stages, text=None))
+    return 0
+
+
+def call_import(options: argparse.Namespace) -> int:
+    for record in read_dyr(options.file):
+        law = record.law(*options.impedance)
+        print(law.save(Path(options.out) / f"{law.name}.toml"))
     return 0
 
 

@@ -66,6 +66,7 @@ _OF_A_TICK = {
     "m": ("m", "measurements that the inner stage uses"),
     "omega": ("omega", "omega_u after the power limiter"),
     "drop": ("drop", "voltage over the threshold impedance"),
+    "push": ("push", "what a stiff source adds to the integrator of E_u"),
     "e_now": ("e", "the bridge's voltage"),
     "suspect": ("suspect", "channel of the A/D that is not plausible, or -1"),
     "phases": ("phases", "what the A/D has read, p.u."),
@@ -172,7 +173,7 @@ class Tick:
         lines = ["typedef struct {"]
         for key, (name, what) in _OF_A_TICK.items():
             if f"t->{name}" in used:
-                size = f"[{sizes.get(key, NY)}]" * (key not in ("omega", "suspect"))
+                size = f"[{sizes.get(key, NY)}]" * (key not in ("omega", "push", "suspect"))
                 kind = "int" if key in INTEGERS else "real"
                 lines.append(f"    {kind} {name}{size}; /* {what} */")
         if "t->c" in used:

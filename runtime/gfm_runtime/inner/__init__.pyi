@@ -5,6 +5,7 @@ from .kinds import (
     KINDS,
     NONE,
     STAGES,
+    STIFF,
     Inner,
     inner_fields,
     pack_inner,
@@ -24,6 +25,7 @@ from .stage import (
     measure_frequency,
     take_measurements,
 )
+from .stiff_source import StiffSource
 from .virtual_stator import VirtualStator
 from .voltage_loop import Cascaded, ThresholdImpedance
 
@@ -36,11 +38,13 @@ __all__ = [
     "PAPER_M",
     "PRIORITIES",
     "STAGES",
+    "STIFF",
     "Cascaded",
     "DualSequence",
     "Inner",
     "InnerStage",
     "PowerLimiter",
+    "StiffSource",
     "ThresholdImpedance",
     "VirtualStator",
     "faded",

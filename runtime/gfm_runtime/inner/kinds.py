@@ -18,6 +18,8 @@ from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
 from gfm_runtime.inner.stage import (
     I_D,
+    I_OD,
+    I_OQ,
     I_Q,
     LEAST_V,
     P_HIGH,
@@ -26,6 +28,7 @@ from gfm_runtime.inner.stage import (
     V_DC,
     V_Q,
     InnerStage,
+    P,
     current_loop,
     faded,
     follow,
@@ -33,6 +36,7 @@ from gfm_runtime.inner.stage import (
     limit_power,
     take_measurements,
 )
+from gfm_runtime.inner.stiff_source import StiffSource, follow_powers, held_voltage, stiff_source
 from gfm_runtime.inner.virtual_stator import VirtualStator, stator
 from gfm_runtime.inner.voltage_loop import (
     Cascaded,
@@ -43,7 +47,8 @@ from gfm_runtime.inner.voltage_loop import (
 from gfm_runtime.signals import NU
 
 Inner = Annotated[
-    VirtualStator | Cascaded | ThresholdImpedance | DualSequence, Field(discriminator="type")
+    VirtualStator | Cascaded | ThresholdImpedance | DualSequence | StiffSource,
+    Field(discriminator="type"),
 ]
 
 STAGES: dict[str, type[InnerStage]] = {
@@ -51,6 +56,7 @@ STAGES: dict[str, type[InnerStage]] = {
 }
 KINDS = {name: code for code, name in enumerate(("none", *STAGES))}
 NONE, STATOR, DUAL = KINDS["none"], KINDS["virtual-stator"], KINDS["dual-sequence"]
+STIFF = KINDS["stiff-source"]
 
 #: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
 INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
@@ -97,17 +103,23 @@ def shape(law, state):
         state.limited = 0
         state.e_now[0], state.e_now[1] = E_d, E_q
     else:
-        if law.P_max < P_HIGH or law.P_min > P_LOW:
-            limit_power(law, state)
+        p = state.m[P]
         follow(law, state)
+        if law.inner == STIFF:
+            follow_powers(law, state)
+            p = state.slow[0]
+        if law.P_max < P_HIGH or law.P_min > P_LOW:
+            limit_power(law, state, p)
         if law.inner == STATOR:
             stator(law, state, E_d, E_q)
             limit_current(law, state)
         elif law.inner == DUAL:
             dual_sequence(law, state, E_d, E_q)
+        elif law.inner == STIFF:
+            stiff_source(law, state)
         else:
             voltage_loop(law, state, E_d, E_q)
-        if law.inner != DUAL:
+        if law.inner != DUAL and law.inner != STIFF:
             current_loop(law, state)
         most = law.m * state.m[V_DC]
         size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
@@ -134,13 +146,17 @@ def settle_inner(law, state, e_d, e_q):
     state.pll[0], state.pll[1] = law.one, 0
     if size > law.least_v:
         state.pll[0], state.pll[1] = m[V_D] / size, m[V_Q] / size
-    state.x_high, state.x_low, state.limited = 0, 0, 0
+    state.x_high, state.x_low, state.limited, state.push = 0, 0, 0, 0
+    state.slow[0], state.slow[1] = m[P], m[V_Q] * m[I_OD] - m[V_D] * m[I_OQ]
+    of = max(size, law.least_v)
+    state.level[1] = (m[V_D] * m[I_OD] + m[V_Q] * m[I_OQ]) / of
+    state.level[0], state.window[0], state.window[1] = size, law.angle_max, -law.angle_max
     for k in range(2):
         state.v_f[k], state.i_f[k], state.i_ref[k] = m[V_D + k], m[I_D + k], m[I_D + k]
-        state.x_c[k] = state.x_v[k] = state.i_n[k] = state.E_n[k] = 0
+        state.x_c[k] = state.x_v[k] = state.i_n[k] = state.E_n[k] = state.x_Q[k] = 0
     state.e[0], state.e[1] = e_d, e_q
     need_d, need_q = state.e[0], state.e[1]  # in the law's own precision
-    if law.inner != NONE:
+    if law.inner != NONE and law.inner != STIFF:
         X = state.omega * law.L_f
         lack_d, lack_q = need_d - m[V_D] + X * m[I_Q], need_q - m[V_Q] - X * m[I_D]
         if law.T_k_ci > 0:
@@ -157,7 +173,10 @@ def settle_inner(law, state, e_d, e_q):
         X = state.omega * law.X_v
         need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
         need_q = m[V_Q] + law.R_v * through_q + X * through_d + state.drop[1]
-    state.away[0], state.away[1] = need_d - state.now[2], need_q
+    E = state.now[2]
+    if law.inner == STIFF:
+        E = held_voltage(law, state)
+    state.away[0], state.away[1] = need_d - E, need_q
     state.E_p[0], state.E_p[1] = need_d, need_q
 
 

@@ -53,6 +53,10 @@ INNER_STATE = (
     ("i_n", 2, "negative sequence of the virtual stator's current"),
     ("E_p", 2, "positive sequence of E"),
     ("E_n", 2, "negative sequence of E"),
+    ("slow", 2, "low-pass filtered P and Q of a stiff source"),
+    ("level", 2, "low-pass filtered V and I_d of a stiff source"),
+    ("x_Q", 2, "integrals of the limits of Q"),
+    ("window", 2, "largest and least angle of E against the PLL, rad"),
 )
 
 
@@ -156,11 +160,15 @@ class InnerStage(TomlTable):
             LawError: the limit does not let the stage rest there.
         """
         i_ref = i if self.k_ci > 0.0 else i + (e - v - 1j * omega * self.L_f * i) / self.k_c
-        if abs(i_ref) > self.I_max:
-            raise LawError(
-                "inner.I_max", f"{self.I_max:g} p.u.: this operating point needs {abs(i_ref):.4g}"
-            )
+        self.check_current(abs(i_ref))
         return v + self.voltage_drop(i, i_o, i_ref, omega)
+
+    def check_current(self, size: float) -> None:
+        """Raise LawError if a steady current of this size, p.u., is beyond the limit."""
+        if size > self.I_max:
+            raise LawError(
+                "inner.I_max", f"{self.I_max:g} p.u.: this operating point needs {size:.4g}"
+            )
 
     def voltage_drop(self, i: complex, i_o: complex, i_ref: complex, omega: float) -> complex:
         """E - v at rest, p.u.; arguments as of ``internal_voltage``, i_ref the current i*."""
@@ -173,6 +181,7 @@ def inner_state_fields(f: np.dtype[Any]) -> list[Any]:
         ("m", f, (9,)),  # measurements of this tick
         ("omega", f),  # omega_u after the power limiter
         ("drop", f, (2,)),  # voltage over the threshold impedance
+        ("push", f),  # what a stiff source adds to the integrator of E_u
         ("e_now", f, (2,)),  # the bridge's voltage of this tick
         *((name, f, (size,)) if size > 1 else (name, f) for name, size, _ in INNER_STATE),
     ]
@@ -209,7 +218,13 @@ def measure_frequency(law, state):
     if size > law.least_v:  # else there is no voltage to follow
         error = error / size
     state.omega_pll += law.T_k_pll * error
-    h = (state.omega_pll + law.k_pll * error - m[OMEGA]) * law.half_turn
+    turn_pll(law, state, (state.omega_pll + law.k_pll * error - m[OMEGA]) * law.half_turn)
+
+
+@inlined
+def turn_pll(law, state, h):
+    """The PLL's phasor a tick later, turned by the angle whose half has the tangent h."""
+    cosine, sine = state.pll[0], state.pll[1]
     # times (1 + j h) / (1 - j h), whose modulus is 1; the root takes the rounding out
     a, b = law.one - h * h, h + h
     turned_d, turned_q = a * cosine - b * sine, a * sine + b * cosine
@@ -218,9 +233,9 @@ def measure_frequency(law, state):
 
 
 @inlined
-def limit_power(law, state):
+def limit_power(law, state, p):
     """omega_u lowered while p is above P_max and raised while it is below P_min, p.u."""
-    over, under = state.m[P] - law.P_max, law.P_min - state.m[P]
+    over, under = p - law.P_max, law.P_min - p
     state.x_high += law.T_k_Pi * over
     if state.x_high < 0:
         state.x_high = 0
