@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree import ElementTree
@@ -18,6 +18,7 @@ from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, ColumnLike, C
 from gfm_hil.recording.run import Run, bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
+from gfm_hil.results.curves import Panel, few_ticks
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
@@ -155,8 +156,8 @@ class Magnitude:
         return np.hypot(self._d[rows], self._q[rows])
 
 
-def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
-    """Shade the times at which a column of 0 and 1 is 1; one artist, read piece by piece."""
+def _limited(t: ColumnLike, x: ColumnLike) -> list[tuple[float, float]]:
+    """From when to when, s, a column of 0 and 1 is 1; read piece by piece."""
     changes, before = [], False
     for first, part in zip(range(0, len(x), PIECE), pieces(x, 0, len(x)), strict=True):
         on = np.concatenate([[before], part == 1])
@@ -165,7 +166,12 @@ def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
     if before:
         changes.append(len(x) - 1)
     edges = [float(t[k : k + 1][0]) for k in changes]
-    spans = [(a, b - a) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
+    """Shade the times at which a column of 0 and 1 is 1; one artist."""
+    spans = [(a, b - a) for a, b in _limited(t, x)]
     if spans:
         shade = axes.broken_barh(
             spans, (0, 1), transform=axes.get_xaxis_transform(), color=COLOURS[4], alpha=0.3, lw=0,
@@ -298,18 +304,22 @@ SIZE_WAVES = (10.5, 6.4)
 SIZE_LAWS = (8.6, 8.2)
 
 
-def draw_signals(
-    figure: Figure, scenario: Scenario, signals: Columns, summary: dict[str, Any]
-) -> list[Axes]:
-    """Fill a figure with the six panels of a run: p, q, frequency, V, v_dc and currents."""
-    axes = _panels(figure, 3, 2)
+class Quantity(NamedTuple):
+    """A panel of a run: its curves by column, each with its colour and label."""
+
+    title: str
+    curves: list[tuple[str, str, str]]
+
+
+def quantities(scenario: Scenario, signals: Columns) -> tuple[list[Quantity], Columns]:
+    """The six panels of a run, p, q, frequency, V, v_dc and currents, and the columns they show."""
     blue, red, green, purple, *_ = COLOURS
     # a regulated source ignores i_u
     i_u = [("u_i_u", green, "i_u")] if scenario.plant.dc_source.mode == "controlled" else []
     inner = [("i_ref", purple, "|i*|")] if {*I_REF} <= signals.keys() else []
     E = "E_law" if "E_law" in signals else "u_E_u"  # with an inner stage u_E_u is e_d
     signals = {**signals, "i_ref": Magnitude(*(signals[n] for n in I_REF))} if inner else signals
-    panels: list[tuple[str, list[tuple[str, str, str]]]] = [
+    panels = [
         ("active power p", [("true_p", blue, "p"), ("ref_P_ref", GREY, "P_ref")]),
         ("reactive power q", [("true_q", blue, "q"), ("ref_Q_ref", GREY, "Q_ref")]),
         ("frequency", [("true_omega_u", blue, "converter"), ("true_omega_g", GREY, "grid")]),
@@ -317,15 +327,50 @@ def draw_signals(
         ("DC voltage v_dc", [("true_v_dc", blue, "v_dc")]),
         ("currents", [("true_i", blue, "|i_dq|"), ("true_i_dc", red, "i_dc"), *inner, *i_u]),
     ]
+    return [Quantity(t, [c for c in curves if c[0] in signals]) for t, curves in panels], signals
+
+
+def draw_signals(
+    figure: Figure, scenario: Scenario, signals: Columns, summary: dict[str, Any]
+) -> list[Axes]:
+    """Fill a figure with the ``quantities`` of a run."""
+    axes = _panels(figure, 3, 2)
     if "limited" in signals:
         _shade(axes[-1], signals["t"], signals["limited"])
-    for a, (title, names) in zip(axes, panels, strict=True):
-        curves = [(signals, n, colour, label) for n, colour, label in names if n in signals]
-        _draw_columns(a, title, names[0][0], scenario, curves)
+    panels, signals = quantities(scenario, signals)
+    for a, (title, named) in zip(axes, panels, strict=True):
+        curves = [(signals, n, colour, label) for n, colour, label in named]
+        _draw_columns(a, title, named[0][0], scenario, curves)
         if len(curves) > 1:
             _legend(a, len(curves) + len(a.collections))
     _mark_run(figure, axes, scenario, summary)
     return axes
+
+
+def panels_of_run(scenario: Scenario, signals: Columns, summary: dict[str, Any]) -> Iterator[Panel]:
+    """The ``quantities`` of a run for a page in which a reader can zoom."""
+    panels, signals = quantities(scenario, signals)
+    t = signals["t"]
+    events = [(float(e["t"]), str(e["label"])) for e in summary["events"]]
+    events += [(float(x["t"]), reason_name(x["reason"])) for x in summary.get("trips", [])]
+    limited = _limited(t, signals["limited"]) if "limited" in signals else []
+    for title, named in panels:
+        shown = TABLE[named[0][0]].shown(nominal_frequency(scenario))
+        at = few_ticks([signals[n] for n, _, _ in named])
+        curves = {label: _at(signals[n], at) * shown.factor for n, _, label in named}
+        yield Panel(
+            f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
+            sorted(events), colours=[colour for _, colour, _ in named],
+            bands=limited if title == "currents" else (),
+        )  # fmt: skip
+
+
+def _at(column: ColumnLike, ticks: NDArray[np.intp]) -> NDArray[Any]:
+    """Values at some ticks, ascending, of a column that is read a piece at a time."""
+    cuts = np.searchsorted(ticks, range(PIECE, len(column) + PIECE, PIECE))
+    parts = np.split(ticks, cuts[:-1])
+    read = [column[k * PIECE : (k + 1) * PIECE][part - k * PIECE] for k, part in enumerate(parts)]
+    return np.concatenate(read).astype(float)
 
 
 def _mark_run(

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.page import inline, write_page
+from gfm_hil.results.curves import PackedCurves, Panel
+from gfm_hil.results.page import inline, plot_script, write_page
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.summary import END_METRICS
@@ -89,7 +90,7 @@ def write_report(run: Run | NetworkRun) -> None:
     network only the figures that they share."""
     # a second of imports, which the sides' processes do without
     from gfm_hil.results.diagram import draw_diagram
-    from gfm_hil.results.figures import draw_comparison, draw_run
+    from gfm_hil.results.figures import draw_comparison, draw_run, panels_of_run
 
     folder, scenario = run.folder, run.scenario
     assert folder is not None
@@ -98,10 +99,16 @@ def write_report(run: Run | NetworkRun) -> None:
         draw_diagram(folder, scenario)
         return
     pictures = draw_run(folder, scenario, run.columns, run.timing, run.summary)
-    _write_page(run, folder, pictures, draw_diagram(folder, scenario))
+    panels = []
+    if "true_p" in run.columns:  # the first picture, as a reader can zoom it
+        pictures = pictures[1:]
+        panels = list(panels_of_run(scenario, run.columns, run.summary))
+    _write_page(run, folder, panels, pictures, draw_diagram(folder, scenario))
 
 
-def _write_page(run: Run, folder: Path, pictures: Sequence[Picture], diagram: Path) -> None:
+def _write_page(
+    run: Run, folder: Path, panels: Sequence[Panel], pictures: Sequence[Picture], diagram: Path
+) -> None:
     summary, scenario = run.summary, run.scenario
     resolved = (folder / "scenario.toml").read_text("utf-8")
     for one in [scenario, *map(scenario.of, scenario.converters)]:
@@ -120,6 +127,9 @@ def _write_page(run: Run, folder: Path, pictures: Sequence[Picture], diagram: Pa
         facts=Table(
             (), [(Cell(name, "head"), value) for name, value in _facts(summary)], text=None
         ),
+        panels=panels,
+        curves=PackedCurves(),
+        script=plot_script(),
         pictures=pictures,
         diagram=inline(diagram),
         events=_events(summary["events"]),

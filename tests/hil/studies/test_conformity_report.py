@@ -1,15 +1,12 @@
 """The report of conformity: first page, figures of the page, PDF with hashes, and what they say of
 limiters."""
 
-import base64
 import hashlib
 import json
 import re
 import sys
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +15,16 @@ import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import Run
+from gfm_hil.results.curves import PackedCurves, Panel
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario
-from gfm_hil.studies.conformity.panels import PackedCurves, Panel, panels_of_run
+from gfm_hil.studies.conformity.panels import panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.verdict import FAIL, PASS, Verdict
 from gfm_runtime.lawfile import shipped_law
 
 from ...support.files import text_of
+from ...support.page import unpacked
 from ...support.processes import wait_for
 from ...support.scope import HAS_BROWSER, Browser
 
@@ -42,25 +41,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asked = ["--law", "droop-3", "--against", str(place / "jump.toml"), "-o", str(place / "out")]
     assert main(["conform", *asked, "--workers", "1", "--quiet"]) == 0
     return place / "out"
-
-
-def unpacked(page: str) -> list[dict[str, Any]]:
-    """The plots of a page with their curves, decoded as its script does."""
-    plots, packed = (
-        re.findall(rf'<script type="[^"]*" id="{name}">(.*?)</script>', page, re.DOTALL)[0]
-        for name in ("plots", "curves")
-    )
-    steps = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<u2").astype(np.int64)
-
-    def curve(first: float, count: float, low: float, high: float) -> np.ndarray:
-        level = np.cumsum(steps[int(first) : int(first + count)]) & 0xFFFF
-        return np.where(level == 0xFFFF, np.nan, low + (high - low) * level / 4094)
-
-    found = json.loads(plots)
-    for plot in found:
-        plot["x"] = curve(*plot["x"])
-        plot["curves"] = {label: curve(*packed) for label, *packed in plot["curves"]}
-    return list(found)
 
 
 def test_the_first_page_says_what_was_judged_and_has_room_to_sign(report):
@@ -165,7 +145,7 @@ def test_a_spike_of_one_tick_stays_in_the_figure():
     assert power.curves["every tick"].max() == 3.0
     assert len(power.x) < 700
     curves = PackedCurves()
-    assert curves.add(power) == 0 and curves.add(Panel("x", p[:0], {}, [], [], (0.0, 1.0))) == 1
+    assert curves.add(power) == 0 and curves.add(Panel("x", p[:0], {}, (0.0, 1.0))) == 1
 
 
 def test_a_clause_is_marked_by_the_part_of_its_window_in_which_a_limiter_acts():

@@ -9,6 +9,16 @@
   const plots = JSON.parse(read("plots"));
   const COLOURS = ["#c9d6e2", "#0072B2"], LEVELS = 4094, NO_VALUE = 0xffff, HEIGHT = 190;
 
+  const abscissa = (first, count, low, step, whole) => {
+    if (!whole) return curve(first, count, low, step);
+    const found = new Array(count);
+    for (let k = 0, ticks = 0; k < count; k++) {
+      ticks += view.getUint16(2 * (first + k), true);
+      found[k] = low + step * ticks;
+    }
+    return found;
+  };
+
   const curve = (first, count, low, high) => {
     const found = new Array(count);
     for (let k = 0, level = 0; k < count; k++) {
@@ -26,13 +36,22 @@
     c.rect(left, top, width, height);
     c.clip();
     c.font = `${10 * px}px system-ui`;
+    c.fillStyle = "#E69F0040";
+    for (const [from, to] of of.bands) c.fillRect(x(from), top, x(to) - x(from), height);
     c.setLineDash([4 * px, 3 * px]);
-    c.strokeStyle = "#888";
-    for (const t of of.events) {
+    c.strokeStyle = c.fillStyle = "#888";
+    c.textAlign = "left";
+    let free = left;
+    for (const [t, label] of of.events) {
       c.beginPath();
       c.moveTo(x(t), top);
       c.lineTo(x(t), top + height);
       c.stroke();
+      const room = c.measureText(label).width + 8 * px, late = x(t) + room > left + width;
+      const from = x(t) - (late ? room : 0);
+      if (from < free) continue;  // it would cover the label before it
+      c.fillText(label, from + 4 * px, top + 10 * px);
+      free = from + room;
     }
     c.lineWidth = 1.5 * px;
     of.limits.forEach(([ts, vs, colour, number], k) => {
@@ -68,7 +87,7 @@
 
   const draw = (place) => {
     const of = plots[place.dataset.plot];
-    const data = [curve(...of.x), ...of.curves.map(([, ...packed]) => curve(...packed))];
+    const data = [abscissa(...of.x), ...of.curves.map(([, ...packed]) => curve(...packed))];
     const limits = of.limits.flatMap(([, vs]) => vs);
     const range = (u, low, high) => {
       low = Math.min(low ?? Infinity, ...limits);
@@ -95,7 +114,7 @@
         { label: of.over },
         ...of.curves.map(([label], k) => ({
           label,
-          stroke: COLOURS[of.curves.length === 1 ? 1 : k],
+          stroke: of.colours[k] ?? COLOURS[of.curves.length === 1 ? 1 : k],
           width: 1.2,
           points: { show: isMeasured(label), size: 5 },
           paths: isMeasured(label) ? () => null : undefined,

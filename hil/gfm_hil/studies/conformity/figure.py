@@ -8,8 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from gfm_hil.core.files import replacing
+from gfm_hil.results.curves import Panel
 from gfm_hil.results.figures import COLOURS, dress, headline
-from gfm_hil.studies.conformity.panels import VERDICT_COLOURS, Mark, Panel
+from gfm_hil.studies.conformity.panels import VERDICT_COLOURS, Mark
 from gfm_hil.studies.conformity.verdict import SIGNS
 
 _LIGHT = "#c9d6e2"
@@ -37,7 +38,7 @@ def draw_panels(path: Path, title: str, panels: Sequence[Panel]) -> None:
             axes.ticklabel_format(axis="y", useOffset=False)
         for k, mark in enumerate(panel.marks):
             _draw_mark(axes, mark, k)
-        for t in panel.events:
+        for t, _ in panel.events:
             axes.axvline(t, color="#888888", lw=0.7, ls=(0, (4, 3)), zorder=0)
         low, high = axes.get_ylim()
         least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise

@@ -1,19 +1,18 @@
 """What the figures of a part show: the judged signals with windows and limits, as few points as
 the eye needs, for the picture and for the page that lets a reader zoom."""
 
-import base64
 import math
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import printed, unit_of
 from gfm_hil.recording.run import Run, nominal_frequency
+from gfm_hil.results.curves import Panel
 from gfm_hil.results.figures import COLOURS
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
 from gfm_hil.studies.conformity.criteria.base import at_connection
@@ -40,8 +39,6 @@ _TITLES = {"p": "active power p", "V": "voltage V", "i": "current", "f_hz": "fre
 # Columns of a curve, each with its least and its largest value: over the whole run, and from
 # before to after each event, where what is judged goes on.
 _COLUMNS, _NEAR, _AROUND_S = 240, 60, (-0.02, 0.3)
-_LEVELS = 4094  # of a curve in a page: steps of a quarter of a thousandth of its height
-_NO_VALUE = 0xFFFF
 
 
 @dataclass(frozen=True)
@@ -58,20 +55,6 @@ class Mark:
     def colour(self) -> str:
         """That of its verdict."""
         return VERDICT_COLOURS.get(self.verdict, OTHER_COLOUR)
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A quantity over time or frequency."""
-
-    title: str  # quantity and unit
-    x: Vector  # s or Hz, ascending, shape (K,)
-    curves: dict[str, Vector]  # by label, shape (K,) each; NaN where there is no value
-    marks: list[Mark]
-    events: list[float]  # s
-    ends: tuple[float, float]  # of the axis
-    over: str = "t [s]"  # the abscissa
-    log: tuple[bool, bool] = (False, False)  # whether abscissa and ordinate are logarithmic
 
 
 class PartFigure(NamedTuple):
@@ -104,8 +87,8 @@ def panels_of_run(run: Run, verdicts: Sequence[Verdict]) -> list[Panel]:
             Panel(
                 f"{_TITLES.get(name, printed(name))} [{unit}]", x,
                 {"every tick": _thin(values, edges), "one-cycle mean": _thin(means, edges)},
-                _marks([(k, v) for k, v in numbered if v.signal == name], factor), events,
-                (0.0, run.scenario.duration),
+                (0.0, run.scenario.duration), [(t, "") for t in events],
+                _marks([(k, v) for k, v in numbered if v.signal == name], factor),
             )
         )  # fmt: skip
     return found
@@ -124,7 +107,8 @@ def panels_of_plot(found: FrequencyScan, verdicts: Sequence[Verdict]) -> list[Pa
         marks = _marks([(k, v) for k, v in enumerate(verdicts, 1) if v.unit == unit], 1.0)
         ends = float(hz[0]), float(hz[-1])
         over = "frequency of the perturbation [Hz]"
-        panels.append(Panel(title, hz, curves, marks, [], ends, over, (True, unit != "°")))
+        log = (True, unit != "°")
+        panels.append(Panel(title, hz, curves, ends, marks=marks, over=over, log=log))
     return panels
 
 
@@ -158,53 +142,3 @@ def _thin(x: Vector, edges: NDArray[np.intp]) -> Vector:
     low, high = np.fmin.reduceat(x, edges), np.fmax.reduceat(x, edges)
     falls = x[np.append(edges[1:], len(x)) - 1] < x[edges]
     return np.column_stack([np.where(falls, high, low), np.where(falls, low, high)]).ravel()
-
-
-class PackedCurves:
-    """The curves of all panels of a page: in ``levels`` of their own height, each as what it
-    changes from point to point, compressed together."""
-
-    def __init__(self) -> None:
-        self.plots = list[dict[str, Any]]()  # one a panel, for the page's script
-        self._parts, self._count = list[bytes](), 0
-
-    def add(self, panel: Panel) -> int:
-        """Take a panel; returns its number in the page."""
-        limits = [
-            [*(np.char.mod("%.5g", z).astype(float).tolist() for z in line), m.colour, m.number]
-            for m in panel.marks
-            for line in m.lines
-        ]
-        bars = [
-            [*m.window, m.colour, m.number]
-            for m in panel.marks
-            if not m.lines and m.window[1] > m.window[0]
-        ]
-        self.plots.append(
-            {
-                "x": self._packed(panel.x),
-                "curves": [[label, *self._packed(y)] for label, y in panel.curves.items()],
-                "limits": limits,
-                "bars": bars,
-                "events": panel.events,
-                "ends": panel.ends,
-                "over": panel.over,
-                "log": panel.log,
-            }
-        )
-        return len(self.plots) - 1
-
-    def _packed(self, x: Vector) -> list[float]:
-        """Where its levels begin, how many there are, and what the least and the largest mean."""
-        known = x[np.isfinite(x)]
-        low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-        level = np.full(len(x), _NO_VALUE)
-        level[np.isfinite(x)] = np.rint((known - low) / ((high - low) or 1.0) * _LEVELS)
-        steps = np.diff(level, prepend=0) & 0xFFFF
-        self._parts.append(steps.astype("<u2").tobytes())
-        self._count += len(x)
-        return [self._count - len(x), len(x), float(f"{low:.6g}"), float(f"{high:.6g}")]
-
-    def packed(self) -> str:
-        """All levels, little-endian, as zlib compresses them, in base 64."""
-        return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode()

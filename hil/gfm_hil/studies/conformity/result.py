@@ -18,12 +18,12 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.realtime.environment import environment
 from gfm_hil.recording.columns import printed
+from gfm_hil.results.curves import PackedCurves
 from gfm_hil.results.page import plot_script, render
 from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.criteria.base import KNOWN, UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
-from gfm_hil.studies.conformity.panels import PackedCurves
 from gfm_hil.studies.conformity.sets import Case
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
