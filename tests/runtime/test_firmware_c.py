@@ -11,12 +11,12 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_runtime import LawError, get_law, load_law
-from gfm_runtime.firmware import CHECKED, FIXED, REALS, STYLES, check, export, golden, make_modules
+from gfm_runtime.firmware import CHECKED, FIXED, REALS, STYLES, check, golden, make_modules
 from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
 from ..support import firmware
-from ..support.firmware import SOME, STAGED, T_S, cc, exported, files_of
+from ..support.firmware import SOME, STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
@@ -112,8 +112,7 @@ def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path):
 @pytest.mark.parametrize("style", STYLES)
 def test_a_change_of_gains_has_the_kernels_bits(tmp_path, style):
     laws = {"vsg-2": get_law("vsg-2"), "softer": get_law("vsg-2", D_p=0.02)}
-    for name, text in export(laws, T_S, "float32", style, files=files_of(laws)).items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
+    exported(tmp_path, "float32", style, of=laws)
     assert [c.differ for c in check(tmp_path, "host")] == [0, 0]
 
 
@@ -234,15 +233,6 @@ def test_the_pages_examples_compile(tmp_path):
         (tmp_path / "example.txt").write_text(called + code)
         done = cc(tmp_path, *STRICT, "-fsyntax-only", "-x", "c", "example.txt")
         assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_cmake_builds_a_folder(folders, tmp_path):
-    folder = folders["float64", "records"]
-    for arguments in (["-S", str(folder), "-B", "build"], ["--build", "build"]):
-        done = cc(tmp_path, *arguments, compiler="cmake")
-        assert done.returncode == 0, done.stdout + done.stderr
-    ran = subprocess.run([tmp_path / "build" / "selftest"], check=False, capture_output=True)
-    assert ran.returncode == 0
 
 
 # --- instances, driven from here ---

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from importlib.metadata import version
+from xml.sax.saxutils import escape
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.counts import COUNTS_STATE
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import written
+from gfm_runtime.firmware.c_text import plain, written
 from gfm_runtime.firmware.check import script
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
@@ -25,6 +27,14 @@ _PROVE = """
 # cmake --build build --target proof
 add_custom_target(proof COMMAND sh ${CMAKE_CURRENT_SOURCE_DIR}/proof/prove.sh)
 """
+#: by file, its template
+_BUILD_FILES = {
+    "CMakeLists.txt": "CMakeLists.txt",
+    "zephyr/module.yml": "zephyr.yml",
+    "zephyr/Kconfig": "Kconfig",
+    "zephyr/CMakeLists.txt": "zephyr.cmake",
+    "gfmhil.gfm.pdsc": "gfmhil.gfm.pdsc",
+}
 
 
 def export(
@@ -70,6 +80,8 @@ def export(
         own = [by_name[name] for name in stage_names(one)]
         choosing |= schedule_sources(one, own, T_s, omega_b, style)
     rows = golden(modules, SHIPPED)
+    built = _build_files(modules, style, choosing)
+    built["CMakeLists.txt"] += _PROVE * fixed
     return {
         **sources(modules, T_s, style),
         **choosing,
@@ -77,7 +89,7 @@ def export(
         "golden.h": _golden_header(rows),
         "golden.csv": rows.csv(),
         **({"proof/prove.sh": script(modules)} if fixed else {}),
-        "CMakeLists.txt": _cmake(modules, style, choosing) + _PROVE * fixed,
+        **built,
         **reports(modules, T_s, style),
     }
 
@@ -156,10 +168,24 @@ static const uint{bits}_t golden[][{len(rows.columns)}] = {{
 """
 
 
-def _cmake(modules: Sequence[Module], style: Style, choosing: Collection[str]) -> str:
+def _build_files(
+    modules: Sequence[Module], style: Style, choosing: Collection[str]
+) -> dict[str, str]:
+    """For CMake and ESP-IDF, for Zephyr, and a description as a CMSIS pack."""
     names = [f"{m.prefix}.c" for m in modules] + ["gfm.c"] * (style == "records")
     names += [file for file in choosing if file.endswith(".c")]
-    root = bool(choosing) or style == "records"  # whether a step takes a square root
+    headers = [f"{name.removesuffix('.c')}.h" for name in names]
+    root = bool(choosing) or style != "unrolled"  # whether the code takes a square root
     root = root or any(not m.fixed and (m.stages or m.tick.operations()["sqrt"]) for m in modules)
-    keys = {"MADE": MADE, "SOURCES": " ".join(names), "LIBM": " m" if root else ""}
-    return written("CMakeLists.txt", keys)
+    kinds = [("header", name) for name in headers] + [("source", name) for name in names]
+    keys = {
+        "MADE": MADE,
+        "VERSION": version("gfmhil"),
+        "SOURCES": " ".join(names),
+        "HEADERS": " ".join(headers),
+        "ZEPHYR_SOURCES": " ".join(f"../{name}" for name in names),
+        "FILES": "\n".join(f'        <file category="{k}" name="{n}" />' for k, n in kinds),
+        "LIBM": "target_link_libraries(gfm PUBLIC m)\n" if root else "",
+        "LAWS": escape(", ".join(plain(m.name) for m in modules)),
+    }
+    return {file: written(template, keys) for file, template in _BUILD_FILES.items()}
