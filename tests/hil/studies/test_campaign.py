@@ -337,3 +337,21 @@ def test_checks_that_take_long_show_how_far_they_are(file, capsys, monkeypatch, 
     main(["campaign", *wrong, "--quiet"])
     assert "checking" not in capsys.readouterr().err
     attack_now(f"after a second a bar or a line says how many of the {len(seen)} checks are done")
+
+
+def test_dead_time_and_drops_of_a_switched_bridge_are_drawn():
+    """On nominal chokes VSG-2 bears no dead time from 2 us on, MIMO-GFM does."""
+    draws = [
+        {"path": "plant.bridge.dead_time_s", "type": "uniform", "low": 2e-6, "high": 3e-6},
+        {"path": "plant.bridge.V_switch", "also": ["plant.bridge.V_diode"], "type": "uniform",
+         "low": 0.5, "high": 1.5},
+    ]  # fmt: skip
+    content = {
+        "title": "bridges", "scenario": "rig_switched", "laws": ["mimo-gfm", "vsg-2"], "runs": 2,
+        "set": {"counts": "none"}, "draw": draws,
+    }  # fmt: skip
+    campaign = load_campaign(content)
+    records = run_chunk(campaign, [(run, law) for law in campaign.laws for run in (0, 1)])
+    assert [one["status"] == "tripped" for one in records] == [False, False, True, True]
+    drops = [one["drawn"]["plant.bridge.V_switch"] for one in records]
+    assert len(set(drops)) == 2 and 0.5 < min(drops) < max(drops) < 1.5
