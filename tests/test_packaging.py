@@ -30,7 +30,7 @@ FOLDERS = {
 RUNTIME_NEEDS = {"numpy", "numba", "llvmlite", "lazy_loader"}
 # The reader of law files, which the loop does not use (pydantic_core is a part of pydantic).
 _FILES = ("lawfile", "mistakes", "inner_file", "expressions", "law", "shipped", "toml_file")
-_STAGES = ("dual_sequence", "kinds", "stage", "virtual_stator", "voltage_loop")  # their options
+_STAGES = [p.stem for p in (FOLDERS["gfm_runtime"] / "inner").glob("*.py")]  # their options
 _COUNTS = ("measure", "modulate", "pair")  # likewise
 BESIDE_THE_LOOP = {
     **{f"{name}.py": {"pydantic", "pydantic_core"} for name in (*_FILES, *_STAGES, *_COUNTS)},
