@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.curves import PackedCurves, Panel
+from gfm_hil.results.curves import POINTS, PackedCurves, Panel
 from gfm_hil.results.page import inline, plot_script, write_page
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.network_run import NetworkRun
@@ -128,6 +128,8 @@ def _write_page(
             (), [(Cell(name, "head"), value) for name, value in _facts(summary)], text=None
         ),
         panels=panels,
+        ticks=summary["ticks"],
+        points=POINTS,
         curves=PackedCurves(),
         script=plot_script(),
         pictures=pictures,

@@ -73,6 +73,7 @@ def test_the_report_of_a_run_holds_its_curves(report):
     run, page = gfmhil.load_run(report.parent), report.read_text("utf-8")
     plots = unpacked(page)
     assert len(page) < 1_000_000 and len(plots) == 6
+    assert "at most 16,000 of the 100,000 ticks" in page
     ticks = np.rint(plots[0]["x"] / 1e-4).astype(int)
     p = np.asarray(run.signals["true_p"])
     assert plots[0]["curves"]["p"] == pytest.approx(p[ticks], abs=np.ptp(p) / 4094)
