@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import PIECE, ColumnLike, pieces
+from gfm_hil.recording.columns import ColumnLike, pieces
 
 Vector = NDArray[np.float64]
 POINTS = 16_000  # most of a panel
 _NEAR = 5e-4  # of the height of its curve: how close the straight lines between points come
 _LEVELS = 4094  # steps of a quarter of a thousandth of a curve's height
 _NO_VALUE = 0xFFFF
+_PIECE = 1 << 16  # ticks whose points are chosen together; all arrays for it take some 5 MB
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,14 @@ def few_ticks(columns: Sequence[ColumnLike], most: int = POINTS) -> NDArray[np.i
     turn, until none misses by ``_NEAR`` of the curve's height or there are ``most`` ticks.
 
     Args:
-        columns: of the same length, read a piece at a time; NaN counts as 0.
+        columns: of the same length, read a piece at a time; NaN counts as 0. Each piece has its
+            share of the ticks.
     """
     ticks = len(columns[0])
     heights = np.array([_height(column) for column in columns])[:, None]
     found = [np.zeros(0, np.intp)]
-    for first in range(0, ticks, PIECE):
-        piece = np.stack([column[first : first + PIECE] for column in columns])
+    for first in range(0, ticks, _PIECE):
+        piece = np.stack([column[first : first + _PIECE] for column in columns], dtype=float)
         found.append(first + _split(piece, heights, most / ticks))
     return np.concatenate(found)
 
@@ -63,21 +65,25 @@ def _height(column: ColumnLike) -> float:
 
 
 def _split(piece: NDArray[Any], heights: NDArray[Any], share: float) -> NDArray[np.intp]:
-    """``few_ticks`` of a piece, shape (curves, ticks)."""
-    values = np.nan_to_num(piece / heights, posinf=0.0, neginf=0.0)
-    every = np.arange(values.shape[1])
+    """``few_ticks`` of a piece, shape (curves, ticks), which it divides by the heights."""
+    piece /= heights
+    np.nan_to_num(piece, copy=False, posinf=0.0, neginf=0.0)
+    every = np.arange(piece.shape[1], dtype=float)
     most = max(2, round(share * len(every)))
-    stretch = -(-4 * len(values) * len(every) // most)
-    padded = np.pad(values, ((0, 0), (0, -len(every) % stretch)), "edge")
-    stretches = padded.reshape(len(values), -1, stretch)
-    starts = np.arange(stretches.shape[1]) * stretch
-    ends = [(starts + at(stretches, axis=2)).ravel() for at in (np.argmin, np.argmax)]
-    kept = np.unique(np.concatenate([[0, len(every) - 1], *ends]))
+    stretch = -(-4 * len(piece) * len(every) // most)
+    ends = [np.array([0, len(every) - 1])]
+    for curve in piece:
+        stretches = np.pad(curve, (0, -len(curve) % stretch), "edge").reshape(-1, stretch)
+        starts = np.arange(len(stretches)) * stretch
+        ends += [starts + stretches.argmin(axis=1), starts + stretches.argmax(axis=1)]
+    kept = np.unique(np.concatenate(ends))
     while len(kept) > 1:
-        lines = np.stack([np.interp(every, kept, curve[kept]) for curve in values])
-        missed = np.abs(values - lines).max(axis=0)[:-1]
-        worst = np.maximum.reduceat(missed, kept[:-1])
-        at = np.flatnonzero((missed == np.repeat(worst, np.diff(kept))) & (missed > _NEAR))
+        missed = np.zeros(len(every))
+        for curve in piece:
+            line = np.interp(every, kept, curve[kept])
+            np.maximum(missed, np.abs(np.subtract(curve, line, out=line), out=line), out=missed)
+        worst = np.repeat(np.maximum.reduceat(missed[:-1], kept[:-1]), np.diff(kept))
+        at = np.flatnonzero((missed[:-1] == worst) & (worst > _NEAR))
         at = at[np.unique(np.searchsorted(kept, at, "right"), return_index=True)[1]]
         room = most - len(kept)
         if not len(at) or room <= 0:

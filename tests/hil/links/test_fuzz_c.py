@@ -196,7 +196,8 @@ def test_fuzzing_the_program_of_a_processor_in_the_loop_finds_nothing(tmp_path, 
     }  # fmt: skip
     modules = make_modules(of, T_S, real)
     texts = {**sources(modules, T_S, "unrolled"), **selftest(modules, "unrolled")}
-    texts |= {"states.h": _states(modules), "pil.c": HARNESS.joinpath("loop.c").read_text()}
+    size = 1 + max(len(m.identification(T_S)) for m in modules)
+    texts |= {"states.h": _states(modules, size), "pil.c": HARNESS.joinpath("loop.c").read_text()}
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     for name in ("board.h", "loop.c"):

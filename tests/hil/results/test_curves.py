@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gfmhil
-from gfm_hil.recording.columns import PIECE
-from gfm_hil.results.curves import PackedCurves, Panel, few_ticks
+from gfm_hil.results.curves import _PIECE, PackedCurves, Panel, few_ticks
 
 from ...support.page import unpacked
 from ...support.processes import wait_for
@@ -38,7 +37,7 @@ def test_no_spike_is_lost_where_there_are_too_many_ticks(seed, curves):
     assert (noise[:, at].min(axis=1) == noise.min(axis=1)).all()
 
 
-@pytest.mark.parametrize("ticks", [0, 1, 2, 5, PIECE + 1])
+@pytest.mark.parametrize("ticks", [0, 1, 2, 5, _PIECE + 1])
 def test_runs_of_any_length(ticks):
     x = np.sin(np.arange(ticks))
     at = few_ticks([x, np.full(ticks, np.nan)], 100)
