@@ -39,6 +39,7 @@ from gfm_hil.studies.conformity.sets import (
     scaled,
     scenario_of,
     shipped_sets,
+    under_test_file,
 )
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
@@ -1215,3 +1216,16 @@ def test_the_list_is_also_json(capsys):
     listed = json.loads(capsys.readouterr().out)
     assert [row["test"] for row in listed] == [case.id for case in load_cases(chosen)]
     assert all(row["runs"] > 0 and row["title"] and row["source"] for row in listed)
+
+
+def test_a_converter_under_test_may_switch(tmp_path):
+    """Its file says so; the pulses of the bridge take the place of the fraction of a sample."""
+    shipped = under_test_file(None).read_text(encoding="utf-8")
+    text = shipped.replace("fraction = 0.3\n", "").replace(
+        "[plant]\n", '[plant]\nbridge = { kind = "two-level", dead_time_s = 1e-6 }\n'
+    )
+    (tmp_path / "switched.toml").write_text(text, encoding="utf-8")
+    found = gfmhil.conform(
+        ["mimo-gfm-practical"], ["miso/4-scr-steps"], converter=tmp_path / "switched.toml"
+    )
+    assert found.under.plant.bridge.kind == "two-level" and found.verdict == "pass"
