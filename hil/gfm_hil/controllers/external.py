@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from gfm_hil.controllers.ports import PortWiring, Vector
 from gfm_hil.core.errors import UserError
 from gfm_plant import Bases
-from gfm_runtime.signals import COUNTS
 
 if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
@@ -109,13 +108,8 @@ def refuse_source(text: str) -> None:
 
 def check_currents(text: str, inner: int) -> None:
     """Check that a run carries what a controller takes, see ``Scenario.carries``. Raises UserError:
-    ``text`` is ``c:FILE``, and the run has counts or no inner stage."""
+    ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
-    if text.startswith("c:") and inner == COUNTS:
-        raise UserError(
-            f"controller {text}: takes voltages and currents, and the scenario's laws counts of an"
-            " A/D; set counts = 'none'"
-        )
     if text.startswith("c:") and not inner:
         raise UserError(
             f"controller {text}: measures currents, which only a run with an inner stage carries: "

@@ -2,7 +2,8 @@
  *
  * All values are in SI units and instantaneous. A phase voltage is against the star point, without a
  * common mode. The bench calls from one thread; several controllers may live in one process.
- * Everything but gfmhil_fault must be there.
+ * gfmhil_fault may be left out, and one of gfmhil_step and gfmhil_isr: a run whose laws read counts of
+ * an A/D calls gfmhil_isr, any other gfmhil_step.
  */
 #ifndef GFMHIL_CONTROLLER_H
 #define GFMHIL_CONTROLLER_H
@@ -58,6 +59,13 @@ int gfmhil_start(void *controller, const gfmhil_input *in, const gfmhil_output *
 
 /* One period. Returns as gfmhil_start; out holds what the last call left there. */
 int gfmhil_step(void *controller, const gfmhil_input *in, gfmhil_output *out);
+
+/* One period from pin to pin: counts of the A/D in, of v_dc and of the phases a, b, c of i, v and i_o,
+ * sampled where the carrier is at its lower end; compare counts of the legs a, b, c out, in counts of the
+ * timer of the run's bridge, which act one period later. in has t and what the operator asks for; its
+ * measurements are 0. Of out only i_dc is read. Returns as gfmhil_start. */
+int gfmhil_isr(void *controller, const gfmhil_input *in, const unsigned short adc[10],
+               gfmhil_output *out, unsigned short cmp[3]);
 
 /* What such a number means, or NULL. May be left out. */
 const char *gfmhil_fault(void *controller, int number);

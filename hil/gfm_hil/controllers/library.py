@@ -4,13 +4,15 @@ It measures and commands three-phase voltages and currents in V and A, as firmwa
 works in a dq frame whose speed omega_u the controller commands. This adapter commands the speed of
 the start for ever, so that the frame's angle is known, and turns everything into that frame and out
 of it. The bridge's voltage stays where it is in space until the next call, as that of a modulator
-does: each tick it is turned back in the frame by what the frame turns.
+does: each tick it is turned back in the frame by what the frame turns. In a run with counts it gets
+those of the A/D and gives compare counts, which have no frame.
 """
 
 import cmath
 import ctypes as c
 import math
 from pathlib import Path
+from typing import Any
 
 from gfm_hil.controllers.external import (
     BenchContext,
@@ -22,11 +24,12 @@ from gfm_hil.controllers.external import (
 )
 from gfm_hil.controllers.ports import PortMap, Vector
 from gfm_hil.core.errors import UserError
-from gfm_runtime.signals import carried, names
+from gfm_runtime.signals import COUNTS, N_ADC, N_LEGS, NU_INNER, carried, names
 
 VERSION = 1
-_NEEDED = ("version", "name", "new", "start", "step", "free")
+_NEEDED = ("version", "name", "new", "start", "free")
 _Phases = c.c_double * 3
+_Adc, _Compare = c.c_uint16 * N_ADC, c.c_uint16 * N_LEGS
 _A = cmath.exp(2j * math.pi / 3)
 
 
@@ -71,7 +74,8 @@ class LibraryController(ExternalController):
         self._of = _loaded(path)
         said = self._of.gfmhil_name()
         self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
-        self._context = context
+        self._context, self._counts = context, context.inner == COUNTS
+        _check_step(self._of, path, self._counts)
         self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
         bases = context.bases
         self._phase_V = bases.V_n * math.sqrt(2.0 / 3.0)
@@ -91,6 +95,7 @@ class LibraryController(ExternalController):
                 f" {offered} (SI units; step_s in the map file sets the period)"
             )
         self._in, self._out = _ControllerInput(), _ControllerOutput()
+        self._adc, self._compare = _Adc(), _Compare()
         self._ticks, self._speed = 0, 1.0
         y = {name: k for k, name in enumerate(carried("y", True))}
         self._pairs = {
@@ -102,20 +107,29 @@ class LibraryController(ExternalController):
     def start(self, u: Vector) -> None:
         # the library starts at the first tick, with measurements
         self._ticks, self._speed = 0, float(u[1])
+        self._rests = u[:NU_INNER].copy()
         self._now(complex(u[2], u[3]), float(u[0]))
 
     def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
         if self._ticks % self._every == 0:
             self._measure(ref, y)
             if self._ticks == 0:
-                self._call("gfmhil_start")
-            self._call("gfmhil_step")
+                self._call("gfmhil_start", self._in, self._out)
+            if self._counts:
+                self._adc[:] = [int(count) for count in y[-N_ADC:]]
+                self._call("gfmhil_isr", self._in, self._adc, self._out, self._compare)
+            else:
+                self._call("gfmhil_step", self._in, self._out)
+        self._ticks += 1
+        if self._counts:
+            u[:NU_INNER], u[NU_INNER:] = self._rests, self._compare
+            u[0] = self._out.i_dc / self._dc_A
+            return
         held = sum(e * turn for e, turn in zip(self._out.e, (1.0, _A, _A**2), strict=True)) * 2 / 3
         # middle of this tick's share of the time for which e acts
-        acts = self._angle(self._ticks + self._context.delay + 0.5)
+        acts = self._angle(self._ticks + self._context.delay - 0.5)
         e = held * cmath.exp(-1j * acts) / self._phase_V
         u[:] = self._out.i_dc / self._dc_A, self._speed, e.real, e.imag
-        self._ticks += 1
 
     def close(self) -> None:
         self._of.gfmhil_free(self._self)
@@ -136,10 +150,11 @@ class LibraryController(ExternalController):
     def _measure(self, ref: Vector, y: Vector) -> None:
         bases, turn = self._context.bases, cmath.exp(1j * self._angle(self._ticks))
         self._in.t = self._ticks * self._context.T_s
-        for name, (d, q) in self._pairs.items():
-            base = self._phase_V if name == "v" else self._phase_A
-            getattr(self._in, name)[:] = _phases(complex(y[d], y[q]) * turn * base)
-        self._in.v_dc = y[self._v_dc] * bases.V_dcref
+        if not self._counts:
+            for name, (d, q) in self._pairs.items():
+                base = self._phase_V if name == "v" else self._phase_A
+                getattr(self._in, name)[:] = _phases(complex(y[d], y[q]) * turn * base)
+            self._in.v_dc = y[self._v_dc] * bases.V_dcref
         for field, name, base in (
             ("P_ref", "P_ref", bases.S_n),
             ("Q_ref", "Q_ref", bases.S_n),
@@ -149,8 +164,8 @@ class LibraryController(ExternalController):
         ):
             setattr(self._in, field, ref[self._ref[name]] * base)
 
-    def _call(self, name: str) -> None:
-        number = getattr(self._of, name)(self._self, c.byref(self._in), c.byref(self._out))
+    def _call(self, name: str, *given_to: Any) -> None:
+        number = getattr(self._of, name)(self._self, *map(c.byref, given_to))
         if number:
             said = None
             if hasattr(self._of, "gfmhil_fault"):
@@ -164,6 +179,17 @@ class LibraryController(ExternalController):
                 raise ControllerError(
                     f"{self.name}: out->{field} = {value} at t = {self._in.t:g} s"
                 )
+
+
+def _check_step(of: c.CDLL, path: Path, counts: bool) -> None:
+    if counts and not hasattr(of, "gfmhil_isr"):
+        raise UserError(
+            f"{path}: has no function gfmhil_isr, and the scenario's laws read counts of an A/D: "
+            "write it, see gfmhil_controller.h, or set counts = 'none'"
+        )
+    if not counts and not hasattr(of, "gfmhil_step"):
+        other = "; for its gfmhil_isr set counts = 'rig'" if hasattr(of, "gfmhil_isr") else ""
+        raise UserError(f"{path}: has no function gfmhil_step; see gfmhil_controller.h{other}")
 
 
 def _phases(space: complex) -> tuple[float, float, float]:
@@ -191,7 +217,12 @@ def _loaded(path: Path) -> c.CDLL:
     of.gfmhil_name.restype = c.c_char_p
     of.gfmhil_new.restype = c.c_void_p
     given = (c.c_void_p, c.POINTER(_ControllerInput), c.POINTER(_ControllerOutput))
-    of.gfmhil_start.argtypes = of.gfmhil_step.argtypes = given
+    of.gfmhil_start.argtypes = given
+    if hasattr(of, "gfmhil_step"):
+        of.gfmhil_step.argtypes = given
+    if hasattr(of, "gfmhil_isr"):
+        pins = c.POINTER(_Adc), given[2], c.POINTER(_Compare)
+        of.gfmhil_isr.argtypes = (*given[:2], *pins)
     of.gfmhil_free.argtypes = (c.c_void_p,)
     of.gfmhil_free.restype = None
     return of

@@ -19,7 +19,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.priority import processors
 from gfm_hil.recording.run import Run
 from gfm_plant import Bases
-from gfm_runtime.signals import carried
+from gfm_runtime.signals import COUNTS, carried
 
 from ...support.files import text_of
 from ...support.firmware import STRICT, cc
@@ -111,6 +111,7 @@ def test_phases_are_those_of_the_turning_frame(step_ticks, delay, tmp_path, monk
     ("rig", "ports", "message"),
     [
         (BenchContext(inner=False), PortMap(), "choose --inner virtual-stator"),
+        (BenchContext(inner=COUNTS), PortMap(), "no function gfmhil_isr, and the scenario's laws"),
         (BenchContext(inner=True), PortMap(blocks="x"), "of a map it takes step_s only"),
         (BenchContext(inner=True), PortMap(step_s=1.5e-4), "must be a multiple of the run's T_s"),
     ],
