@@ -22,7 +22,7 @@ from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant,
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
 from gfm_plant.wiring import ConverterCircuit, Wiring
-from gfm_runtime.signals import CHANNELS, SPACE_VECTOR
+from gfm_runtime.signals import CHANNELS, COUNT_BITS, SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
@@ -148,6 +148,9 @@ def _make(
     if grid.finite is not None and grid_node is not None:
         dynamic.append(("plant.grid.finite", "", grid.finite))
     carriers, updates = _carrier(converters, T_s)
+    conversions = int(max(par["phase_samples"]))
+    if (par["phase_samples"] != conversions).any():
+        raise ValueError("phases.samples: must be the same for all converters of a network")
     if carriers and dynamic:
         raise ValueError(
             f"{dynamic[0][0]}: cannot be beside a switched bridge yet; set bridge.kind = 'average'"
@@ -160,7 +163,8 @@ def _make(
     now["unit"] = now["sequence"][:, 0] = 1.0
     st["sensed"][:, 0] = 1.0
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
-    st["phase_seen"] = math.nan
+    st["phase_seen"] = st["phase_sums"] = math.nan
+    network.net["conversions"] = conversions
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
@@ -412,9 +416,14 @@ def _pack_phases(par: Record, phases: Phases, T_s: float) -> None:
     par["phase_lo"] = [low for low, _ in ends]
     par["phase_lsb"] = [(high - low) / 2**phases.bits for low, high in ends]
     par["phase_top"] = 2**phases.bits - 1
-    par["phase_weights"] = 0.0, 0.0, 1.0
+    par["phase_samples"], par["phase_weights"] = phases.samples, (0.0, 0.0, 1.0)
+    if phases.samples << phases.bits > 1 << COUNT_BITS:
+        raise ValueError(
+            f"plant.phases.samples = {phases.samples}: their sum must fit {COUNT_BITS} bits, so "
+            f"with bits = {phases.bits} at most {1 << COUNT_BITS - phases.bits}"
+        )
     if phases.bandwidth_hz is not None:
-        x = 2 * math.pi * phases.bandwidth_hz * T_s
+        x = 2 * math.pi * phases.bandwidth_hz * T_s / phases.samples
         mean = -math.expm1(-x) / x
         par["phase_weights"] = math.exp(-x), mean - math.exp(-x), 1.0 - mean
     for name, skew in phases.skew_s.items():

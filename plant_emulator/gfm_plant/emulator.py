@@ -17,6 +17,7 @@ from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.period import go_back, keep, length, stretch
+from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
@@ -107,8 +108,12 @@ def plant_step(plant: PlantRecords) -> None:
     keep(plant)
     if field(n, "unbalanced")[circuit(n, now)]:
         mirror_sources(n, now, plant.st[0].tick)
+    for k in range(n.n_converters):
+        plant.st[k].phase_sums[0] = math.nan
     if now.clearing:
         advance_clearing(plant)
+    elif n.conversions > 1:
+        _advance_converting(plant)
     elif n.n_units:
         advance(plant, 0.0, n.T_s)
     else:
@@ -141,6 +146,17 @@ def plant_step(plant: PlantRecords) -> None:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s and begin_clearing(n, now):
             _reconnect(plant)
+
+
+@compiled
+def _advance_converting(plant: PlantRecords) -> None:
+    """Go on by one period, with all conversions of the A/D at the phases."""
+    n = plant.net[0]
+    for m in range(n.conversions):
+        end = n.T_s * (m + 1) / n.conversions
+        advance(plant, n.T_s * m / n.conversions, end if m + 1 < n.conversions else math.inf)
+        for k in range(n.n_converters):
+            convert(plant, k, m, end)
 
 
 @compiled

@@ -150,6 +150,7 @@ net_dtype = _header(
         ("omega_b", "f8"),  # rad/s
         ("T_s", "f8"),
         ("advance", "i8"),  # address, see `going_on`
+        ("conversions", "i8"),  # of the A/D at the phases in a period
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
         # units of a switched bridge's carrier in a period, between two loads of compare values (0:

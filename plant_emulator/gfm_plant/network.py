@@ -20,7 +20,8 @@ from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
-from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, PlantRecords
+from gfm_plant.phases import convert_nothing
+from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
@@ -81,6 +82,14 @@ class Network:
         for record, old in zip(self.memory, kept.memory, strict=True):
             _bytes(record)[:] = _bytes(old)
         self.wiring = kept.wiring
+
+    def without_current(self, k: int, ticks: int) -> NDArray[np.float64]:
+        """What the A/D at the phases of converter k has read before the first tick, when nothing
+        flowed: counts, (ticks, 10)."""
+        rows = np.empty((ticks, N_PHASES))
+        if ticks:
+            convert_nothing(self.records, k, rows)
+        return rows
 
     def start(
         self,

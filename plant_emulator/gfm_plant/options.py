@@ -25,7 +25,16 @@ from gfm_plant.parameters import (
     load_converter,
 )
 from gfm_plant.records import MAX_DELAY, N_OVERLOADS
-from gfm_runtime.signals import COUNTS, FULL_SCALES, Y_NAMES, Channel, carried, names, quantity
+from gfm_runtime.signals import (
+    COUNTS,
+    FULL_SCALES,
+    MOST_SAMPLES,
+    Y_NAMES,
+    Channel,
+    carried,
+    names,
+    quantity,
+)
 
 Measured = Literal["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q", "i_od", "i_oq"]
 Command = Literal["i_u", "omega_u", "E_u", "E_q"]
@@ -224,6 +233,13 @@ class Phases(Options):
     of a phase's nominal peak value, sqrt(2/3) V_n and sqrt(2/3) S_n/V_n."""
 
     bits: int = Field(12, ge=8, le=16, description="of the A/D")
+    samples: int = Field(
+        1,
+        ge=1,
+        le=MOST_SAMPLES,
+        description="conversions of each channel in a period, evenly apart, the last at the tick; "
+        "a count is their sum",
+    )
     v_dc: Range = Field(
         FULL_SCALES["v_dc"], description="full scale [lo, hi] of the DC voltage, p.u."
     )

@@ -15,7 +15,7 @@ from gfm_plant.model import V_DC
 from gfm_plant.noise import gaussians
 from gfm_plant.records import COMPARE, N_PHASES, PlantRecords
 from gfm_plant.solution import I_F, I_O, V, own
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import cached, compiled, inlined
 
 _A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
 _SEED = np.uint64(1 << 62)  # tells the noise of the phases from that of `sensors`
@@ -39,12 +39,28 @@ def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: in
     """Write the counts of converter k's A/D at this tick to y from ``first`` on, in the order of
     the signal table's group ``adc``.
 
-    A sensor's low-pass sees a straight line from tick to tick. A channel with skew samples earlier,
-    on the same line; the current of L_f on the slope that it has before the tick, where its bridge
-    has a zero vector if it is switched.
+    Several conversions are those since the last tick, see ``convert``; where that has no instants
+    between, at the start and in a period that clears a fault, all are at the tick.
+    """
+    s = plant.st[k]
+    if math.isnan(s.phase_sums[0]):
+        for m in range(plant.par[k].phase_samples):
+            convert(plant, k, m, 0.0)
+    for j in range(N_PHASES):
+        y[first + j] = s.phase_sums[j]
+
+
+@compiled
+def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
+    """Add conversion m of this period, at an instant s after its beginning, to the counts of
+    converter k.
+
+    A sensor's low-pass sees a straight line from conversion to conversion. A channel with skew
+    samples earlier, on the same line; with one conversion a period the current of L_f on the slope
+    that it has before the tick, where its bridge has a zero vector if it is switched.
     """
     r, s, w = plant.par[k], plant.st[k], field(plant.now[0], "w")
-    turn = stands(plant, 0.0)
+    turn = stands(plant, at)
     i, v, i_o = w[own(k) + I_F] * turn, w[own(k) + V] * turn, w[own(k) + I_O] * turn
     i, i_o = i * r.current, i_o * r.current
     slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
@@ -63,9 +79,24 @@ def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: in
             + r.phase_weights[2] * value
         )
         s.phase_seen[0, j], s.phase_seen[1, j] = value, low
-        back = along(x, slope) if 0 < j < 4 else change / plant.net[0].T_s
+        back = change * r.phase_samples / plant.net[0].T_s
+        if 0 < j < 4 and r.phase_samples == 1:
+            back = along(x, slope)
         seen = low - r.phase_skew[j] * back
-        y[first + j] = _count(r, s.tick, j, seen)
+        before = 0.0 if m == 0 else s.phase_sums[j]
+        s.phase_sums[j] = before + _count(r, s.tick * r.phase_samples + m, j, seen)
+
+
+@cached
+def convert_nothing(plant: PlantRecords, k: int, rows: NDArray[np.float64]) -> None:
+    """Write to rows, (n, 10), what converter k's A/D has read at n ticks before the first one, when
+    no current flowed and there was no voltage."""
+    r = plant.par[k]
+    for i in range(len(rows)):
+        for j in range(N_PHASES):
+            rows[i, j] = 0.0
+            for m in range(r.phase_samples):
+                rows[i, j] += _count(r, m - (i + 1) * r.phase_samples, j, 0.0)
 
 
 @compiled

@@ -112,6 +112,7 @@ converter_par_dtype = np.dtype(
         ("phase_lsb", "f8", (N_PHASES,)),
         ("phase_top", "f8"),
         ("phase_weights", "f8", (3,)),
+        ("phase_samples", "i8"),  # conversions in a period, whose sum is the count
         # D/A, one entry a command
         ("dac_lo", "f8", (N_COMMANDS,)),
         ("dac_hi", "f8", (N_COMMANDS,)),
@@ -149,6 +150,7 @@ converter_state_dtype = np.dtype(
         ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
         # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
         ("phase_seen", "f8", (2, N_PHASES)),
+        ("phase_sums", "f8", (N_PHASES,)),  # of this period's conversions, NaN if there were none
         # in a piece of time: power that the bridge draws, and what the sensors see, at its
         # beginning, middle and end (and what these change by in a second at the beginning and the
         # end of an interval between two edges); the command's voltage and the most that v_dc gives

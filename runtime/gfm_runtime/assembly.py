@@ -19,7 +19,7 @@ from gfm_runtime.controller import (
     missed,
     set_reference,
 )
-from gfm_runtime.counts import begin_counts
+from gfm_runtime.counts import begin_counts, calibrate_with
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
 from gfm_runtime.inner import settle
@@ -36,7 +36,7 @@ from gfm_runtime.signals import (
     PLAIN,
     REF_NAMES,
 )
-from gfm_runtime.states import OK, READY, RUNNING, STATES
+from gfm_runtime.states import BAD_SENSOR, OK, READY, RUNNING, SAFE, STATES
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
 SPARE = 2  # places for laws with other gains: one may be in force while the other is filled
@@ -187,6 +187,7 @@ class Controller:
         y: NDArray[Any] | None = None,
         e: complex | None = None,
         angle: complex = 1.0,
+        rows: NDArray[Any] | None = None,
     ) -> None:
         """Go from READY to RUNNING, at rest.
 
@@ -194,6 +195,8 @@ class Controller:
             x_law, u: the active law's state (n,) and output (3,), p.u.
             y, e: with an inner stage: measurements (11,) and the bridge's voltage e_d + j e_q, p.u.
             angle: for a law that measures itself: the unit phasor of its frame.
+            rows: likewise, counts without current, (``calibrations``, 10), by which it calibrates.
+                An offset that is too large leads to SAFE.
 
         Raises:
             LawError: the controller is not READY; SAFE is latched until ``reset``.
@@ -211,6 +214,16 @@ class Controller:
             self.ctl["out"] = [u[0], u[1], e.real, e.imag]
             begin_counts(self.states[k], y, angle)
         self.ctl["state"] = RUNNING
+        if rows is not None and len(rows):
+            suspect = calibrate_with(self.laws, self.states, k, rows)
+            if suspect >= 0:
+                self.ctl["state"], self.ctl["reason"] = SAFE, BAD_SENSOR
+                self.ctl["channel"] = suspect
+
+    @property
+    def calibrations(self) -> int:
+        """How many counts without current the active law takes at its start."""
+        return int(self.laws["calibrate"][self.ctl["active"][0]])
 
     def reset(self) -> None:
         """Re-arm: go from SAFE or STOPPED to READY, clear the reason, and keep the laws."""

@@ -31,6 +31,8 @@ CHANNELS: tuple[Channel, ...] = get_args(Channel)
 """Of the A/D at a converter's phases, in the order of the group ``adc``."""
 _READ = {"v_dc": "the DC voltage", "i": "the current of L_f", "v": "the voltage of C_f",
          "i_o": "the current of the line"}  # fmt: skip
+COUNT_BITS, MOST_SAMPLES = 16, 32
+"""Of a count, which may be a sum; conversions that it sums at most."""
 FULL_SCALES = {"v_dc": (0.0, 2.0), "i": (-4.0, 4.0), "v": (-2.0, 2.0), "i_o": (-4.0, 4.0)}
 """Of the A/D by default, p.u. of V_dcref and of a phase's nominal peak value, by quantity."""
 

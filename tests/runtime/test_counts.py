@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from gfm_runtime import LawError, discretise, load_law, pack_law, state_dtype
-from gfm_runtime.counts import Counts, Measure, Modulate, align, measure, modulate, named_counts
+from gfm_runtime.counts import (
+    Counts,
+    Measure,
+    Modulate,
+    align,
+    calibrate,
+    measure,
+    modulate,
+    named_counts,
+)
 from gfm_runtime.signals import CHANNELS
 
 T_S, OMEGA_B, TOP = 1e-4, 100 * math.pi, 10_000
@@ -68,6 +77,41 @@ def test_the_frame_turns_by_the_speed_and_is_aligned_with_the_voltage():
     states["sensed"][0, 7:9] = 0.6, 0.8
     align(laws[0], states[0], read(12, 1.0, 0.0, 1.1 * np.exp(2j), 0.0), 0)
     assert complex(*states["angle"][0]) * (0.6 + 0.8j) == pytest.approx(np.exp(2j), abs=2e-3)
+
+
+@pytest.mark.parametrize("samples", [4, 16])
+def test_a_sum_of_conversions_in_the_last_period_is_what_the_tick_would_read(samples):
+    """Of vectors that turn at 1.02 p.u.; a mean over 1.8 degrees is 4e-5 less."""
+    laws, states = made({"samples": samples})
+    states["speed"], turn = 1.02, 1.02 * OMEGA_B * T_S
+    i, v, i_o = 0.8 - 0.3j, 1.02 + 0.1j, 0.75 - 0.35j
+    ages = np.exp(-1j * turn * np.arange(samples)[::-1] / samples)
+    counts = np.sum([read(12, 1.05, i * e, v * e, i_o * e) for e in ages], axis=0)
+    measure(laws[0], states[0], counts, 0)
+    wanted = [1.05, i.real, i.imag, v.real, v.imag, i_o.real, i_o.imag]
+    found = states["sensed"][0][[0, *range(5, 11)]]
+    assert found == pytest.approx(wanted, abs=8 * 2**-12 / math.sqrt(samples))
+    align(laws[0], states[0], counts, 0)  # where that voltage already is
+    assert complex(*states["angle"][0]) == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("largest", "suspect"), [(-0.09, -1), (-0.11, 8)])
+def test_the_start_finds_the_offsets_of_the_currents(largest, suspect):
+    """To the standard deviation of a mean; those of voltages, and of a sensor that is not there,
+    stay. More than 0.1 p.u. is not plausible."""
+    rng, offsets = np.random.default_rng(1), np.zeros(10)
+    offsets[1:] = 0.05, -0.03, 0.4, 0.2, 0.2, 0.2, 0.04, largest, 0.4
+    laws, states = made({"bits": 16, "phases": 2, "calibrate": 200})
+    for _ in range(200):
+        assert states["suspect"][0] in (0, -1)
+        noise = 0.01 * rng.standard_normal(10)
+        calibrate(laws[0], states[0], read(16, 1.0, 0.0, 0.0, 0.0, errors=offsets + noise), 0)
+    assert states["suspect"] == suspect
+    kept = states["shift"][0].copy()
+    assert kept[[1, 2, 7, 8]] * 8 / 2**16 == pytest.approx(offsets[[1, 2, 7, 8]], abs=3e-3)
+    assert not kept[[0, 3, 4, 5, 6, 9]].any()
+    calibrate(laws[0], states[0], read(16, 1.0, 0.0, 0.0, 0.0), 0)  # one more than it takes
+    assert np.array_equal(states["shift"][0], kept)
 
 
 def modulated(E: complex, v_dc: float = 1.0, **by: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -186,6 +230,11 @@ def test_a_mistake_in_a_file_is_told_in_one_line(tmp_path, text, says):
     assert says in str(told.value) and "\n" not in str(told.value)
     with pytest.raises(LawError, match=r"unknown; use a \.toml file or one of"):
         named_counts("rigg")
+
+
+def test_a_sum_that_does_not_fit_16_bits_is_told_in_one_line():
+    with pytest.raises(LawError, match=r"measure\.samples: 32: .* with bits = 12 at most 16"):
+        made({"samples": 32})
 
 
 def test_a_law_file_has_both_tables_or_none(tmp_path):

@@ -26,15 +26,17 @@ def law(name: str, inner: str, measure: dict[str, Any], **modulate: Any) -> Buil
     )
 
 
-#: each modulator and compensation once, over-modulation of both kinds, two currents, short pulses
+#: each modulator and compensation once, over-modulation of both kinds, two currents, short pulses,
+#: calibration, sums of conversions
 COUNTED = {
-    "vsg-2": law("vsg-2", "none", {"f_y": 300.0}),
+    "vsg-2": law("vsg-2", "none", {"f_y": 300.0, "calibrate": 8, "offset_most": 0.05}),
     "third": law("mimo-gfm", "cascaded", {"phases": 2}, kind="third-harmonic", dead_time_s=2e-6,
                  compensate="sign", over="scale"),
     "sine": law("droop-1", "none", {"bits": 16, "offset": {"i_a": 0.01}, "gain": {"v_b": 1.01}},
                 kind="sine", dead_time_s=2e-6, compensate="predicted", min_pulse_s=3e-6),
-    "discontinuous": law("psc-1", "virtual-stator", {"bits": 10}, kind="discontinuous",
-                         v_dc="nominal", carriers=2, min_pulse_s=2e-6, over="scale"),
+    "discontinuous": law("psc-1", "virtual-stator", {"bits": 10, "samples": 8},
+                         kind="discontinuous", v_dc="nominal", carriers=2, min_pulse_s=2e-6,
+                         over="scale"),
 }  # fmt: skip
 
 
@@ -64,6 +66,8 @@ def test_the_rows_reach_what_they_are_for():
     results = rows.words[:, at("result")].astype(int)
     assert {OK, BAD_Y, BAD_U, BAD_SENSOR} <= {*results}
     assert np.mean(results == OK) > 0.5
+    calibrations = rows.words[:, at("op")] == 6
+    assert {OK, BAD_SENSOR} == {*results[calibrations]} and np.sum(calibrations) > 500
     compare = rows.words[:, at("u_cmp_a") : at("u_cmp_a") + 3].view(float)[results == OK]
     adc = rows.words[:, at("y_adc_v_dc") + 1 : at("y_adc_v_dc") + 10].view(float)[results == OK]
     assert np.sum(compare == 0) > 500 and np.sum(compare == 10_000) > 500

@@ -154,7 +154,8 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         if inner:
             own = np.concatenate([start.y, start.x[: NY_INNER - NY]])
             angle = np.exp(1j * start.x[DELTA])
-            controller.start(start.x_law, start.u, own, start.e, angle)
+            rows = plant.without_current(k, controller.calibrations)
+            controller.start(start.x_law, start.u, own, start.e, angle, rows)
         else:
             controller.start(start.x_law, start.u)
         told = _commands(start, inner)

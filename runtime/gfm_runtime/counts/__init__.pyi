@@ -1,4 +1,4 @@
-from .measure import Measure, align, measure
+from .measure import Measure, align, calibrate, measure
 from .modulate import Modulate, modulate
 from .pair import (
     COUNTS_CONSTANTS,
@@ -6,6 +6,7 @@ from .pair import (
     COUNTS_STATE,
     Counts,
     begin_counts,
+    calibrate_with,
     counts_fields,
     counts_state_fields,
     go_on_with,
@@ -22,6 +23,8 @@ __all__ = [
     "Modulate",
     "align",
     "begin_counts",
+    "calibrate",
+    "calibrate_with",
     "counts_fields",
     "counts_state_fields",
     "go_on_with",

@@ -1,7 +1,9 @@
 """From the counts of an A/D at the phases to the measurements y of a law.
 
-Offset and scale of each channel; Clarke's amplitude-invariant transform; Park's, by the angle of
-the controller's own frame; then p, q and V at the filter capacitor, Eq. (9)-(11), and a low-pass.
+Offset, known or found at the start, and scale of each channel, whose count may be the sum of
+several conversions in the last sampling time; Clarke's amplitude-invariant transform; Park's, by
+the angle of the controller's own frame; then p, q and V at the filter capacitor, Eq. (9)-(11), and
+a low-pass.
 """
 
 from __future__ import annotations
@@ -13,9 +15,12 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from gfm_runtime.compiled import inlined
+from gfm_runtime.errors import LawError
 from gfm_runtime.signals import (
     CHANNELS,
+    COUNT_BITS,
     FULL_SCALES,
+    MOST_SAMPLES,
     N_ADC,
     N_LEGS,
     Y_I_D,
@@ -54,6 +59,13 @@ class Measure(TomlTable):
     """What the firmware takes its sensors and its A/D for; p.u. of a phase's nominal peak value."""
 
     bits: int = Field(12, ge=8, le=16, description="of the A/D")
+    samples: int = Field(
+        1,
+        ge=1,
+        le=MOST_SAMPLES,
+        description="conversions of each channel in a sampling time, evenly apart, the last at the "
+        "tick; a count is their sum, and the law takes their mean",
+    )
     v_dc: FullScale = Field(
         FULL_SCALES["v_dc"], description="full scale [lo, hi] of the DC voltage, p.u."
     )
@@ -67,6 +79,16 @@ class Measure(TomlTable):
     )
     gain: dict[Channel, float] = Field(
         {}, description="that a channel is known to have; it is divided by"
+    )
+    calibrate: int = Field(
+        0,
+        ge=0,
+        le=65536,
+        description="counts without current from which the start takes the offsets of the sensors "
+        "of i and i_o; 0: none",
+    )
+    offset_most: float = Field(
+        0.1, gt=0, le=100, description="largest offset so found, p.u.; more: SAFE"
     )
     phases: Literal[2, 3] = Field(
         3, description="currents of i and i_o with a sensor; with 2 the third is their negative sum"
@@ -87,21 +109,35 @@ class Measure(TomlTable):
     )
     f_y: float = Field(0.0, ge=0, description="low-pass on v_dc, p, q and V, Hz; 0: none")
 
-    def constants(self, T_s: float) -> dict[str, Any]:
-        """The constants in ``law_dtype``, by name; T_s in s."""
+    def constants(self, T_s: float, omega_b: float) -> dict[str, Any]:
+        """The constants in ``law_dtype``, by name; T_s in s, omega_b in rad/s.
+
+        Raises:
+            LawError: a sum of ``samples`` conversions does not fit 16 bits.
+        """
+        if self.samples << self.bits > 1 << COUNT_BITS:
+            raise LawError(
+                "measure.samples",
+                f"{self.samples}: their sum must fit {COUNT_BITS} bits, so with bits = {self.bits} "
+                f"at most {1 << COUNT_BITS - self.bits}",
+            )
         zero, per_count = [], []
         for name in CHANNELS:
             low, high = getattr(self, quantity(name))
             lsb, gain = (high - low) / 2**self.bits, self.gain.get(name, 1.0)
-            zero.append((self.offset.get(name, 0.0) - low) / lsb)
-            per_count.append(lsb / gain)
+            zero.append(self.samples * ((self.offset.get(name, 0.0) - low) / lsb))
+            per_count.append(lsb / gain / self.samples)
         follow = -math.expm1(-2 * math.pi * self.f_y * T_s) if self.f_y > 0 else 1.0
         apart = _IN_TURN * T_s
         return {
             "two": int(self.phases == 2),
             "adc_zero": zero,
             "adc_scale": per_count,
-            "adc_top": 2.0**self.bits - 1,
+            "adc_top": self.samples * (2.0**self.bits - 1),
+            "turn_back": omega_b * T_s * (self.samples - 1) / (2 * self.samples),
+            "calibrate": float(self.calibrate),
+            "per_calibrate": 1.0 / max(self.calibrate, 1),
+            "offset_most": self.offset_most,
             "sum_most": self.sum_most,
             "sum_checks": float(math.ceil(self.sum_s / apart - 1e-6)),
             "still_checks": float(math.ceil(self.still_s / apart - 1e-6)),
@@ -122,6 +158,8 @@ def measure(law, state, adc, first):
     y = state.sensed
     for j in range(N_ADC):
         state.phases[j] = adc[first + j]  # in the law's own precision
+        if law.calibrate > 0 and _of_current(law, j):
+            state.phases[j] -= state.shift[j]
         state.phases[j] = (state.phases[j] - law.adc_zero[j]) * law.adc_scale[j]
     if law.two != 0:
         state.phases[I_A + 2] = -state.phases[I_A] - state.phases[I_A + 1]
@@ -130,12 +168,17 @@ def measure(law, state, adc, first):
     state.turn += law.one
     if state.turn >= law.in_turn:
         state.turn = law.zero
+    cosine, sine = state.angle[0], state.angle[1]
+    if law.turn_back > 0:  # a mean over the last sampling time is that of its middle
+        along, across = turn(law, law.turn_back * state.speed)
+        cosine = state.angle[0] * along + state.angle[1] * across
+        sine = state.angle[1] * along - state.angle[0] * across
     for k in range(_IN_TURN):
         at = I_A + N_LEGS * k
         a, b, c = state.phases[at], state.phases[at + 1], state.phases[at + 2]
         if state.turn == k:
             _check(law, state, adc, first, k)
-        y[Y_I_D + 2 * k], y[Y_I_D + 1 + 2 * k] = _park(law, state, a, b, c)
+        y[Y_I_D + 2 * k], y[Y_I_D + 1 + 2 * k] = _park(law, a, b, c, cosine, sine)
     p = y[Y_V_D] * y[Y_I_OD] + y[Y_V_Q] * y[Y_I_OQ]
     q = y[Y_V_Q] * y[Y_I_OD] - y[Y_V_D] * y[Y_I_OQ]
     V = math.sqrt(y[Y_V_D] * y[Y_V_D] + y[Y_V_Q] * y[Y_V_Q])
@@ -179,10 +222,9 @@ def _check(law, state, adc, first, k):
 
 
 @inlined
-def _park(law, state, a, b, c):
+def _park(law, a, b, c, cosine, sine):
     """The d and q components of three phases."""
     alpha, beta = (a + a - b - c) * law.per_3, (b - c) * law.per_root_3
-    cosine, sine = state.angle[0], state.angle[1]
     return alpha * cosine + beta * sine, beta * cosine - alpha * sine
 
 
@@ -208,3 +250,42 @@ def align(law, state, adc, first):
     size = math.sqrt(cosine * cosine + sine * sine)
     if size > law.least_v:
         state.angle[0], state.angle[1] = cosine / size, sine / size
+        if law.turn_back > 0:
+            along, across = turn(law, law.turn_back * state.speed)
+            cosine = state.angle[0] * along - state.angle[1] * across
+            state.angle[1] = state.angle[0] * across + state.angle[1] * along
+            state.angle[0] = cosine
+
+
+@inlined
+def calibrate(law, state, adc, first):
+    """Take one of the first ``law.calibrate`` counts, of a bridge without current, into the mean
+    from which the sensors of i and i_o measure: state.shift; after the last of them
+    state.suspect is a channel whose offset is too large, else -1. Arguments as of ``measure``."""
+    state.suspect = -1
+    if state.calibrated < law.calibrate:
+        state.calibrated += law.one
+        for j in range(N_ADC):
+            if _of_current(law, j):
+                state.phases[j] = adc[first + j]
+                state.shift[j] += (state.phases[j] - law.adc_zero[j]) * law.per_calibrate
+        if state.calibrated >= law.calibrate:
+            for j in range(N_ADC):
+                if _of_current(law, j) and abs(state.shift[j] * law.adc_scale[j]) > law.offset_most:
+                    state.suspect = j
+
+
+@inlined
+def _of_current(law, j):
+    """Whether a channel is one of i or i_o with a sensor."""
+    return (j >= I_A and j < V_A - law.two) or (j >= I_O_A and j < N_ADC - law.two)
+
+
+@inlined
+def turn(law, x):
+    """The cosine and the sine of a small angle, rad, by their series: to 6e-12 at 0.04, the turn of
+    a tick of 100 us; to 1e-6 at 0.3."""
+    x2 = x * x
+    cosine = law.one - x2 * (law.half - x2 * law.per_24)
+    sine = x * (law.one - x2 * (law.per_6 - x2 * law.per_120))
+    return cosine, sine

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from gfm_runtime.compiled import inlined
-from gfm_runtime.counts.measure import Measure
+from gfm_runtime.compiled import cached, inlined
+from gfm_runtime.counts.measure import Measure, calibrate
 from gfm_runtime.counts.modulate import Modulate
 from gfm_runtime.shipped import Shipped
 from gfm_runtime.signals import N_ADC, N_LEGS, NY_INNER, Y_OMEGA
@@ -31,7 +31,7 @@ COUNTS_NUMBERS = tuple(
 COUNTS_CONSTANTS = {
     **dict.fromkeys(_SERIES, 1), "adc_zero": N_ADC, "adc_scale": N_ADC,
     **dict.fromkeys(("adc_top", "sum_most", "sum_checks", "still_checks", "still_above"), 1),
-    "follow_y": 1,
+    **dict.fromkeys(("follow_y", "turn_back", "calibrate", "per_calibrate", "offset_most"), 1),
     **dict.fromkeys(("turn", "turn_ahead", "per_leg", "top", "ripple"), 1),
     **dict.fromkeys(("dead", "half_dead", "per_band", "least"), 1),
 }  # fmt: skip
@@ -43,6 +43,8 @@ COUNTS_STATE = (
     ("turn", 1, "whose sensors this tick checks: 0 i and v_dc, 1 v, 2 i_o"),
     ("speed", 1, "at which the frame has turned since the last tick, p.u."),
     ("odd", 3, "checks for which the phases of i, v and i_o have not added up to 0"),
+    ("shift", N_ADC, "counts that the start has found without current, less those expected"),
+    ("calibrated", 1, "how many of them it has taken"),
 )
 _OF_A_TICK = (("phases", N_ADC), ("legs", N_LEGS), ("edges", N_LEGS), ("compare", N_LEGS))
 
@@ -81,12 +83,12 @@ def pack_counts(counts: Counts | None, rec: Any, T_s: float, omega_b: float) -> 
         omega_b: base frequency of the converter, rad/s.
 
     Raises:
-        LawError: as ``Modulate.top``.
+        LawError: as ``Measure.constants`` and ``Modulate.top``.
     """
     if counts is None:
         return
     rec["counts"] = 1
-    constants = counts.measure.constants(T_s) | counts.modulate.constants(T_s, omega_b)
+    constants = counts.measure.constants(T_s, omega_b) | counts.modulate.constants(T_s, omega_b)
     for name, value in (_SERIES | constants).items():
         rec[name] = value
 
@@ -94,15 +96,31 @@ def pack_counts(counts: Counts | None, rec: Any, T_s: float, omega_b: float) -> 
 @inlined
 def go_on_with(new, old):
     """Let another law go on with the frame and the filters of the one before."""
-    new.speed, new.turn = old.speed, old.turn
+    new.speed, new.turn, new.calibrated = old.speed, old.turn, old.calibrated
     new.angle[0], new.angle[1] = old.angle[0], old.angle[1]
     for j in range(NY_INNER):
         new.sensed[j] = old.sensed[j]
     for j in range(N_ADC):
         new.phases[j] = old.phases[j]
         new.last[j], new.still[j] = old.last[j], old.still[j]
+        new.shift[j] = old.shift[j]
     for j in range(N_LEGS):
         new.odd[j] = old.odd[j]
+
+
+@cached
+def calibrate_with(laws: Any, states: Any, k: int, rows: Any) -> int:
+    """Calibrate law k of arrays of ``law_dtype`` and ``state_dtype``.
+
+    Args:
+        rows: counts without current, (``calibrate``, 10).
+
+    Returns:
+        The channel whose offset is too large, or -1.
+    """
+    for i in range(len(rows)):
+        calibrate(laws[k], states[k], rows[i], 0)
+    return int(states[k].suspect)
 
 
 def begin_counts(state: Any, y: Any, angle: complex) -> None:

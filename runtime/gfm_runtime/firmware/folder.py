@@ -100,7 +100,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
     parts: tuple[str, ...] = ("init", "reset", "step", "look", "settle", "change", "view", "spoil")
     tuned = modules[0].tuning is not None
     parts += ("tune",) * tuned
-    parts += ("go_on", "align") * modules[0].counts
+    parts += ("go_on", "align", "calibrate") * modules[0].counts
     stages = modules[0].stages
     precision, fixed = modules[0].precision, modules[0].fixed is not None
     counts = modules[0].counts

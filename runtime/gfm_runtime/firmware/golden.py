@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import compiled
-from gfm_runtime.counts import COUNTS_STATE, go_on_with, measure, modulate
+from gfm_runtime.counts import COUNTS_STATE, calibrate, go_on_with, measure, modulate
 from gfm_runtime.firmware.fixed import REFS, YS, Instance, bump_of, refusal, to_integers
 from gfm_runtime.firmware.module import BAD_REF, Module, at_rest
 from gfm_runtime.inner import INNER_STATE, settle_inner, take_measurements
@@ -46,9 +46,10 @@ from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 from gfm_runtime.switchover import change_law, settle_into, settle_with_inner
 
 #: what a row does before its step: nothing, init, a bumpless change to the row's law, reset and
-#: settle at the last u, or an error of memory: no number in the law's state, or in its stage's
-#: and from TUNE on the sets of gains of a law that can be tuned
-STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE, TUNE = range(7)
+#: settle at the last u, or an error of memory: no number in the law's state, or in its stage's;
+#: or one of the counts of its calibration; and from TUNE on the sets of gains of a law that can be
+#: tuned
+STEP, INIT, SWITCH, RESET, SPOIL, SPOIL_STAGE, CALIBRATE, TUNE = range(8)
 SEGMENT = 30  # ticks of one kind
 KINDS = 7
 INSIDE = 1e-3  # of a range; stays off its ends, which differ in float32
@@ -259,6 +260,11 @@ def _drive(laws, instances, fresh, ranges, op, k, tuned, refs, ys, now, io, resu
                 settle_with_inner(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
             else:
                 settle_into(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero)
+        elif op[i] == CALIBRATE:
+            state = instances[now[0], now[1]]
+            calibrate(laws[now[3]], state, c.adc, 0)
+            if state.suspect >= 0:
+                now[2] = BAD_SENSOR
         elif op[i] >= TUNE:
             now[4] = tuned + op[i]
         law, state = laws[now[3]], instances[now[0], now[1]]
@@ -440,6 +446,8 @@ def _adc(op: NDArray[np.int64], seed: int, law: np.void) -> tuple[NDArray[np.int
             out[at, 0] *= k // KINDS % 4 > 0
             op[start + 15 : at.stop : 8] = RESET
         op[start] = RESET
+        if kind in (0, 4):  # with current, which is too much of an offset, and without
+            op[start + 1 : start + 1 + int(law["calibrate"])] = CALIBRATE
     return op, np.clip(np.floor(out), 0.0, top).astype(law["u_0"].dtype)
 
 

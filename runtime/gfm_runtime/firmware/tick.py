@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime.counts import COUNTS_NUMBERS, COUNTS_STATE, align, measure, modulate
+from gfm_runtime.counts import COUNTS_NUMBERS, COUNTS_STATE, align, calibrate, measure, modulate
 from gfm_runtime.firmware import fixed
 from gfm_runtime.firmware.translate import (
     Algebra,
@@ -151,6 +151,7 @@ class Tick:
                 translate.function(measure, adc),
                 translate.function(modulate, records),
                 translate.function(align, adc),
+                translate.function(calibrate, adc),
             ]
         entries = [self.output, self.advance, self.look, self.settle, *self._counts]
         self._functions = reached(entries)
@@ -182,7 +183,7 @@ class Tick:
         if "t->m" in used:
             lines += [f"enum {{ {', '.join(_PLACES)} }}; /* of m in a tick */", ""]
         at = "t" if self._counts else "&t"  # one tick may be part of another function
-        names = ("MEASURE", "MODULATE", "ALIGN")[: len(self._counts)]
+        names = ("MEASURE", "MODULATE", "ALIGN", "CALIBRATE")[: len(self._counts)]
         counts = {
             name: call(one, "t" if name == "MEASURE" else "&t", adc="counts", first="0")
             for name, one in zip(names, self._counts, strict=True)

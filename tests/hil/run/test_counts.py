@@ -83,6 +83,38 @@ def test_a_sensor_that_fails_leads_to_the_safe_state_with_its_name(phases, named
     assert f"a sensor is not plausible: {named}" in str(run.events)
 
 
+def test_a_mean_of_n_conversions_has_less_noise(tmp_path):
+    """By the root of n, of what is white."""
+    noise, spread = dict.fromkeys(("i_o_a", "i_o_b", "i_o_c"), 0.02), []
+    for n in (1, 4, 16):
+        file = tmp_path / f"{n}.toml"
+        file.write_text(f"[measure]\nsamples = {n}\n", encoding="utf-8")
+        run = rig(
+            counts=str(file), plant__phases={"samples": n, "noise_std": noise},
+            plant__sensors={}, duration=0.6,
+        )  # fmt: skip
+        assert run.status == "completed"
+        wrong = np.subtract(run.signals["m_p"], run.signals["y_p"])[-4000:]
+        assert abs(wrong.mean()) < 1e-3
+        spread.append(wrong.std())
+    assert spread[0] / np.array(spread[1:]) == pytest.approx([2, 4], rel=0.05)
+
+
+def test_the_start_takes_the_offsets_of_the_currents(tmp_path):
+    """What is left of 50 Hz in p is that of the mean of 1,000 counts with noise."""
+    file = tmp_path / "calibrated.toml"
+    file.write_text(COUNTS + "calibrate = 1000\n", encoding="utf-8")
+    by = {"counts": str(file), "plant__sensors": {}}
+    offset = {"i_o_a": 0.05, "i_b": -0.03}
+    run = rig(plant__phases={"bits": 16, "offset": offset, "noise_std": {"i_o_a": 0.01}},
+              duration=0.6, **by)  # fmt: skip
+    wrong = np.subtract(run.signals["m_p"], run.signals["y_p"])[-4000:]
+    assert 2 * abs(np.mean(wrong * np.exp(-2j * np.pi * 0.005 * np.arange(4000)))) < 1e-3
+    run = rig(plant__phases={"bits": 16, "offset": {"i_o_c": -0.2}}, duration=0.1, **by)
+    assert run.status == "safe"
+    assert "a sensor is not plausible: adc_i_o_c" in str(run.events)
+
+
 def test_predicted_compensation_keeps_vsg_2_where_dead_time_loses_it(tmp_path):
     """At 2 us; and it takes most of the fifth and the seventh harmonic of the line's current of
     MIMO-GFM away."""

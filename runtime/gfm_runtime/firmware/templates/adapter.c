@@ -97,6 +97,13 @@ static void @P@_do_align(int k, const golden_real *y)
     @T@_align(@ARGUMENT@&@P@_of[k], adc);
 }
 
+static void @P@_do_calibrate(int k, const golden_real *y)
+{
+    uint16_t adc[GOLDEN_NY];
+    @P@_to_adc(y, adc);
+    (void)@T@_calibrate(@ARGUMENT@&@P@_of[k], adc);
+}
+
 static void @P@_do_go_on(int k, const golden_real *counts)
 {
     memcpy(&@P@_of[k].counts, counts, sizeof @P@_of[k].counts);

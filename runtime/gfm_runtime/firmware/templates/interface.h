@@ -158,6 +158,11 @@ int @P@_sense(@LAW@@P@_t *s, const uint16_t adc[]);
  * voltage, which then has the components counts.sensed of it: along d, if nothing was written there. */
 void @P@_align(@LAW@@P@_t *s, const uint16_t adc[]);
 
+/* Before align, as often as the law calibrates (calibrate of [measure]; with 0, or more often, it does
+ * nothing): takes the counts of a bridge without current for the mean that its sensors read then. The
+ * last one gives BAD_SENSOR if an offset is too large. */
+int @P@_calibrate(@LAW@@P@_t *s, const uint16_t adc[]);
+
 /* @end@ */
 #ifdef __cplusplus
 }

@@ -67,3 +67,19 @@ void @P@_align(@LAW@@P@_t *s, const uint16_t adc[])
     }
     @ALIGN@;
 }
+
+int @P@_calibrate(@LAW@@P@_t *s, const uint16_t adc[])
+{
+    tick_t t;
+    real counts[@GUARD@_NADC];
+    int i;
+    for (i = 0; i < @GUARD@_NADC; i++) {
+        counts[i] = (real)adc[i];
+    }
+    @CALIBRATE@;
+    if (t.suspect >= 0) {
+        s->channel = t.suspect;
+        s->reason = @GUARD@_BAD_SENSOR;
+    }
+    return s->reason;
+}

@@ -52,6 +52,7 @@ typedef struct {
 /* @if counts@ */
     void (*go_on)(int k, const golden_real *counts);
     void (*align)(int k, const golden_real *y);
+    void (*calibrate)(int k, const golden_real *y);
 /* @end@ */
 } law_t;
 
@@ -141,10 +142,15 @@ unsigned golden_row(const golden_word row[])
     case 5: /* no number in its stage's */
         laws[law].spoil(k, (int)row[0] == 5);
         break;
-    default: /* 6 and more: other gains */
+/* @if counts@ */
+    case 6:
+        laws[law].calibrate(k, y);
+        break;
+/* @end@ */
+    default: /* 7 and more: other gains */
 /* @if tuned@ */
-        if (row[0] >= 6) {
-            laws[law].tune(k, (int)row[0] - 6);
+        if (row[0] >= 7) {
+            laws[law].tune(k, (int)row[0] - 7);
         }
 /* @end@ */
         break;
