@@ -13,6 +13,7 @@ from gfm_hil.api.runs import run_network as run_network
 from gfm_hil.api.studies import campaign as campaign
 from gfm_hil.api.studies import conform as conform
 from gfm_hil.api.studies import identify as identify
+from gfm_hil.api.studies import judge_recording as judge_recording
 from gfm_hil.api.studies import scan as scan
 from gfm_hil.core.errors import UserError as UserError
 from gfm_hil.scenario import Scenario as Scenario

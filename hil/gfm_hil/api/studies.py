@@ -15,8 +15,10 @@ from gfm_hil.scenario.schema import laws_digest
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
+from gfm_hil.studies.conformity import recorded
 from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
 from gfm_hil.studies.conformity.hashes import file_hashes
+from gfm_hil.studies.conformity.recorded import part_of
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test, under_test_file
 from gfm_hil.studies.envelopes import Unit
@@ -128,6 +130,58 @@ def conform(
         hashes = file_hashes(files, inner, own, under.plant.converter, cases, external)
     names = [*files, *([external.name] if external else [])]
     made = Conformity(names, inner, under, cases, found, place, hashes, digests, droops)
+    if place is not None:
+        made.write(place, watch.notice)
+    return made
+
+
+def judge_recording(
+    file: str | Path,
+    map_file: str | Path,
+    against: str | Path,
+    part: str | None = None,
+    folder: str | Path | None = None,
+    *,
+    converter: str | Path | None = None,
+    figures: bool = True,
+    watch: Watch = SILENT,
+) -> Conformity:
+    """Judge a recording of hardware or of another simulator as a run of one part of a test.
+
+    Args:
+        file: CSV, COMTRADE (its .cfg or .cff), Parquet, MF4 or MAT.
+        map_file: what its channels are.
+        against: a test, such as ``"ercot/2-phase-jump"``, or the path of one of your own.
+        part: of the test; its only one if None.
+        folder, figures: as for ``conform``.
+        converter: file of the converter under test, with what its owner declares; without a droop
+            in it no clause that asks for the droop can be judged.
+        watch: is told what a person who waits should know.
+
+    Raises:
+        UserError: one line a mistake, before anything is judged: a file cannot be read, a channel
+            is missing, or the recording does not begin where the test does.
+    """
+    file, map_file = Path(file), Path(map_file)
+    place = None if folder is None else Path(folder)
+    if place is not None:
+        check_empty(place)
+    cases, under = load_cases([str(against)]), load_under_test(converter)
+    if len(cases) > 1:
+        raise UserError(f"--against {against}: a recording is of one test: {[c.id for c in cases]}")
+    chosen = part_of(cases[0], part)
+    with tempfile.TemporaryDirectory() as temporary:
+        found, words = recorded.judge_recording(
+            file, map_file, cases[0], chosen, under, Path(temporary), place if figures else None
+        )
+    own = under_test_file(converter)
+    files = [x for x in (file, file.with_suffix(".dat"), map_file) if x.is_file()]
+    hashes = file_hashes({}, None, own, under.plant.converter, cases, None, dict.fromkeys(files))
+    name = file.stem
+    made = Conformity(
+        [name], None, under, cases, [found], place, hashes, droops={name: under.droop},
+        recordings={name: words},
+    )  # fmt: skip
     if place is not None:
         made.write(place, watch.notice)
     return made

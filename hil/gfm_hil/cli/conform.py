@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from gfm_hil.api.studies import conform
+from gfm_hil.api.studies import conform, judge_recording
 from gfm_hil.cli.common import add_inner, add_map, add_study_options, new_folder, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
@@ -71,7 +71,13 @@ def add(command: argparse.ArgumentParser) -> None:
         "laws beside it; it begins at the operating point of the first law; or pil:TARGET, the "
         "first law as firmware on a processor in QEMU",
     )  # fmt: skip
-    add_map(command, "--controller")
+    command.add_argument(
+        "--recording", type=Path, metavar="FILE",
+        help="judge this recording, of one part of the test --against, in place of a run: CSV, "
+        "COMTRADE (.cfg, .cff), Parquet, MF4 or MAT",
+    )  # fmt: skip
+    command.add_argument("--part", metavar="NAME", help="with --recording: the part of the test")
+    add_map(command, "--controller, or the channels of --recording")
     add_inner(command)
     command.add_argument(
         "--against", action="extend", nargs="+", metavar="SET",
@@ -108,6 +114,8 @@ def call(options: argparse.Namespace) -> int:
             if options.list == "limits":
                 print(counted(rows))
         return 0
+    if options.recording is not None:
+        return _recording(options)
     if not options.law and options.controller is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
     laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
@@ -122,6 +130,33 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(found.plain(), indent=1))
     else:
+        _print(found, time.monotonic() - began)
+    return _EXIT[found.verdict]
+
+
+def _recording(options: argparse.Namespace) -> int:
+    """Judge a recording; returns the exit code."""
+    for name, given in (("law", options.law), ("controller", options.controller)):
+        if given:
+            raise UserError(f"--{name}: goes not with --recording, which has no controller of ours")
+    if options.map is None:
+        raise UserError("--map: missing; it says what the channels of --recording are")
+    if options.against is None or len(options.against) != 1:
+        raise UserError(
+            "--against: name the one test that was recorded, such as ercot/2-phase-jump"
+        )
+    folder = new_folder(options.out, "conform")
+    began = time.monotonic()
+    with watching("conform", options.quiet) as watch:
+        found = judge_recording(
+            options.recording, options.map, options.against[0], options.part, folder,
+            converter=options.converter, figures=not options.no_figures, watch=watch,
+        )  # fmt: skip
+    if options.json:
+        print(json.dumps(found.plain(), indent=1))
+    else:
+        for words in found.recordings.values():
+            terminal().print(escape(words), highlight=False, soft_wrap=True)
         _print(found, time.monotonic() - began)
     return _EXIT[found.verdict]
 

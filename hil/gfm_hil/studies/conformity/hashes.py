@@ -18,6 +18,7 @@ def file_hashes(
     converter: str,
     cases: Iterable[Case],
     external: ControllerUnderTest | None,
+    recorded: Iterable[Path] = (),
 ) -> dict[str, str]:
     """SHA-256 by what each file is.
 
@@ -27,6 +28,7 @@ def file_hashes(
         under_test, converter: file of the converter under test, and the converter that it names.
         cases: the tests.
         external: a model beside the laws, or None.
+        recorded: files of a recording that is judged.
     """
 
     def each() -> Iterator[tuple[str, bytes]]:
@@ -39,6 +41,8 @@ def file_hashes(
             yield external.name, controller_file(external.model)[1].read_bytes()
         if external is not None and external.ports is not None:
             yield f"map {external.ports.name}", external.ports.read_bytes()
+        for path in recorded:
+            yield f"recording {path.name}", path.read_bytes()
         yield f"converter under test {under_test.name}", under_test.read_bytes()
         yield f"converter {converter}", _named(converter, "gfm_plant", "converters")
         for case in cases:

@@ -75,6 +75,8 @@ def panels_of_run(run: Run, verdicts: Sequence[Verdict]) -> list[Panel]:
     x = np.column_stack([edges, np.append(edges[1:], ticks) - 1]).ravel() * T_s
     numbered, found = [*enumerate(verdicts, 1)], []
     for name in dict.fromkeys([*_ALWAYS, *judged]):
+        if name not in run.signals:  # of a recording
+            continue
         unit, factor = unit_of(name) or "–", 1.0
         if unit == "rad":
             unit, factor = "°", math.degrees(1.0)

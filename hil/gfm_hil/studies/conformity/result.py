@@ -63,6 +63,7 @@ class Conformity:
         digests: by law, the digest of all that its file, the file's bases and the inner stage say,
             which the two sides of a link compare as well.
         droops: by law, the droop that its clauses ask for, p.u./p.u.; inf: none.
+        recordings: by what was recorded in place of a run of a law, how it was read.
     """
 
     laws: list[str]
@@ -74,6 +75,7 @@ class Conformity:
     hashes: dict[str, str] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     droops: dict[str, float | None] = field(default_factory=dict)
+    recordings: dict[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -123,6 +125,7 @@ class Conformity:
             "machine": self.machine,
             "hashes": self.hashes,
             "digests": self.digests,
+            "recordings": self.recordings,
             "tests": {case.id: case.test.model_dump(include=about) for case in self.cases},
             "laws": {
                 law: {
@@ -169,7 +172,9 @@ class Conformity:
         own = [] if law is None else [("law", law), ("digest", self.digests.get(law, "–"))]
         droop = self.droops.get(law or "", under.droop)
         words = "" if droop is None else "none" if droop == math.inf else f"{100 * droop:.3g} %"
-        if under.droop is None:
+        if law in self.recordings:
+            own = [("recording", law), ("read as", self.recordings[law])]
+        if under.droop is None and law not in self.recordings:
             words = ", ".join(filter(None, [words, "that of the law itself"]))
         return [
             *own,

@@ -12,20 +12,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.schema import StrictSchema
+from gfm_hil.recording.foreign import ABOUT
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, whole_ticks
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
-from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Verdict
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.envelopes import Unit
 from gfm_plant import Plant
 from gfm_runtime import BuiltLaw
@@ -136,10 +138,16 @@ class Clause(StrictSchema):
     whole_run: ClassVar[bool] = False  # it is about the whole run, whatever its events
     of_cut_run: ClassVar[bool] = False  # a run that ended early can be judged too
     explains: ClassVar[int] = 2  # the failure of one with a smaller number explains those of others
+    #: the verdicts that hold of a recording too coarse for more: of samples up to two cycles apart
+    coarse: ClassVar[tuple[Outcome, ...]] = ()
 
     def judge(self, m: Moment) -> Verdict:
         """The verdict at one time of a run, whose window was recorded."""
         raise NotImplementedError
+
+    def finest_s(self, cycle_s: float) -> float:
+        """How far apart the samples of a recording may be for every verdict on it to hold, s."""
+        return cycle_s / 20
 
     def of(self, test: Publication) -> Clause:
         """The clause with its source filled in, from that of its test."""
@@ -202,7 +210,7 @@ class Moment:
         self.T_s = run.scenario.T_s
         self.f_n = nominal_frequency(run.scenario)
         self.width = cycle_ticks(self.T_s, self.f_n)
-        self.droop = math.inf if under.droop is None else under.droop
+        self.recording: Mapping[str, Any] = run.summary.get(ABOUT, {})
         self.at, self.tick = at, round(at / self.T_s)
         whole = run.scenario.ticks
         later = [e.at(self.T_s) for e in run.scenario.events if e.at(self.T_s) > self.tick]
@@ -222,7 +230,24 @@ class Moment:
                 return self.cannot("the window is shorter than two cycles")
             if not self.clause.whole_run and self.tick < whole_ticks(self.width):
                 return self.cannot("no whole cycle was recorded before the event")
-        return self.clause.judge(self)
+        return self._of_recording() if self.recording else self.clause.judge(self)
+
+    def _of_recording(self) -> Verdict:
+        """The verdict on a recording; what it cannot show cannot be judged."""
+        apart, cycle = self.recording["resolution_s"], 1 / self.f_n
+        finest = self.clause.finest_s(cycle)
+        told = f"what the recording shows is {1e3 * apart:.3g} ms apart, and it takes "
+        if apart > 2 * cycle or (apart > finest and not self.clause.coarse):
+            return self.cannot(f"{told}{1e3 * finest:.3g} ms")
+        try:
+            found = self.clause.judge(self)
+        except UserError as problem:
+            return self.cannot(str(problem))
+        if apart > finest and found.verdict not in (*self.clause.coarse, CANNOT, INFORMATIVE):
+            return self.cannot(
+                f"{told}{1e3 * finest:.3g} ms for more than: {found.text.rstrip('.')}"
+            )
+        return found
 
     def says(
         self,
@@ -262,13 +287,32 @@ class Moment:
         )
 
     @property
+    def droop(self) -> float:
+        """The declared droop, p.u./p.u.; inf: none. Raises UserError: it is a recording's, which
+        has no law that tells it, and none is declared."""
+        if self.under.droop is None and self.recording:
+            raise UserError("its converter declares no droop; give one, or inf, by --converter")
+        return math.inf if self.under.droop is None else self.under.droop
+
+    @property
     def span(self) -> tuple[float, float]:
         """From when to when the window lasts, s."""
         return self.first * self.T_s, self.last * self.T_s
 
     def raw(self, name: str) -> Vector:
-        """Every tick of a signal."""
+        """Every tick of a signal. Raises UserError: a recording has none, or not all that counts
+        from the cycle before the event, or before the window, to its end."""
+        if self.recording:
+            since = min(self.tick, self.first) - whole_ticks(self.width)
+            self.check(name, since, self.last)
         return np.asarray(self.run.signals[at_connection(self.run, name)], np.float64)
+
+    def check(self, name: str, first: int, last: int) -> None:
+        """See that a recording has a signal at some ticks. Raises UserError: it has not."""
+        if name not in self.run.signals:
+            raise UserError(f"the recording has no {name}")
+        if np.isnan(self.run.signals[name][max(0, first) : last]).any():
+            raise UserError(f"the recording does not have all of {name} in the window")
 
     def means(self, name: str, first: int, last: int) -> Vector:
         """The one-cycle means of a signal that lie within some ticks."""

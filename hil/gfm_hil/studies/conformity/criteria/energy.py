@@ -1,13 +1,13 @@
 """A change of frequency takes enough energy out of the converter."""
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import FAIL, PASS, Outcome, Verdict
 
 
 class Energy(Windowed):
@@ -21,6 +21,8 @@ class Energy(Windowed):
     net_of_droop: bool = Field(
         True, description="false: what the droop gives counts as inertia does"
     )
+
+    coarse: ClassVar[tuple[Outcome, ...]] = (PASS, FAIL)
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the inertia constant, s."""

@@ -20,6 +20,9 @@ class NoOscillation(Clause):
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the largest ripple, p.u. peak to peak, to four decimals."""
+        if m.recording:
+            for name in ("p", "V", "omega_u", "i", "omega_g"):
+                m.check(name, m.last - round(2.0 / m.T_s), m.last)
         scenario = m.run.scenario.model_copy(update={"expect_ripple": self.ripple})
         ripple = remaining_ripple(scenario, m.run.columns, m.run.events, m.run.ticks)
         if ripple is None:

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from gfm_hil.scenario.expectation import reason_name
 from gfm_hil.studies.conformity.criteria.base import Clause, Moment
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import FAIL, PASS, Outcome, Verdict
 
 _LASTED = ("completed", "oscillating")
 
@@ -19,10 +19,16 @@ class NoTrip(Clause):
     whole_run: ClassVar[bool] = True
     of_cut_run: ClassVar[bool] = True
     explains: ClassVar[int] = 0
+    coarse: ClassVar[tuple[Outcome, ...]] = (PASS, FAIL)
 
     def judge(self, m: Moment) -> Verdict:
         """The value is how long the run lasted, s; no other converter of a network may trip."""
         run = m.run
+        if m.recording and run.status == "completed":
+            if not m.recording["trips_seen"]:
+                return m.cannot("without current before the event a recording needs channel trip")
+            if run.ticks < run.scenario.ticks:
+                return m.cannot(f"the recording ends at {run.ticks * m.T_s:.4g} s of the test")
         end, whole = run.ticks * m.T_s, run.scenario.ticks * m.T_s
         lost = {n: r for n, r in m.others.items() if r.status not in _LASTED}
         ok = run.status in _LASTED and run.ticks >= run.scenario.ticks and not lost

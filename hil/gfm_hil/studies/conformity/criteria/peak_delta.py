@@ -1,12 +1,12 @@
 """A signal moves by at least so much."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from gfm_hil.recording.columns import unit_of
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import PASS, Outcome, Verdict
 
 
 class PeakDelta(Windowed):
@@ -17,6 +17,8 @@ class PeakDelta(Windowed):
     signal: str = Field("p", description="as for stays_within")
     least: float = Field(gt=0, description="in the unit of the signal")
     direction: Literal["up", "down"] = Field(description="in which direction it must move")
+
+    coarse: ClassVar[tuple[Outcome, ...]] = (PASS,)  # between samples the peak may be higher
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the way to the peak, in the unit of the signal."""

@@ -33,6 +33,10 @@ class Rise(Windowed):
         False, description="true: by its mean over the last cycle, as of a fault's current"
     )
 
+    def finest_s(self, cycle_s: float) -> float:
+        """A fifth of the time that it may take, or that of any clause."""
+        return min(self.within / 5, super().finest_s(cycle_s))
+
     def judge(self, m: Moment) -> Verdict:
         """The value is the time that it takes, ms."""
         w, sign, way = m.way(self.signal, self.direction)

@@ -2,14 +2,14 @@
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
-from gfm_hil.studies.conformity.verdict import LIMITED, Verdict
+from gfm_hil.studies.conformity.verdict import FAIL, LIMITED, PASS, Outcome, Verdict
 
 
 class Settles(Windowed):
@@ -26,6 +26,8 @@ class Settles(Windowed):
     )
     tolerance: float = Field(gt=0, description="in the unit of the signal")
     within: float = Field(gt=0, description="s after at")
+
+    coarse: ClassVar[tuple[Outcome, ...]] = (PASS, FAIL, LIMITED)
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the time that it takes, s."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from gfm_hil.recording.columns import unit_of
 from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
-from gfm_hil.studies.conformity.verdict import Verdict
+from gfm_hil.studies.conformity.verdict import FAIL, Outcome, Verdict
 
 
 class StaysWithin(Windowed):
@@ -25,6 +25,8 @@ class StaysWithin(Windowed):
         False, description="low and high are parts of the mean of the last cycle before at"
     )
     longest_s: float = Field(0.0, ge=0, description="s that the signal may be beyond, in one piece")
+
+    coarse: ClassVar[tuple[Outcome, ...]] = (FAIL,)  # between samples it may be beyond
 
     @model_validator(mode="after")
     def _limited(self) -> StaysWithin:

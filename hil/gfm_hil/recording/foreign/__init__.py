@@ -1,0 +1,7 @@
+"""Recordings that others made, of hardware, PSCAD or RTDS, as runs of ours: a map says what their
+channels are, and what the sampling cannot show is told."""
+
+from gfm_hil.recording.foreign.files import FILES
+from gfm_hil.recording.foreign.opened import ABOUT, open_recording
+
+__all__ = ["ABOUT", "FILES", "open_recording"]

@@ -1,0 +1,94 @@
+"""The files that recordings come in: each format's channels by name, as numbers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError, need
+
+Vector = NDArray[np.float64]
+TIME = "t"  #: the channel of time, s, of formats that have one of their own
+
+
+def read_channels(file: Path) -> dict[str, Vector]:
+    """Every channel of a file by its name, shape (samples,). Raises UserError: it is not there, of
+    no format that is known, damaged, or the package that reads it is not installed."""
+    kind = file.suffix.lower().removeprefix(".")
+    if kind not in FILES:
+        known = ", ".join(f".{name}" for name in FILES)
+        raise UserError(f"{file}: the format is told by the ending, which must be one of {known}")
+    if not file.is_file():
+        raise UserError(f"{file}: no such file")
+    try:
+        return FILES[kind](file)
+    except UserError:
+        raise
+    except Exception as problem:  # of a library, each in its own way
+        words = str(problem).splitlines() or [type(problem).__name__]
+        raise UserError(f"{file}: is no {kind.upper()} file that can be read: {words[0]}") from None
+
+
+def _csv(file: Path) -> dict[str, Vector]:
+    with file.open(encoding="utf-8-sig") as lines:
+        head = [name.strip().strip('"') for name in lines.readline().split(",")]
+        rows = np.loadtxt(lines, delimiter=",", ndmin=2)
+    if rows.shape[1] != len(head):
+        raise ValueError(
+            f"its first line names {len(head)} columns, its second has {rows.shape[1]}"
+        )
+    return dict(zip(head, np.ascontiguousarray(rows.T), strict=True))
+
+
+def _mat(file: Path) -> dict[str, Vector]:
+    from scipy.io import loadmat
+
+    return _numbers({n: x for n, x in loadmat(file).items() if not n.startswith("__")})
+
+
+def _parquet(file: Path) -> dict[str, Vector]:
+    need("pyarrow", "pyarrow", f"{file}", "export")
+    from pyarrow import parquet
+
+    table = parquet.read_table(file)
+    return _numbers({name: table[name].to_numpy() for name in table.column_names})
+
+
+def _mf4(file: Path) -> dict[str, Vector]:
+    need("asammdf", "asammdf", f"{file}", "export")
+    from asammdf import MDF
+
+    with MDF(file) as opened:
+        signals = [*opened.iter_channels(skip_master=True)]
+    return _numbers({TIME: signals[0].timestamps} | {s.name: s.samples for s in signals})
+
+
+def _numbers(columns: dict[str, Any]) -> dict[str, Vector]:
+    """The columns that are numbers."""
+    found = {name: np.asarray(x).squeeze() for name, x in columns.items()}
+    return {
+        n: x.astype(np.float64) for n, x in found.items() if x.ndim == 1 and x.dtype.kind in "biuf"
+    }
+
+
+def _comtrade(file: Path) -> dict[str, Vector]:
+    need("comtrade", "comtrade", f"{file}", "comtrade")
+    import comtrade
+
+    opened = comtrade.Comtrade()
+    opened.load(str(file))
+    found = {TIME: np.asarray(opened.time, np.float64)}
+    for names, rows in (
+        (opened.analog_channel_ids, opened.analog),
+        (opened.status_channel_ids, opened.status),
+    ):
+        found |= {n: np.asarray(x, np.float64) for n, x in zip(names, rows, strict=True)}
+    return found
+
+
+FILES: dict[str, Callable[[Path], dict[str, Vector]]] = {
+    "csv": _csv, "cfg": _comtrade, "cff": _comtrade, "mat": _mat, "parquet": _parquet, "mf4": _mf4,
+}  # fmt: skip
+"""What reads each format, by the ending of its files."""

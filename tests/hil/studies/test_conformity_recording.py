@@ -1,0 +1,174 @@
+"""A recording is judged as the run that it was made of, or cannot be; a changed one fails its
+clause, and one that is no recording of the test is told before anything is judged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import run_in_memory
+from gfm_hil.studies.conformity.criteria.base import judge
+from gfm_hil.studies.conformity.sets import load_cases, load_under_test, scenario_of
+from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS
+
+TEST, PART, F_N = "ercot/2-phase-jump", "-10", 60.0
+CONVERTER = """\
+P_max = 1.0
+P_min = -1.0
+droop = 0.05
+plant = { converter = "paper", delay = { samples = 1, fraction = 0.3 } }
+"""
+BASES = "S_n = 4000.0\nV_n = 380.0\n"
+WAVES = """\
+v = { phases = ["v_a_V", "v_b_V", "v_c_V"], unit = "V" }
+i = { phases = ["i_oa_A", "i_ob_A", "i_oc_A"], unit = "A" }
+"""
+PHASORS = """\
+v = { magnitude = "VM", angle = "VA", unit = "V" }
+i = { magnitude = "IM", angle = "IA", unit = "A" }
+meter = { window_s = 0.016666666666666666 }
+"""
+CHANNELS = """\
+[channels]
+p = { channel = "P", unit = "kW" }
+q = { channel = "Q", unit = "var" }
+V = "V"
+f = { channel = "f", unit = "Hz" }
+"""
+Columns = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    (folder / "converter.toml").write_text(CONVERTER)
+    (folder / "waves.toml").write_text(BASES + WAVES)
+    (folder / "phasors.toml").write_text(BASES + PHASORS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(place: Path) -> Run:
+    """The run of which recordings are made."""
+    (case,), under = load_cases([TEST]), load_under_test(place / "converter.toml")
+    part = next(part for part in case.test.runs() if part.name == PART)
+    law = "mimo-gfm-deployable"
+    return run_in_memory(scenario_of(case, part, under, law, None, place))
+
+
+@pytest.fixture(scope="module")
+def verdicts(run: Run, place: Path) -> dict[str, str]:
+    """What conform says of the run itself, by the kind of clause."""
+    (case,), under = load_cases([TEST]), load_under_test(place / "converter.toml")
+    part = next(part for part in case.test.runs() if part.name == PART)
+    return {v.kind: v.verdict for v in judge(run, case.test.asked(part), under)}
+
+
+@pytest.fixture(scope="module")
+def waves(run: Run) -> Columns:
+    return run.three_phase(si=True)
+
+
+def judged(place: Path, columns: Columns, of: str = "waves.toml") -> dict[str, str]:
+    """The verdicts of the clauses on a recording of such columns, by kind."""
+    head = ",".join(columns)
+    file = place / "recording.csv"
+    np.savetxt(file, np.stack([*columns.values()], 1), "%.9g", ",", header=head, comments="")
+    made = gfmhil.judge_recording(file, place / of, TEST, PART, converter=place / "converter.toml")
+    return {v.kind: v.verdict for v in made.parts[0].verdicts}
+
+
+def phasors(waves: Columns) -> Columns:
+    """What a meter of one-cycle phasors, 50 a second, shows of the waves."""
+    t, turns = waves["t"], np.exp(2j * np.pi / 3 * np.arange(3))
+    made = {"t": np.arange(0.02, t[-1], 0.02)}
+    edges = [np.clip(made["t"] + side, t[0], t[-1]) for side in (-0.5 / F_N, 0.5 / F_N)]
+    for letter, names in (("V", "v_a_V v_b_V v_c_V"), ("I", "i_oa_A i_ob_A i_oc_A")):
+        x = sum(waves[n] * turn for n, turn in zip(names.split(), turns, strict=True)) * 2 / 3
+        area = np.cumsum(x * np.exp(-2j * np.pi * F_N * t)) * (t[1] - t[0])
+        ends = [np.interp(e, t, area) for e in edges]
+        mean = (ends[1] - ends[0]) * F_N / np.sqrt(2)
+        made |= {f"{letter}M": np.abs(mean), f"{letter}A": np.degrees(np.angle(mean))}
+    return made
+
+
+def test_the_phases_of_a_run_have_the_verdicts_of_the_run(
+    place: Path, waves: Columns, verdicts: dict[str, str]
+) -> None:
+    found = judged(place, waves)
+    assert found.pop("stays_in_step") == CANNOT  # the angle of a converter shows outside nowhere
+    assert found == {kind: verdict for kind, verdict in verdicts.items() if kind in found}
+    assert PASS in found.values()
+
+
+def test_a_clock_of_its_own_changes_no_verdict(
+    place: Path, waves: Columns, verdicts: dict[str, str]
+) -> None:
+    found = judged(place, waves | {"t": waves["t"] + 1234.5})
+    assert all(verdict in (CANNOT, verdicts[kind]) for kind, verdict in found.items())
+    assert list(found.values()).count(CANNOT) == 1
+
+
+def test_phasors_show_what_they_can(place: Path, waves: Columns, verdicts: dict[str, str]) -> None:
+    found = judged(place, phasors(waves), "phasors.toml")
+    told = {kind: verdict for kind, verdict in found.items() if verdict != CANNOT}
+    assert told == {kind: verdicts[kind] for kind in told}
+    assert {"settles", "no_trip", "peak_delta"} <= {*told}
+    assert found["damped"] == found["no_oscillation"] == CANNOT
+
+
+def _swing(t: np.ndarray, since: float, size: float, hz: float, ratio: float) -> np.ndarray:
+    """A swing that begins at a time and decays with a damping ratio."""
+    after = np.clip(t - since, 0.0, None)
+    decays = np.exp(-2 * np.pi * hz * ratio * after)
+    return size * decays * np.sin(2 * np.pi * hz * after)
+
+
+#: what changes p, of which nothing else is made, and the clause that it breaks
+MUTATIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "peak_delta": lambda p, t: p[0] + 0.25 * (p - p[0]),
+    "settles": lambda p, t: p + 0.1 * np.clip(t - 3.0, 0.0, 1.0),
+    "damped": lambda p, t: p + _swing(t, 2.1, 0.045, 3.0, 0.02),
+    "no_oscillation": lambda p, t: p + _swing(t, 5.0, 0.03, 15.0, 0.0),
+    "no_trip": lambda p, t: p * (t < 6.5),
+}
+
+
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_a_changed_recording_fails_its_clause(place: Path, run: Run, kind: str) -> None:
+    s = run.signals
+    columns = {"t": s["t"], "P": 4.0 * MUTATIONS[kind](s["p"], s["t"]), "Q": 4e3 * s["q"]}
+    columns |= {"V": s["V"], "f": s["f_hz"]}
+    if kind == "no_trip":
+        columns["Q"] = columns["Q"] * (s["t"] < 6.5)
+    (place / "channels.toml").write_text(BASES + CHANNELS)
+    found = judged(place, columns, "channels.toml")
+    assert [k for k, verdict in found.items() if verdict == FAIL] == [kind]
+
+
+WRONG: dict[str, tuple[Callable[[Columns], Columns], str, str]] = {
+    "base": (dict, "S_n = 40e3\nV_n = 380.0\n" + WAVES, r"p = 0\.05 p\.u\..*see S_n"),
+    "volts": (dict, BASES.replace("380", "690") + WAVES, r"V = 0\.5.* p\.u\..*V_n"),
+    "swapped": (lambda w: w | {"v_a_V": w["v_b_V"], "v_b_V": w["v_a_V"]}, BASES + WAVES, "swapped"),
+    "shift": (dict, BASES + "event_s = 1.5\n" + WAVES, "shifted"),
+    "channel": (lambda w: {n: x for n, x in w.items() if n != "i_oc_A"}, BASES + WAVES, "i_oc_A"),
+    "rest": (lambda w: {n: x[:15000] for n, x in w.items()}, BASES + WAVES, "no event"),
+    "cut": (lambda w: {n: x[19990:] for n, x in w.items()}, BASES + WAVES, "before the event"),
+    "clock": (lambda w: {n: np.delete(x, 900) for n, x in w.items()}, BASES + WAVES, "not even"),
+    "unit": (dict, BASES + WAVES.replace('"A"', '"kW"'), "unit = 'kW'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_told_in_one_line(place: Path, waves: Columns, name: str) -> None:
+    change, text, words = WRONG[name]
+    (place / "wrong.toml").write_text(text)
+    with pytest.raises(UserError, match=words) as found:
+        judged(place, change(waves), "wrong.toml")
+    assert "\n" not in str(found.value)
