@@ -20,8 +20,8 @@ _PREFIX = {"": 1.0, "k": 1e3, "M": 1e6}
 _UNITS = {
     **{f"{k}{unit}": (what, size) for unit, what in (("W", "power"), ("var", "power"),
        ("V", "voltage"), ("A", "current")) for k, size in _PREFIX.items()},
-    "Hz": ("frequency", 1.0), "rad": ("angle", 1.0), "deg": ("angle", math.pi / 180), "s": ("time", 1.0),
-    "ms": ("time", 1e-3), "us": ("time", 1e-6),
+    "Hz": ("frequency", 1.0), "rad": ("angle", 1.0), "deg": ("angle", math.pi / 180),
+    "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6),
 }  # fmt: skip
 #: what each signal measures
 MEASURES = {
@@ -41,7 +41,7 @@ class Channel(StrictSchema):
 
 
 class Phases(StrictSchema):
-    """The instantaneous values of three phases, to neutral, or a phasor of the positive sequence."""
+    """Instantaneous values of three phases, to neutral, or a phasor of the positive sequence."""
 
     phases: tuple[str, str, str] | None = Field(
         None, strict=False, description="channels of a, b, c, in the order in which they follow"

@@ -86,7 +86,7 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
     way = "phases" if s.vectors else "channels" if of.v is None else "phasors"
     rate = f"{1 / s.dt:.6g} samples/s"
     about = {
-        "file": str(file), "event_s": event, "resolution_s": resolution, "trips_seen": reason != "?",
+        "event_s": event, "resolution_s": resolution, "trips_seen": reason != "?",
         "words": f"{way} at {rate}; event at {event:.6g} s of its clock, {told}, laid on "
         f"{first:g} s of the test; what is slower than {1e3 * resolution:.3g} ms is seen",
     }  # fmt: skip
@@ -115,7 +115,9 @@ def _event(s: Sampled, of: RecordingMap, scenario: Scenario, cycle: float) -> tu
         if (moved := np.abs(x - middle) > band).any():
             found.append((int(np.argmax(moved)), name))
     if not found:
-        raise UserError("no event: p, q and V stay where they are at its beginning")
+        raise UserError(
+            f"no event: p, q and V stay as in the first {_BAND_S:g} s, which must be at rest"
+        )
     k, name = min(found)
     at = float(s.t[max(0, k - 1)])  # the last sample of before
     words = f"found: {name} leaves its band of rest"
@@ -150,7 +152,7 @@ def _check_rest(s: Sampled, event: float, scenario: Scenario, f_n: float) -> Non
             )
     wanted = {"V": (1.0, _NEAR_V, "V_n, unit or scale"), "f": (1.0, _NEAR_F, "unit or f_n"),
               "p": (scenario.references.P_ref, _NEAR_P,
-                    "S_n, unit, scale, sign, or which current belongs to which voltage")}  # fmt: skip
+                    "S_n, unit, scale, sign, or the order of the phases of i")}  # fmt: skip
     for name, (want, near, which) in wanted.items():
         if name in s.of and not abs((have := float(np.mean(s.of[name][before]))) - want) <= near:
             raise UserError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +61,12 @@ def sampled(columns: dict[str, Vector], of: RecordingMap, f_n: float) -> Sampled
     if not vectors:
         if "i" not in found:
             with np.errstate(divide="ignore", invalid="ignore"):
-                i = np.hypot(found["p"], found["q"]) / found["V"]
-            found["i"] = np.where(found["V"] > _LEAST_V, i, np.nan)
+                size = np.hypot(found["p"], found["q"]) / found["V"]
+            found["i"] = np.where(found["V"] > _LEAST_V, size, np.nan)
         return Sampled(t, dt, found)
     v, i = vectors["v"], vectors["i"]
     s = v * np.conj(i)
-    made = {"p": s.real, "q": s.imag, "V": np.abs(v), "i": np.abs(i)}
+    made: dict[str, Vector] = {"p": s.real, "q": s.imag, "V": np.abs(v), "i": np.abs(i)}
     turns = of.v is not None and of.v.phases is not None
     made["f"] = _frequency(t, v, 1 / f_n) / f_n + (0.0 if turns else 1.0)
     return Sampled(t, dt, {**made, **found}, vectors if turns else {})
@@ -93,7 +94,7 @@ def sequences(t: Vector, x: NDArray[np.complex128], f_n: float) -> tuple[float, 
     return tuple(float(np.abs(np.mean((x * y)[-count:]))) for y in (turn, turn.conj()))  # type: ignore[return-value]
 
 
-def at_ticks(s: Sampled, x: NDArray[np.generic], t: Vector, T_s: float) -> NDArray[np.generic]:
+def at_ticks(s: Sampled, x: NDArray[Any], t: Vector, T_s: float) -> NDArray[Any]:
     """A signal at other instants, nan outside the recording: straight lines between samples, of
     which as many as lie in a tick are averaged first."""
     inside = np.clip(t, s.t[0], s.t[-1])
