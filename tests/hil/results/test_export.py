@@ -7,6 +7,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import comtrade
 import numpy as np
 import pytest
 from asammdf import MDF
@@ -114,6 +115,27 @@ def test_parquet_is_read_again_as_it_was(table, tmp_path):
         assert about[b"comment"].decode() == column.comment
     assert json.loads(found.schema.metadata[b"laws"]) == table.laws
     assert json.loads(found.schema.metadata[b"events"]) == table.events
+
+
+@pytest.mark.parametrize("kind", ["cfg", "cff"])
+def test_comtrade_is_read_by_its_package_with_scale_and_clock(table, tmp_path, kind):
+    export_run(table.folder, kind, tmp_path / f"run.{kind}", "si")
+    found = comtrade.load(str(tmp_path / f"run.{kind}"), use_numpy_arrays=True)
+    assert (found.rev_year, found.ft) == ("2013", "FLOAT32" if kind == "cfg" else "ASCII")
+    assert found.total_samples == table.ticks and found.frequency == pytest.approx(50.0)
+    assert np.allclose(found.time, table.columns["t"], atol=1e-9)
+    assert found.trigger_time == pytest.approx(0.01, abs=1e-6)
+    units = {c.name: (c.uu, c.ph) for c in found.cfg.analog_channels}
+    assert units["v_b_V"] == ("V", "B") and units["i_oa_A"] == ("A", "A")
+    assert units["true_p"] == ("p.u.", "")
+    rows = dict(zip(found.analog_channel_ids, found.analog, strict=True))
+    waves = table.three_phase(si=True)
+    assert {*waves} - {"t"} < {*rows}
+    for name, x in rows.items():
+        want = waves[name] if name in waves else table.columns[name]
+        step = 0.0 if kind == "cfg" else np.ptp(want) / 399_000  # half of one
+        near = step + 2e-7 * np.abs(want).max()  # and the package has 32-bit floats
+        assert np.abs(x - want).max() <= near, name
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ clause, and one that is no recording of the test is told before anything is judg
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.io import savemat
 import gfmhil
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
+from gfm_hil.results.export.comtrade import write_cfg, write_dat
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.studies.conformity.criteria.base import judge
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test, scenario_of
@@ -79,7 +81,9 @@ def waves(run: Run) -> Columns:
 def judged(place: Path, columns: Columns, of: str = "waves.toml", kind: str = "mat") -> Verdicts:
     """The verdicts of the clauses on a recording of such columns, by kind."""
     file = place / f"recording.{kind}"
-    if kind == "mat":
+    if kind == "cfg":
+        pass  # is there
+    elif kind == "mat":
         savemat(file, columns)
     else:
         head, rows = ",".join(columns), np.stack([*columns.values()], 1)
@@ -108,8 +112,23 @@ def test_the_phases_of_a_run_have_the_verdicts_of_the_run(
 ) -> None:
     found = judged(place, waves, kind="csv")
     assert found.pop("stays_in_step") == CANNOT  # the angle of a converter shows outside nowhere
-    assert found == {kind: verdict for kind, verdict in verdicts.items() if kind in found}
+    assert found == {kind: verdicts[kind] for kind in found}
     assert PASS in found.values()
+
+
+def test_comtrade_at_4_khz_has_the_verdicts_of_the_run(
+    place: Path, run: Run, waves: Columns, verdicts: Verdicts
+) -> None:
+    t = np.arange(0.0, waves["t"][-1], 1 / 4000)
+    slower = {n: np.interp(t, waves["t"], x) for n, x in waves.items() if n != "t"}
+    content = {"t": t, "tick": np.arange(len(t)), **slower}
+    scenario = run.scenario.model_copy(update={"T_s": 1 / 4000})
+    export = replace(run, scenario=scenario, columns=content, timing={})
+    write_cfg(export, place / "recording.cfg")
+    write_dat(export, place / "recording.dat")
+    found = judged(place, {}, kind="cfg")
+    assert found.pop("stays_in_step") == CANNOT
+    assert found == {kind: verdicts[kind] for kind in found}
 
 
 def test_a_clock_of_its_own_changes_no_verdict(

@@ -74,17 +74,18 @@ def _numbers(columns: dict[str, Any]) -> dict[str, Vector]:
 
 
 def _comtrade(file: Path) -> dict[str, Vector]:
-    need("comtrade", "comtrade", f"{file}", "comtrade")
+    need("comtrade", "comtrade", f"{file}", "export")
     import comtrade
 
-    opened = comtrade.Comtrade()
+    opened = comtrade.Comtrade(ignore_warnings=True, use_numpy_arrays=True)
     opened.load(str(file))
     found = {TIME: np.asarray(opened.time, np.float64)}
-    for names, rows in (
-        (opened.analog_channel_ids, opened.analog),
-        (opened.status_channel_ids, opened.status),
-    ):
-        found |= {n: np.asarray(x, np.float64) for n, x in zip(names, rows, strict=True)}
+    for about, x in zip(opened.cfg.analog_channels, opened.analog, strict=True):
+        # what is recorded on the secondary side of a transformer is told on the primary one
+        ratio = about.primary / about.secondary if about.pors.upper() == "S" else 1.0
+        found[about.name] = ratio * np.asarray(x, np.float64)
+    for name, x in zip(opened.status_channel_ids, opened.status, strict=True):
+        found[name] = np.asarray(x, np.float64)
     return found
 
 

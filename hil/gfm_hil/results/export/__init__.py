@@ -1,5 +1,5 @@
-"""Run folders as files that other tools open: MF4, MAT, Parquet, CSV, and CAN traffic as BLF; what
-each format needs to be installed, and writing one whole or not at all."""
+"""Run folders as files that other tools open: MF4, MAT, Parquet, CSV, COMTRADE, and CAN traffic as
+BLF; what each format needs to be installed, and writing one whole or not at all."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import replacing, write_text
+from gfm_hil.core.files import replacing
 from gfm_hil.recording.run import Run, bases
 from gfm_hil.recording.waveforms import three_phase
 
@@ -21,7 +21,7 @@ class Format:
     text: str  # what it is
     writer: str  # function that writes a run to a file, as module:name in this package
     needs: str = ""  # package that this takes
-    # ending of a second file that the first is read by, and the function of its text
+    # ending of a second file that the first goes with, and the function that writes it
     beside: tuple[str, str] | None = None
     columns: bool = True  # it holds the columns of the recording
 
@@ -31,9 +31,14 @@ FORMATS = {
     "csv": Format("text, every number exactly", "writers:write_csv"),
     "mat": Format("MATLAB 5", "writers:write_mat"),
     "parquet": Format("Apache Parquet", "writers:write_parquet", "pyarrow"),
+    "cfg": Format(
+        "COMTRADE C37.111-2013, 32-bit floats", "comtrade:write_cfg",
+        beside=(".dat", "comtrade:write_dat"),
+    ),
+    "cff": Format("COMTRADE C37.111-2013, one file of ASCII", "comtrade:write_cff"),
     "blf": Format(
         "CAN frames and their DBC, for Vector's tools", "blf:write_blf",
-        beside=(".dbc", "blf:dbc_text"), columns=False,
+        beside=(".dbc", "blf:write_dbc_file"), columns=False,
     ),
 }  # fmt: skip
 
@@ -58,7 +63,7 @@ def export_run(
             and A; see ``gfm_hil.recording.waveforms``.
 
     Returns:
-        What was written: the file and, of CAN frames, their DBC.
+        What was written: the file and, of CAN frames, their DBC, of a .cfg its .dat.
 
     Raises:
         UserError: no run, no such format, the recording lacks what the three phases need, or the
@@ -78,9 +83,10 @@ def export_run(
             part.touch()  # the packages say it each in its own way
             _function(form.writer)(run, part)
             if form.beside is not None:
-                suffix, text = form.beside
+                suffix, writer = form.beside
                 written.append(file.with_suffix(suffix))
-                write_text(written[-1], _function(text)(run))
+                with replacing(written[-1]) as second:
+                    _function(writer)(run, second)
     except OSError as problem:
         raise UserError(f"{file}: {problem.strerror or problem}") from None
     return written

@@ -46,12 +46,12 @@ def write_blf(run: Run, file: Path) -> None:
             )  # fmt: skip
 
 
-def dbc_text(run: Run) -> str:
-    """The DBC by which the frames are to be read."""
+def write_dbc_file(run: Run, file: Path) -> None:
+    """Write the DBC by which the frames are to be read."""
     options = can_options(run)
-    if options.dbc is None:
-        return write_dbc(options.fd)
-    return Path(options.dbc).read_text(encoding="utf-8")
+    own = options.dbc
+    text = write_dbc(options.fd) if own is None else Path(own).read_text(encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
 
 
 def can_options(run: Run) -> CanOptions:
