@@ -7,7 +7,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import comtrade
 import numpy as np
 import pytest
 from asammdf import MDF
@@ -119,6 +118,7 @@ def test_parquet_is_read_again_as_it_was(table, tmp_path):
 
 @pytest.mark.parametrize("kind", ["cfg", "cff"])
 def test_comtrade_is_read_by_its_package_with_scale_and_clock(table, tmp_path, kind):
+    comtrade = pytest.importorskip("comtrade")
     export_run(table.folder, kind, tmp_path / f"run.{kind}", "si")
     found = comtrade.load(str(tmp_path / f"run.{kind}"), use_numpy_arrays=True)
     assert (found.rev_year, found.ft) == ("2013", "FLOAT32" if kind == "cfg" else "ASCII")

@@ -119,6 +119,7 @@ def test_the_phases_of_a_run_have_the_verdicts_of_the_run(
 def test_comtrade_at_4_khz_has_the_verdicts_of_the_run(
     place: Path, run: Run, waves: Columns, verdicts: Verdicts
 ) -> None:
+    pytest.importorskip("comtrade")
     t = np.arange(0.0, waves["t"][-1], 1 / 4000)
     slower = {n: np.interp(t, waves["t"], x) for n, x in waves.items() if n != "t"}
     content = {"t": t, "tick": np.arange(len(t)), **slower}
