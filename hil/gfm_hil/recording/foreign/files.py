@@ -79,7 +79,10 @@ def _comtrade(file: Path) -> dict[str, Vector]:
 
     opened = comtrade.Comtrade(ignore_warnings=True, use_numpy_arrays=True)
     opened.load(str(file))
-    found = {TIME: np.asarray(opened.time, np.float64)}
+    rates, t = opened.cfg.sample_rates, np.asarray(opened.time, np.float64)
+    if len(rates) == 1 and rates[0][0] > 0:  # the package has 32-bit floats
+        t = np.arange(len(t)) / rates[0][0]
+    found = {TIME: t}
     for about, x in zip(opened.cfg.analog_channels, opened.analog, strict=True):
         # what is recorded on the secondary side of a transformer is told on the primary one
         ratio = about.primary / about.secondary if about.pors.upper() == "S" else 1.0

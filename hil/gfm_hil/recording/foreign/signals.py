@@ -48,7 +48,7 @@ def sampled(columns: dict[str, Vector], of: RecordingMap, f_n: float) -> Sampled
         raise UserError(f"it has {count} samples: must have 8 at least")
     t = np.arange(count) / of.rate_hz if of.rate_hz else of.scalar("t", columns)
     steps = np.diff(t)
-    dt = float(np.median(steps))
+    dt = float(t[-1] - t[0]) / (count - 1)
     if not (steps > 0).all() or np.max(np.abs(steps - dt)) > max(_EVEN * dt, 2e-6):
         k = int(np.argmax(np.abs(steps - dt)))
         raise UserError(

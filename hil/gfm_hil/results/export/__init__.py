@@ -32,7 +32,7 @@ FORMATS = {
     "mat": Format("MATLAB 5", "writers:write_mat"),
     "parquet": Format("Apache Parquet", "writers:write_parquet", "pyarrow"),
     "cfg": Format(
-        "COMTRADE C37.111-2013, 32-bit floats", "comtrade:write_cfg",
+        "COMTRADE C37.111-2013, 16-bit numbers", "comtrade:write_cfg",
         beside=(".dat", "comtrade:write_dat"),
     ),
     "cff": Format("COMTRADE C37.111-2013, one file of ASCII", "comtrade:write_cff"),
