@@ -1,5 +1,7 @@
 from gfm_hil.api.law import Law as Law
 from gfm_hil.api.law import laws as laws
+from gfm_hil.api.network_case import NetworkCase as NetworkCase
+from gfm_hil.api.network_case import network_from as network_from
 from gfm_hil.api.runs import BetweenTicks as BetweenTicks
 from gfm_hil.api.runs import Comparison as Comparison
 from gfm_hil.api.runs import NetworkRun as NetworkRun

@@ -35,7 +35,8 @@ class Branch:
     """R and L in series from node ``start`` to node ``end``, p.u.; L > 0.
 
     ``earthed`` is that of `Transformer`, "" if it is none. One that is not ``switched`` has no
-    breaker and feeds nothing.
+    breaker and feeds nothing. ``ratio`` is that of an ideal transformer at its start: the voltage
+    of the start over that behind it.
     """
 
     name: str
@@ -45,6 +46,12 @@ class Branch:
     R: float
     earthed: str = ""
     switched: bool = True
+    ratio: float = 1.0
+
+    def taken(self) -> tuple[tuple[str, float], ...]:
+        """Its nodes, and what a current of 1 from start to end takes away from each. By the same
+        factors the voltages of the nodes drive the current."""
+        return (self.start, 1.0 / self.ratio), (self.end, -1.0)
 
 
 @dataclass(frozen=True)
@@ -237,7 +244,7 @@ def assemble(circuit: Circuit, apart: str = "") -> Assembled:
     meets: dict[str, NDArray[np.float64]] = {}
     for j, branch in enumerate(branches):
         M[j, j] = -branch.R
-        for node, sign in ((branch.start, 1.0), (branch.end, -1.0)):
+        for node, sign in branch.taken():
             if node in fixed:
                 B[j, fixed[node]] = sign
             elif node in charged:
@@ -325,16 +332,16 @@ def find_voltage(
         if one not in rows:
             rows[one] = np.zeros(n_w + n_s)
             for branch in branches:
-                if one in (branch.start, branch.end):
-                    sign = 1.0 if branch.end == one else -1.0
-                    rows[one][order.index(branch.name)] = sign * through[one]
+                for end, sign in branch.taken():
+                    if end == one:
+                        rows[one][order.index(branch.name)] = -sign * through[one]
     if node in rows:
         return rows[node][:n_w], rows[node][n_w:]
     D = np.zeros((len(free), len(branches)))
     right = np.zeros((len(branches), n_w + n_s))
     for j, branch in enumerate(branches):
         right[j, order.index(branch.name)] = branch.R
-        for end, sign in ((branch.start, 1.0), (branch.end, -1.0)):
+        for end, sign in branch.taken():
             if end in rows:
                 right[j] -= sign * rows[end]
             else:

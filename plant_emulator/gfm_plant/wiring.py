@@ -310,8 +310,9 @@ class Wiring:
         if self.grid is None or not self.closed:
             return found
         for branch in self.whole((*self.units_lines, *self.branches, *self.fed_branches)):
-            if self.grid in (branch.start, branch.end):
-                found[branch.name] = 1.0 if branch.end == self.grid else -1.0
+            for node, sign in branch.taken():
+                if node == self.grid:
+                    found[branch.name] = -sign
         return found
 
     def islands(self) -> list[tuple[str, ...]]:
@@ -381,9 +382,10 @@ class Wiring:
                 return {}
             share = R / seen.real if seen.real > 0 else 1.0
         return {
-            branch.name: share if branch.end == place else -share
+            branch.name: -sign * share
             for branch in circuit.branches
-            if place in (branch.start, branch.end)
+            for node, sign in branch.taken()
+            if node == place
         }
 
     def modes(self, blocked: frozenset[int], contact: Contact | None) -> tuple[Modes, list[str]]:
@@ -439,19 +441,22 @@ class Wiring:
 
     def _zero_sequence_between(self, one: str, other: str) -> complex | None:
         """The impedance of closed lines and star points between two nodes."""
-        found = [(*ends, 1 / complex(part.R, part.L)) for part, ends in self.zero_branches()]
+        found = [
+            (dict(zip(ends, (sign for _, sign in part.taken()), strict=True)), part)
+            for part, ends in self.zero_branches()
+        ]
         reached = {other}
-        while more := {end for a, b, _ in found if {a, b} & reached for end in (a, b)} - reached:
+        while more := {end for at, _ in found if {*at} & reached for end in at} - reached:
             reached |= more
         if one not in reached:
             return None
         nodes = sorted(reached - {other})
         Y = np.zeros((len(nodes), len(nodes)), complex)
-        for a, b, y in found:
-            if a in reached:
-                at = [nodes.index(end) for end in (a, b) if end != other]
-                sign = np.array([1.0, -1.0][: len(at)])
-                Y[np.ix_(at, at)] += np.outer(sign, sign) * y
+        for signs, part in found:
+            if {*signs} <= reached:
+                at = [nodes.index(end) for end in signs if end != other]
+                sign = np.array([signs[nodes[k]] for k in at])
+                Y[np.ix_(at, at)] += np.outer(sign, sign) / complex(part.R, part.L)
         return complex(np.linalg.inv(Y)[nodes.index(one), nodes.index(one)])
 
     def zero_branches(self) -> Iterator[tuple[Branch, tuple[str, str]]]:
@@ -567,7 +572,7 @@ class Wiring:
                 yield branch
                 continue
             at = self.fault.position
-            yield Branch(branch.name, branch.start, "beyond", at * branch.L, at * branch.R)
+            yield replace(branch, end="beyond", L=at * branch.L, R=at * branch.R)
             yield Branch("beyond", "beyond", branch.end, (1 - at) * branch.L, (1 - at) * branch.R)
 
 

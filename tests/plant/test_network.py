@@ -338,6 +338,29 @@ def test_a_transformer_is_its_leakage_and_its_magnetising_inductance():
     assert one.st["x"] == pytest.approx(other.st["x"], abs=1e-11)
 
 
+@pytest.mark.parametrize("kind", ["3ph", "LL"])
+def test_behind_taps_all_impedances_are_those_times_the_square_of_the_ratio(kind):
+    t, found = 1.07, []
+    for ratio, square in ((t, 1.0), (1.0, t**2)):
+        plant = make(
+            {"a": ({}, "m"), "b": ({}, "m")}, grid="far",
+            lines={"feeder": {"start": "m", "end": "far", "L": 0.2, "R": 0.02}},
+            transformers={
+                "t": {"start": "m", "end": "n", "S": 1.0, "X": 0.1 * square, "R": 0.01 * square,
+                      "ratio": ratio}
+            },
+            loads={"z": {"node": "n", "P": 0.4 / square, "Q": 0.2 / square}},
+            capacitors={"c": {"node": "n", "Q": 0.1 / square}},
+        )  # fmt: skip
+        u = start(plant, 1.0, [0.1, 0.15])
+        phase_jump(plant, 10.0)
+        go(plant, u, 100)
+        fault(plant, None, 0.3 * square, 0.005, node="n", kind=kind)
+        go(plant, u, 200)
+        found.append(plant.st["x"].copy())
+    assert found[0] == pytest.approx(found[1], abs=1e-10)
+
+
 @pytest.mark.parametrize(
     ("earthed", "node", "Z_0"),
     [

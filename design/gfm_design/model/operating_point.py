@@ -96,12 +96,16 @@ def operating_points(
         NoEquilibrium: there is none, or Newton's method does not find it.
     """
     network = _NetworkEquilibrium(plant, laws, refs)
-    z = _newton(network.residual, network.first(refs))
-    if z is None:
-        each = zip(plant.wiring.units, laws, strict=True)
-        names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
-        raise NoEquilibrium(f"{names}: have no common steady state")
-    return network.found(z)
+    return network.found(network.solved())
+
+
+def node_voltages(
+    plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
+) -> dict[str, complex]:
+    """The voltages of the nodes at that operating point, p.u., each against the grid's or, in an
+    island, that of its first node. Arguments and errors as of ``operating_points``."""
+    network = _NetworkEquilibrium(plant, laws, refs)
+    return network.voltages(network.solved())
 
 
 class _NetworkEquilibrium:
@@ -113,6 +117,7 @@ class _NetworkEquilibrium:
 
     def __init__(self, plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]) -> None:
         self.wiring = wiring = plant.wiring
+        self.laws, self.refs = laws, refs
         self.V_g, self.omega_g = complex(plant.now[0]["V_g"]), float(plant.now[0]["omega_g"])
         self.sides = [
             _ConverterEquilibrium(plant.par[k : k + 1], law, np.asarray(ref))
@@ -156,11 +161,12 @@ class _NetworkEquilibrium:
             missing[unit.terminal] = 0j  # of a core, which draws nothing in steady state
         for branch in wiring.branches:
             if branch.name not in wiring.opened:
-                ends_of = volts.get(branch.start, 0j) - volts.get(branch.end, 0j)
-                i = ends_of / complex(branch.R, speeds[branch.start] * branch.L)
-                missing[branch.start] -= i
-                if branch.end != GROUND:
-                    missing[branch.end] += i
+                ends = branch.taken()
+                i = sum(sign * volts.get(node, 0j) for node, sign in ends)
+                i /= complex(branch.R, speeds[branch.start] * branch.L)
+                for node, sign in ends:
+                    if node != GROUND:
+                        missing[node] -= sign * i
         for shunt in wiring.shunts:
             if shunt.name not in wiring.opened:
                 missing[shunt.node] -= volts[shunt.node] / shunt.R
@@ -177,14 +183,27 @@ class _NetworkEquilibrium:
         met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
 
-    def first(self, refs: Sequence[Vector]) -> Vector:
+    def solved(self) -> Vector:
+        """The unknowns. Raises NoEquilibrium: there is none, or the search does not find it."""
+        z = _newton(self.residual, self.first())
+        if z is None:
+            each = zip(self.wiring.units, self.laws, strict=True)
+            names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
+            raise NoEquilibrium(f"{names}: have no common steady state")
+        return z
+
+    def first(self) -> Vector:
         """Where the search begins."""
-        first = _first_voltages(self.wiring, refs)
+        first = _first_voltages(self.wiring, self.refs)
         each = zip(self.wiring.units, self.sides, strict=True)
         starts = [side.first(first[unit.node], 1.0) for unit, side in each]
         volts = [[first[node] if node in self.alive else 0.0, 0.0] for node in self.free]
         others = np.zeros(sum(self.sizes[len(starts) + 1 :]))
         return np.concatenate([*starts, np.ravel(volts), others, np.ones(len(self.islands))])
+
+    def voltages(self, z: Vector) -> dict[str, complex]:
+        """Of the nodes, p.u."""
+        return self._split(z)[1]
 
     def found(self, z: Vector) -> tuple[list[OperatingPoint], list[tuple[Vector, float]]]:
         """The operating points, and the unknowns and the speed of each component with a source."""

@@ -46,6 +46,7 @@ COMMANDS = {
     "doctor": ("doctor", "check this machine's fitness for real time, and say what to improve"),
     "schema": ("schema", "write the JSON schema of a scenario, law or other file, for editors"),
     "new": ("new", "write a law or scenario file to start from, with comments"),
+    "network": ("network", "make a network of a published power-flow case"),
     "scenarios": ("scenarios", "list the scenarios that ship"),
     "keys": ("keys", "make a key pair per role, for ZeroMQ between two machines"),
     "deploy": ("deploy", "write service units, container files and the tuning script to a folder"),

@@ -11,7 +11,7 @@ from gfm_plant.parameters import NonNegative, Positive
 
 class Transformer(Component):
     """A transformer between two nodes: its leakage in series, and its magnetising inductance from
-    the start to ground. It has the ratio of the nominal voltages, so that in p.u. it has none; the
+    the start to ground. Its ratio is that of the nominal voltages, but for taps in ``ratio``; the
     angle by which a delta winding turns all voltages is left out, and it does not saturate. For a
     zero sequence the earthed star point of one side, with a delta on the other, is a path to ground
     through the leakage."""
@@ -31,6 +31,11 @@ class Transformer(Component):
     X_m: Positive | None = Field(
         None, description="magnetising reactance, p.u. of its rating; none: no magnetising current"
     )
+    ratio: Positive = Field(
+        1.0,
+        description="voltage of its start over that of its end without load, p.u.: the position of "
+        "its taps",
+    )
     earthed: Literal["end", "start", "both", "none"] = Field(
         "end",
         description="where its star points are earthed; the other winding is a delta, and with "
@@ -40,8 +45,9 @@ class Transformer(Component):
 
     def elements(self, name: str) -> list[Branch]:
         leakage = Branch(
-            name, self.start, self.end, self.X / self.S, self.R / self.S, earthed=self.earthed
-        )
+            name, self.start, self.end, self.X / self.S, self.R / self.S, self.earthed,
+            ratio=self.ratio,
+        )  # fmt: skip
         if self.X_m is None:
             return [leakage]
         X_m = self.X_m / self.S
@@ -49,4 +55,5 @@ class Transformer(Component):
 
     def label(self) -> str:
         text = f"S {self.S:g}, X {self.X:.3g}, R {self.R:.2g}"
+        text += f", ratio {self.ratio:g}" * (self.ratio != 1.0)
         return text if self.X_m is None else f"{text}, $X_m$ {self.X_m:g}"

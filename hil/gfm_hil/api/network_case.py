@@ -1,0 +1,305 @@
+"""Published power-flow cases as networks: converters in place of some machines, at the operating
+point of the power flow."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import root
+
+from gfm_design.model.operating_point import node_voltages, operating_point
+from gfm_hil.api.power_flow import PowerFlow, read_pandapower
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import check_empty, write_text
+from gfm_hil.engine.setup import make_benches
+from gfm_hil.scenario import load_scenario, toml_text
+from gfm_plant import NoEquilibrium, Plant, make_plant
+from gfm_plant.components import COMPONENTS
+from gfm_runtime import LawError, discretise, load_law
+from gfm_runtime.signals import Y_NAMES
+
+P_AT, V_AT = Y_NAMES.index("p"), Y_NAMES.index("V")
+_LEAST_BRANCH = 1e-9  # p.u.; a smaller reactance is none
+_NEAR = 1e-6  # p.u.; how far the network's steady state may lie from the power flow
+# of PowerSimulationsDynamics.jl's inverter (scenarios/published/psid_inverter.toml), p.u.; its
+# line stands for the converter's own transformer
+_CONVERTER = {"L_f": 0.08, "R_f": 0.003, "C_f": 0.074, "L_g": 0.2, "R_g": 0.01}
+_STORED_S = 0.03  # energy of its DC capacitor by its rating, as of the paper's converter
+_V_N, _V_DC = 690.0, 1500.0  # V
+# of the machines in Kundur's two areas, whose other values are those of a machine here
+_MACHINE = {"H": 6.5, "avr": {}}
+
+
+@dataclass(frozen=True)
+class NetworkCase:
+    """A scenario with a network, and the converter files that it names."""
+
+    content: dict[str, Any]  #: of the scenario file
+    converters: dict[str, dict[str, Any]]  #: by file name, content
+    ignored: Sequence[str]  #: what the case has and this has not, and what this adds
+    voltages: Mapping[str, complex] = field(repr=False)  #: of its nodes by the power flow, p.u.
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``network.toml`` and its converter files; returns the path of the former.
+
+        Raises:
+            UserError: the folder is not empty, or the network has no steady state like the
+                power flow.
+        """
+        folder = Path(folder)
+        check_empty(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, converter in self.converters.items():
+            write_text(folder / name, toml_text(converter))
+        write_text(folder / "network.toml", toml_text(self.content))
+        far = self.distance(folder / "network.toml")
+        if far > _NEAR:
+            raise UserError(
+                f"{folder / 'network.toml'}: in its steady state a voltage is {far:.2g} p.u. from"
+                " that of the power flow"
+            )
+        return folder / "network.toml"
+
+    def distance(self, file: str | Path) -> float:
+        """How far the voltages of the network's steady state are from the power flow, p.u."""
+        benches = make_benches(load_scenario(file, in_process=True))
+        laws = [b.controller.active_law for b in benches]
+        refs = [np.asarray(b.scenario.references.vector()) for b in benches]
+        there = node_voltages(benches[0].plant, laws, refs)
+        own, case = (
+            np.array([one[name] for name in self.voltages]) for one in (there, self.voltages)
+        )
+        turn = np.vdot(own, case)
+        return float(np.abs(own * turn / abs(turn) - case).max())
+
+
+def network_from(
+    case: Any, converters: Mapping[str | int, str], slack: str = "machine", title: str = ""
+) -> NetworkCase:
+    """Make a network of a power-flow case.
+
+    Each bus with generators gets one synchronous machine of order 6 with a voltage regulator and a
+    governor, or the converter that is named for it, which has the rating and the operating point
+    of what it replaces. Loads become constant impedances that draw at the case's voltage what they
+    draw there, the charging of lines capacitors at the buses.
+
+    Args:
+        case: a net of pandapower, the name of one of its cases (case9, case39, ...), or the path
+            of a net as JSON.
+        converters: by the name of a bus with generators, the law of the converter there; the first
+            one's rating is the network's base.
+        slack: machine, or grid: what stands at the slack bus, if no converter does.
+        title: of the scenario.
+
+    Raises:
+        UserError: an unknown case, bus or law; a case that has no slack or does not converge; a
+            part that a network cannot have; a generator without a rating; a law that has no steady
+            state there.
+    """
+    flow = read_pandapower(case, title)
+    names = [bus.name for bus in flow.buses]
+    laws = {str(bus): law for bus, law in converters.items()}
+    feeding = [b.name for b in flow.buses if b.machine or b.name == names[flow.slack]]
+    if not laws:
+        raise UserError(
+            f"{flow.title}: name a bus for a converter; {', '.join(feeding)} have generators"
+        )
+    for name in laws:
+        if name not in feeding:
+            what = "has no generator" if name in names else "is no bus of the case"
+            raise UserError(f"{flow.title}: bus {name}: {what}; {', '.join(feeding)} have one")
+    if slack not in ("machine", "grid"):
+        raise UserError(f"slack = {slack!r}: must be machine or grid")
+    return _Build(flow, laws, slack == "grid").case()
+
+
+class _Build:
+    """A network of a solved case, being written; p.u. of the first converter from here on."""
+
+    def __init__(self, flow: PowerFlow, laws: Mapping[str, str], grid: bool) -> None:
+        self.flow, self.laws = flow, laws
+        at = {bus.name: k for k, bus in enumerate(flow.buses)}
+        self.S_b = self._rating(at[next(iter(laws))])
+        self.scale = flow.S_b / self.S_b
+        self.grid = flow.slack if grid and flow.buses[flow.slack].name not in laws else None
+        self.ignored = list(flow.ignored)
+        self.files: dict[str, dict[str, Any]] = {}
+        self.par: Any = None  # the same for all, in p.u. of each
+        self.network: dict[str, Any] = {} if self.grid is None else {"grid": self._node(self.grid)}
+
+    def _node(self, k: int) -> str:
+        return f"bus{self.flow.buses[k].name}"
+
+    def _rating(self, k: int) -> float:
+        bus = self.flow.buses[k]
+        if bus.rating is None:
+            raise UserError(
+                f"{self.flow.title}: bus {bus.name}: its generator has no rating: give sn_mva or"
+                " max_p_mw"
+            )
+        return bus.rating * self.flow.S_b
+
+    def _put(self, table: str, name: str, part: dict[str, Any]) -> None:
+        self.network.setdefault(table, {})[name] = part
+
+    def case(self) -> NetworkCase:
+        for k, bus in enumerate(self.flow.buses):
+            if bus.name in self.laws:
+                self._converter(k, self.laws[bus.name])
+        self._branches()
+        for k, bus in enumerate(self.flow.buses):
+            self._load(k)
+            if (
+                bus.name not in self.laws
+                and k != self.grid
+                and (bus.machine or k == self.flow.slack)
+            ):
+                self._machine(k)
+        content = {
+            "title": self.flow.title,
+            "description": "Made from a power-flow case. " + " ".join(self.ignored),
+            "duration": 5.0,
+            "link": {"type": "inproc"},
+        }
+        if self.grid is not None:
+            content["plant"] = {"grid": {"V_g": abs(self.flow.buses[self.grid].V)}}
+        content["network"] = self.network
+        volts = {self._node(k): bus.V for k, bus in enumerate(self.flow.buses)}
+        return NetworkCase(content, self.files, self.ignored, volts)
+
+    def _branches(self) -> None:
+        feeding = {k for k, bus in enumerate(self.flow.buses) if bus.machine}
+        names = Counter[str]()
+        for branch in self.flow.branches:
+            a, b = (self.flow.buses[k].name for k in (branch.start, branch.end))
+            kind = "transformer" if branch.transformer else "line"
+            name = f"{kind}{a}-{b}"
+            names[name] += 1
+            name += f"-{names[name]}" * (names[name] > 1)
+            R, X = (part / self.scale for part in (branch.Z.real, branch.Z.imag))
+            if R < 0 or X < _LEAST_BRANCH:
+                raise UserError(
+                    f"{self.flow.title}: {kind} {a} to {b}: R = {branch.Z.real:g}, X ="
+                    f" {branch.Z.imag:g} p.u.: R must be >= 0, X > 0"
+                )
+            ends = {"start": self._node(branch.start), "end": self._node(branch.end)}
+            if not branch.transformer:
+                self._put("lines", name, {**ends, "L": X, "R": R})
+                continue
+            earthed = "both"
+            if branch.end in feeding or branch.start in feeding:  # the side of a machine is a delta
+                earthed = "start" if branch.end in feeding else "end"
+            values = {"S": 1.0, "X": X, "R": R, "earthed": earthed, "ratio": branch.ratio}
+            self._put("transformers", name, {**ends, **values})
+
+    def _load(self, k: int) -> None:
+        """Load, shunt, and the charging of lines at a bus, as what draws the same there."""
+        bus = self.flow.buses[k]
+        charging = sum(
+            b.B / 2 / (b.ratio**2 if b.start == k else 1.0)
+            for b in self.flow.branches
+            if k in (b.start, b.end)
+        )
+        drawn = bus.load / abs(bus.V) ** 2 * self.scale
+        shunt = (bus.shunt + 1j * charging) * self.scale
+        capacitor = max(shunt.imag, 0.0) + max(-drawn.imag, 0.0)
+        if k == self.grid:
+            return  # the grid holds its voltage
+        if drawn.real < 0:
+            raise UserError(
+                f"{self.flow.title}: bus {bus.name}: its loads draw {bus.load.real:g} p.u.; static"
+                " generators are not for a network: make them generators"
+            )
+        if drawn.real or drawn.imag > 0:
+            P_Q = {"P": drawn.real, "Q": max(drawn.imag, 0.0)}
+            self._put("loads", f"load{bus.name}", {"node": self._node(k), **P_Q})
+        if shunt.real > 0:
+            self._put("loads", f"shunt{bus.name}", {"node": self._node(k), "P": shunt.real})
+        if shunt.imag < 0:
+            self._put(
+                "loads", f"reactor{bus.name}", {"node": self._node(k), "P": 0.0, "Q": -shunt.imag}
+            )
+        if capacitor:
+            self._put("capacitors", f"charging{bus.name}", {"node": self._node(k), "Q": capacitor})
+
+    def _machine(self, k: int) -> None:
+        bus, S = self.flow.buses[k], self._rating(k)
+        i = (bus.machine / bus.V).conjugate() * self.flow.S_b / S
+        R = float(_default("synchronous_machines", "R"))
+        P = bus.machine.real * self.flow.S_b / S + R * abs(i) ** 2
+        values = {"node": self._node(k), "S": S / self.S_b, "P": P, "V": abs(bus.V), **_MACHINE}
+        self._put("synchronous_machines", f"G{bus.name}", values)
+
+    def _converter(self, k: int, law: str) -> None:
+        bus, S = self.flow.buses[k], self._rating(k)
+        name, file = f"C{bus.name}", f"converter{bus.name}.toml"
+        self.files[file] = _converter_file(S, self.flow.f)
+        power = bus.machine * self.flow.S_b / S
+        if self.par is None:
+            self.par = _parameters(self.files[file])
+        try:
+            references = _references(self.par, law, abs(bus.V), power)
+        except (NoEquilibrium, LawError) as problem:
+            raise UserError(f"{self.flow.title}: bus {bus.name}: {problem}") from None
+        self._put(
+            "converters",
+            name,
+            {"node": self._node(k), "law": law, "references": references,
+             "plant": {"converter": file}},
+        )  # fmt: skip
+
+
+def _default(table: str, name: str) -> Any:
+    return COMPONENTS[table].model_fields[name].default
+
+
+def _converter_file(S: float, f: float) -> dict[str, Any]:
+    """A converter of a rating, VA, in SI units."""
+    omega, Z = 2 * math.pi * f, _V_N**2 / S
+    return {
+        "source": "PowerSimulationsDynamics.jl, test/data_tests: filt(), in p.u. of this rating",
+        "S_n": S, "V_n": _V_N, "omega_n": omega, "V_dcref": _V_DC,
+        "L_f": _CONVERTER["L_f"] * Z / omega, "R_f": _CONVERTER["R_f"] * Z,
+        "C_f": _CONVERTER["C_f"] / Z / omega,
+        "L_g": _CONVERTER["L_g"] * Z / omega, "R_g": _CONVERTER["R_g"] * Z,
+        "C_dc": 2 * _STORED_S * S / _V_DC**2,
+    }  # fmt: skip
+
+
+def _parameters(converter: dict[str, Any]) -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "converter.toml")
+        file.write_text(toml_text(converter), encoding="utf-8")
+        return make_plant(Plant(converter=str(file)), 1e-4).par
+
+
+def _references(par: Any, name: str, V_bus: float, S: complex) -> dict[str, float]:
+    """References with which a law brings the power S, p.u. of the converter, to a bus.
+
+    A law without an integrator comes to rest beside its references, so they are searched.
+
+    Raises:
+        NoEquilibrium: there are none.
+    """
+    law = discretise(load_law(name).first, 1e-4)
+    i = (S / V_bus).conjugate()
+    v = V_bus + complex(_CONVERTER["R_g"], _CONVERTER["L_g"]) * i
+    s, V = v * i.conjugate(), abs(v)
+
+    def missed(z: NDArray[np.float64]) -> NDArray[np.float64]:
+        ref = np.array([1.0, z[0], 1.0, s.imag, z[1]])
+        y = operating_point(par, law, ref, 1.0, V_bus).y
+        return np.array([y[P_AT] - s.real, y[V_AT] - V])
+
+    solution = root(missed, [s.real, V], tol=1e-13)
+    if np.abs(missed(solution.x)).max() > 1e-9:
+        raise NoEquilibrium(f"{name} cannot bring P = {S.real:.4g}, Q = {S.imag:.4g} p.u. there")
+    return {"P_ref": float(solution.x[0]), "Q_ref": s.imag, "V_ref": float(solution.x[1])}

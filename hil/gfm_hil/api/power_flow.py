@@ -1,0 +1,167 @@
+"""Power-flow cases by pandapower: solved, and read as it hands them to PYPOWER."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.core.errors import UserError, need
+from gfm_runtime.errors import meant
+
+_MOST_BUSES = 500  # the matrices of a network are dense
+_NEAR = 1e-6  # p.u.; a smaller current comes from rounding
+_IGNORED = {
+    "controller": "they stand where the power flow leaves them",
+    "sgen": "taken off the loads of their buses",
+    "storage": "taken off the loads of their buses",
+}
+"""Tables of pandapower that a network has no counterpart of, and what becomes of them."""
+
+
+class Bus(NamedTuple):
+    """A bus, in p.u. of the case's power; P and Q are what comes."""
+
+    name: str
+    V: complex  # by the power flow
+    load: complex  # what is drawn
+    shunt: complex  # admittance
+    machine: complex  # what its machines bring
+    rating: float | None  # of its machines
+
+
+class Branch(NamedTuple):
+    start: int  # the taps are there
+    end: int
+    Z: complex
+    B: float  # charging, both ends together
+    ratio: float
+    transformer: bool
+
+
+@dataclass(frozen=True)
+class PowerFlow:
+    """A solved case in p.u. of ``S_b``."""
+
+    title: str
+    S_b: float  #: VA
+    f: float  #: Hz
+    buses: Sequence[Bus]
+    branches: Sequence[Branch]
+    slack: int  #: bus
+    ignored: Sequence[str]  #: what the case has and a network has not
+
+
+def read_pandapower(case: Any, title: str) -> PowerFlow:
+    """Solve a net of pandapower, and read it as pandapower itself hands it to PYPOWER."""
+    need("pandapower", "pandapower", "a power-flow case", "networks")
+    import pandapower  # an optional package, and seconds of imports
+    from pandapower.converter.pypower import to_ppc
+
+    if isinstance(case, str | Path):
+        title, case = title or Path(case).stem, _load_pandapower(str(case))
+    title = title or str(case.name or "case")
+    if len(case.bus) > _MOST_BUSES:
+        raise UserError(f"{title}: {len(case.bus)} buses: at most {_MOST_BUSES}")
+    if not case.ext_grid.in_service.any() and not case.gen.query("slack and in_service").size:
+        raise UserError(f"{title}: has no slack: an ext_grid, or a gen with slack")
+    try:
+        pandapower.runpp(
+            case, init="dc", tolerance_mva=1e-9, numba=False, enforce_q_lims=False,
+            calculate_voltage_angles=False, trafo_model="pi",
+        )  # fmt: skip
+    except Exception as problem:  # of many kinds, from inside
+        raise UserError(f"{title}: its power flow does not converge: {problem}") from None
+    ppc = to_ppc(case, calculate_voltage_angles=False, trafo_model="pi", init="results", mode="pf")
+    S_b = ppc["baseMVA"]
+    names: dict[int, str] = {}
+    where = case._pd2ppc_lookups["bus"]
+    unique = case.bus.name.notna().all() and case.bus.name.astype(str).is_unique
+    called = {index: str(case.bus.name[index] if unique else index) for index in case.bus.index}
+    if len(dead := case.bus.index[case.bus.in_service & case.res_bus.vm_pu.isna()]):
+        raise UserError(f"{title}: bus {called[dead[0]]} has no path to the slack")
+    for index, name in called.items():
+        names.setdefault(int(where[index]), name)
+    bus, branch = ppc["bus"], ppc["branch"]
+    place = {int(number): k for k, number in enumerate(bus[:, 0])}
+    V = bus[:, 7] * np.exp(1j * np.radians(bus[:, 8]))
+    load, shunt = (bus[:, 2] + 1j * bus[:, 3]) / S_b, (bus[:, 4] + 1j * bus[:, 5]) / S_b
+    branches = []
+    for row in branch[branch[:, 10] > 0]:
+        ratio, (a, b) = row[8] or 1.0, (place[int(n)] for n in row[:2])
+        transformer = ratio != 1.0 or bus[a, 9] != bus[b, 9]
+        Z = complex(row[2], row[3])
+        branches.append(Branch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
+    comes = V * (_admittance(shunt, branches) @ V).conj() + load
+    ratings = _ratings(case, where, place, S_b)
+    ignored = [
+        f"{len(case[table])} {table}: {why}."
+        for table, why in _IGNORED.items()
+        if len(case.get(table, ()))
+    ]
+    if turning := int((case.trafo.shift_degree % 30 != 0).sum()):
+        ignored.append(f"{turning} trafo: they turn no phase.")
+    buses = [
+        Bus(names[int(row[0])], V[k], load[k], shunt[k],
+             comes[k] if k in ratings else 0j, ratings.get(k))
+        for k, row in enumerate(bus)
+    ]  # fmt: skip
+    for k, one in enumerate(buses):
+        if k not in ratings and abs(comes[k]) > _NEAR:
+            raise UserError(
+                f"{title}: bus {one.name}: {comes[k]:.3g} p.u. come from parts that this does not"
+                " read (iron losses of transformers, for one)"
+            )
+    slack = int(np.flatnonzero(bus[:, 1] == 3)[0])
+    return PowerFlow(title, S_b * 1e6, float(case.f_hz), buses, branches, slack, ignored)
+
+
+def _ratings(
+    case: Any, where: Any, place: Mapping[int, int], S_b: float
+) -> dict[int, float | None]:
+    """Rating of the generators of each bus, p.u.; None if one of them has none."""
+    ratings: dict[int, float | None] = {}
+    for table in ("gen", "ext_grid"):
+        for _, row in case[table][case[table].in_service].iterrows():
+            own = next(
+                (float(row[n]) for n in ("sn_mva", "max_p_mw") if n in row and row[n] > 0), None
+            )
+            k = place[int(where[row.bus])]
+            before = ratings.get(k, 0.0)
+            ratings[k] = None if own is None or before is None else before + own / S_b
+    return ratings
+
+
+def _load_pandapower(case: str) -> Any:
+    """A case that pandapower ships, or a file."""
+    import pandapower
+    import pandapower.networks as shipped
+
+    if case.endswith(".json"):
+        try:
+            return pandapower.from_json(case)
+        except Exception as problem:
+            raise UserError(f"{case}: is no net of pandapower: {problem}") from None
+    known = [n for n in dir(shipped) if n.startswith("case") and callable(getattr(shipped, n))]
+    if case not in known:
+        raise UserError(
+            f"{case!r}: must be one of {', '.join(known)}, or the path of a net of pandapower"
+            f" (.json){meant(case, known)}"
+        )
+    return getattr(shipped, case)()
+
+
+def _admittance(shunt: NDArray[Any], branches: Sequence[Branch]) -> NDArray[np.complex128]:
+    Y = np.diag(shunt).astype(complex)
+    for one in branches:
+        y, a, b = 1 / one.Z, one.start, one.end
+        own = y + 0.5j * one.B
+        Y[a, a] += own / one.ratio**2
+        Y[b, b] += own
+        Y[a, b] -= y / one.ratio
+        Y[b, a] -= y / one.ratio
+    return Y

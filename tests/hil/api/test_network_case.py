@@ -1,0 +1,138 @@
+"""Power-flow cases as networks, against the power flow of pandapower."""
+
+import copy
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.cli import main
+from gfm_hil.core.errors import UserError
+
+pandapower = pytest.importorskip("pandapower")
+networks = pytest.importorskip("pandapower.networks")
+pytestmark = pytest.mark.filterwarnings("ignore:tap_dependency_table")  # of its own cases
+
+
+def small():
+    """A slack and a generator behind taps and a line, with a load and a capacitor."""
+    net = pandapower.create_empty_network(f_hz=60.0, sn_mva=100.0)
+    a, b, c = (pandapower.create_bus(net, 110.0, name=name) for name in "abc")
+    pandapower.create_ext_grid(net, a, vm_pu=1.02, max_p_mw=100.0)
+    pandapower.create_gen(net, b, p_mw=40.0, vm_pu=1.01, sn_mva=60.0)
+    pandapower.create_line_from_parameters(net, a, b, 30.0, 0.1, 0.4, 9.0, 1.0)
+    pandapower.create_line_from_parameters(net, b, c, 20.0, 0.1, 0.4, 9.0, 1.0)
+    pandapower.create_load(net, c, p_mw=50.0, q_mvar=20.0)
+    pandapower.create_shunt(net, c, q_mvar=-10.0, p_mw=1.0)
+    return net
+
+
+@pytest.mark.parametrize(
+    ("case", "converters"),
+    [
+        ("case9", {"2": "droop-3", "3": "mimo-gfm"}),
+        ("case14", {"1": "vsg-2"}),  # taps, and a converter at the slack
+        pytest.param("case39", {"30": "droop-3", "38": "vsg-2"}, marks=pytest.mark.full),
+        pytest.param("case118", {"69": "droop-3"}, marks=pytest.mark.full),
+    ],
+)
+def test_the_steady_state_is_the_power_flow(case, converters, tmp_path):
+    slack = "grid" if case == "case9" else "machine"
+    made = gfmhil.network_from(case, converters, slack)
+    assert made.distance(made.save(tmp_path / "net")) < 1e-8
+    net = getattr(networks, case)()
+    # trafo_model "pi", as MATPOWER has it: "t" moves case118 by 2.4e-5 p.u.
+    pandapower.runpp(
+        net, tolerance_mva=1e-9, numba=False, trafo_model="pi", calculate_voltage_angles=False
+    )
+    published = dict(zip(net.bus.name.astype(str), net.res_bus.vm_pu, strict=True))
+    own = {node.removeprefix("bus"): abs(v) for node, v in made.voltages.items()}
+    assert own == pytest.approx(published, abs=1e-8)
+
+
+@pytest.mark.full
+def test_a_run_stays_there_until_a_line_opens(tmp_path):
+    case = gfmhil.network_from("case9", {"2": "droop-3", "3": "vsg-2"})
+    case.content["events"] = [{"type": "breaker", "t": 0.5, "name": "line4-5", "closed": False}]
+    case.content["duration"] = 1.0
+    run = gfmhil.run_network(case.save(tmp_path / "net"))
+    for name, bus in (("C2", "2"), ("C3", "3")):
+        p, omega = (run[name].signals[n] for n in ("p", "omega_u"))
+        assert np.ptp(p[:4999]) < 1e-9 and np.ptp(p[5001:]) > 0.01, bus
+        assert abs(omega[:4999] - 1).max() < 1e-9
+
+
+def test_of_python_a_net_of_ones_own(tmp_path):
+    net = small()
+    case = gfmhil.network_from(net, {"b": "droop-3"}, title="mine")
+    assert case.distance(case.save(tmp_path / "net")) < 1e-8
+    network = case.content["network"]
+    assert case.content["title"] == "mine" and [*network["converters"]] == ["Cb"]
+    assert case.converters["converterb.toml"]["S_n"] == 60e6
+    assert network["synchronous_machines"]["Ga"]["S"] == pytest.approx(100 / 60)
+    # the load draws at its voltage what the case says: 50 MW of 60 MVA
+    assert network["loads"]["loadc"]["P"] * abs(case.voltages["busc"]) ** 2 == pytest.approx(5 / 6)
+
+
+def without_slack(net):
+    net.ext_grid.in_service = False
+
+
+def island(net):
+    net.line.loc[1, "in_service"] = False
+
+
+def without_rating(net):
+    net.gen["sn_mva"] = np.nan
+
+
+def too_much(net):
+    net.load["p_mw"] = 5000.0
+
+
+def generates(net):
+    pandapower.create_sgen(net, 2, p_mw=60.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (without_slack, "mine: has no slack: an ext_grid, or a gen with slack"),
+        (island, "mine: bus c has no path to the slack"),
+        (without_rating, "mine: bus b: its generator has no rating: give sn_mva or max_p_mw"),
+        (too_much, "mine: its power flow does not converge: "),
+        (generates, "mine: bus c: its loads draw -0.1 p.u.; static generators"),
+    ],
+)
+def test_what_no_network_can_be_made_of(change, line):
+    net = copy.deepcopy(small())
+    change(net)
+    with pytest.raises(UserError) as problem:
+        gfmhil.network_from(net, {"b": "droop-3"}, title="mine")
+    assert str(problem.value).startswith(line)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["case8", "--converter", "2=droop-3"], "'case8': must be one of case118, "),
+        (["case9"], "case9: name a bus for a converter; 1, 2, 3 have generators"),
+        (["case9", "--converter", "5=droop-3"], "case9: bus 5: has no generator; 1, 2, 3 have one"),
+        (["case9", "--converter", "99=droop-3"], "case9: bus 99: is no bus of the case; 1, 2, 3"),
+        (["case9", "--converter", "2=no-law"], "no-law"),
+        (["case9", "--converter", "2"], "--converter 2: must be BUS=LAW, each bus once"),
+    ],
+)
+def test_wrong_input_is_one_line(arguments, line, tmp_path, capsys):
+    assert main(["network", "import", *arguments, "-o", str(tmp_path / "net")]) == 2
+    said = capsys.readouterr()
+    assert line in said.err and len(said.err.splitlines()) == 1 and not said.out
+    assert not (tmp_path / "net").exists()
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    assert main(["network", "import", "case9", "--converter", "2=droop-3", "--slack", "grid",
+                 "-o", str(tmp_path / "net")]) == 0  # fmt: skip
+    said = capsys.readouterr().out
+    assert "1 converters, 9 lines" in said and "p.u. from the power flow" in said
+    assert (tmp_path / "net" / "network.toml").is_file()
