@@ -264,7 +264,7 @@ def test_exports_have_them_on_request(run, tmp_path):
     assert found.schema.field("i_ob_A").metadata[b"unit"] == b"A"
     for name, x in pu.items():
         assert [float(line[head.index(name)]) for line in lines] == x.tolist()
-    with pytest.raises(UserError, match="--three-phase si: goes with mf4, csv, mat, parquet, not"):
+    with pytest.raises(UserError, match="si: goes with mf4, csv, mat, parquet, cfg, cff, not"):
         export_run(one.folder, "blf", tmp_path / "run.blf", "si")
     export_run(one.folder, "csv", tmp_path / "run.csv")
     assert "v_a" not in (tmp_path / "run.csv").read_text(encoding="utf-8").partition("\n")[0]
