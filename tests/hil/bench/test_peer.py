@@ -185,7 +185,7 @@ def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
 def test_a_killed_benchmark_leaves_nothing_behind(line, tmp_path):
     """No process, no memory segment, no folder."""
     shm = Path("/dev/shm")
-    mark, before = f"GFMHIL_TEST={uuid.uuid4()}", {*shm.rglob("*")}
+    mark, before = f"GFMHIL_TEST={uuid.uuid4()}", {*shm.rglob("*"), shm / f"gfmhil-{os.geteuid()}"}
     line = ["bench", *line, "--seconds", "8"]
     with subprocess.Popen(
         [*GFMHIL, *line, "--out", str(tmp_path / "bench")],

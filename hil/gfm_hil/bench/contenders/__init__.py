@@ -25,6 +25,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import wire_dtype
+from gfm_runtime.children import GRACE_S
 from gfm_runtime.signals import NY
 
 FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
@@ -164,10 +165,10 @@ def memory_folder(stack: ExitStack) -> Path:
     memory if /dev/shm exists."""
     place = "/dev/shm" if Path("/dev/shm").is_dir() else None
     folder = tempfile.mkdtemp(prefix="gfmhil-", dir=place)
-    # a second time: a process that ends with this one may have written a file meanwhile
-    remove = 'read _; rm -rf "$0" 2>&- || { sleep 5; rm -rf "$0"; }'
+    # if this process is killed, plant and controller write in the folder until they have ended
+    remove = f'read _ || sleep {5 * GRACE_S}; rm -rf "$0"'
     guard = subprocess.Popen(
         ["sh", "-c", remove, folder], stdin=subprocess.PIPE, start_new_session=True
     )
-    stack.callback(guard.communicate)
+    stack.callback(guard.communicate, b"\n")
     return Path(folder)
