@@ -84,6 +84,15 @@ def test_a_tcp_port_that_is_taken():
     )
 
 
+@pytest.mark.timeout(30)
+def test_a_plant_whose_controller_never_comes_ends():
+    """What it sent before it tried anew would wait for ever to be sent."""
+    link = ZmqLink("plant", "tcp://127.0.0.1:1")
+    assert link.send(b"frame")
+    link.again()
+    link.close()
+
+
 @pytest.mark.parametrize("endpoint", ["udp://127.0.0.1:1", "", "tcp://nowhere"])
 def test_an_endpoint_that_is_none(endpoint):
     with pytest.raises(UserError, match=r"link\.endpoint = "):

@@ -54,6 +54,7 @@ def pair_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
         (zmq.SNDBUF, _KERNEL_ROOM),
         (zmq.RCVBUF, _KERNEL_ROOM),
         (zmq.MAXMSGSIZE, _LARGEST),
+        (zmq.LINGER, _LAST_WORDS),  # also of a connection that ``again`` ends
     ):
         made.set(option, value)
     return made
@@ -174,7 +175,7 @@ class ZmqLink:
         """Free the endpoint; the last messages get 500 ms to be sent."""
         if self.port is not None:
             self.port.handle[:] = 0  # makes its functions do nothing
-        self._socket.close(linger=_LAST_WORDS)
+        self._socket.close()
         if self._curve is not None:
             self._curve.close()
         self._context.term()
