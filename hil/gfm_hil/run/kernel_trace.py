@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.run.taken import STOPPED, WAITS, Taken, collected
+from gfm_hil.run.taken import STOPPED, UNREAD, WAITS, Taken, collected
 from gfm_runtime.compiled import cached, compiled
 
 _PREFIX = "gfmhil-"  # of our instances, before the number of the process
@@ -30,13 +30,13 @@ _SOFTIRQS = (
 # what an event means to ``walk``
 _IGNORED, _SWITCH, _WAKING, _ENTRY, _EXIT = range(5)
 # whose time it is; a number follows in the lower 32 bits
-_THREAD, _IRQ, _SOFTIRQ, _VECTOR, _STOPPED, _WAITS = range(1, 7)
+_THREAD, _IRQ, _SOFTIRQ, _VECTOR, _STOPPED, _WAITS, _UNREAD = range(1, 8)
 # what the loop's thread does
 _SLEEPS, _READY, _RUNNING, _HALTED, _BLOCKED = range(5)
 # state of a processor from one page to the next: time of the last event; running thread and its
 # name; whose time it is, since when, and the thread's name then; interrupts that are not over
-_LAST, _RUNS, _RUNS_NAME, _LOOP, _WHO, _SINCE, _WHO_NAME, _LOST, _DEPTH, _STACK = (
-    0, 1, 2, 4, 5, 6, 7, 9, 10, 11,
+_LAST, _RUNS, _RUNS_NAME, _LOOP, _WHO, _SINCE, _WHO_NAME, _DEPTH, _STACK = (
+    0, 1, 2, 4, 5, 6, 7, 9, 10,
 )  # fmt: skip
 _DEEPEST = 8  # interrupts within interrupts
 _HEAD = 16  # bytes of a page before its events
@@ -70,10 +70,8 @@ def walk(pages, kinds, numbers, fields, loop, least_ns, state, rows):
         t = np.int64(page[0]) | np.int64(page[1]) << 32
         end = 4 + (np.int64(page[2]) & 0x3FFFFFFF) // 4
         if page[2] >> 31:  # the kernel overwrote events that nobody had read
-            state[_LOST] += 1
-            state[_DEPTH] = 0
-            state[_WHO] = 0
-            state[_LOOP] = _SLEEPS
+            n = _until(t, np.int64(_UNREAD) << 32, least_ns, state, rows, n)
+            state[_DEPTH], state[_LOOP] = 0, _SLEEPS
         i = np.int64(4)
         while i < end and i < len(page):
             length, delta, at = np.int64(page[i]) & 31, np.int64(page[i]) >> 5, i + 1
@@ -217,8 +215,7 @@ class KernelTrace:
         for file in self._files.values():
             os.close(file)
         self._guard.communicate()
-        lost = sum(int(state[_LOST]) for state in self._states.values())
-        return collected("trace", sorted(self._found, key=lambda row: row[1]), lost=lost)
+        return collected("trace", sorted(self._found, key=lambda row: row[1]))
 
     def _set_up(self) -> None:
         """Choose clock, processors and events, and learn the numbers of these."""
@@ -254,6 +251,9 @@ class KernelTrace:
             self._write(f"events/{event}/enable", "1")
 
     def _follow(self) -> None:
+        with suppress(OSError):  # after the loops, before all that would keep it from reading
+            if any(loop > 0 and os.sched_getscheduler(loop) for loop in self._loops.values()):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         while not self._end.wait(_BETWEEN_S):
             self._take()
         self._take()
@@ -290,6 +290,8 @@ class KernelTrace:
                 return f"interrupt {self._vectors[number]}"
             case _ if kind == _STOPPED:
                 return STOPPED
+            case _ if kind == _UNREAD:
+                return UNREAD
         return WAITS
 
     def _read(self, name: str) -> str:

@@ -14,6 +14,7 @@ METHODS = {"trace": "by the kernel's trace", "proc": "by /proc"}
 ROWS = np.dtype([("processor", "i4"), ("begin", "i8"), ("end", "i8"), ("ran", "i8"), ("who", "i4")])
 STOPPED = "a signal that stopped it"
 WAITS = "its own wait in the kernel"  # for memory, a disk, or a worker of a line
+UNREAD = "not known: the kernel overwrote its trace before it was read"
 _MOST = 0.5  # of a stall, that a name must explain
 
 
@@ -28,7 +29,6 @@ class Taken:
     # of ``ROWS``, times in ns of CLOCK_MONOTONIC; ``who`` is an index into ``names``
     rows: NDArray[Any] = field(default_factory=lambda: np.zeros(0, ROWS))
     names: Sequence[str] = ()
-    lost: int = 0  # how often the kernel overwrote its trace before it was read
 
     def who(self, begin_ns: int, end_ns: int, stall_ns: float, processors: Collection[int]) -> str:
         """Who explains most of a stall within this time, on one of these processors.
@@ -58,8 +58,10 @@ def nobody(method: Method) -> str:
     return "the host" if virtual_machine() != "no" else "firmware"
 
 
-def collected(method: Method, rows: Iterable[tuple[int, int, int, int, str]], **more: Any) -> Taken:
+def collected(
+    method: Method, rows: Iterable[tuple[int, int, int, int, str]], why: str = ""
+) -> Taken:
     """From rows with names in place of their numbers."""
     names: dict[str, int] = {}
     listed = [(*row[:4], names.setdefault(row[4], len(names))) for row in rows]
-    return Taken(method, rows=np.array(listed, ROWS), names=[*names], **more)
+    return Taken(method, why, np.array(listed, ROWS), [*names])
