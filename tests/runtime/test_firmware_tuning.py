@@ -24,7 +24,7 @@ from gfm_runtime import (
 from gfm_runtime.catalogue import grid_names
 from gfm_runtime.firmware import check, make_modules
 from gfm_runtime.firmware.module import tunable
-from gfm_runtime.firmware.tuning import FIELDS, Tuning
+from gfm_runtime.firmware.tuning import FIELDS, GainChanges
 from gfm_runtime.kernel import state_dtype
 from gfm_runtime.lawfile import parse_law, tied
 from gfm_runtime.switchover import settle_into
@@ -37,7 +37,7 @@ TICKS, AT = 400, 200  # ticks of a run, and the one that changes gains
 NEW = {"D_p": 0.02, "k_22": 9.0, "k_34": 2.5}  # of vsg-2
 
 
-def tuning_of(name: str, real: str = "float64", inner: str | None = None) -> Tuning:
+def tuning_of(name: str, real: str = "float64", inner: str | None = None) -> GainChanges:
     """What C knows of a law of the catalogue."""
     (law,) = load_law(name, inner).laws
     (module,) = make_modules({name: law}, T_S, real)
@@ -260,7 +260,7 @@ def test_an_fmu_whose_parameters_change_has_the_kernels_bits(tmp_path, inner, fm
 def test_a_law_whose_form_follows_from_its_gains_is_refused(text, said):
     file = parse_law(f"name = 'x'\ntitle = 'x'\nsource = 'x'\nparameters.D_p = 3.0\n{text}\n")
     with pytest.raises((LawError, TypeError), match=said):
-        Tuning(file, pack_law(discretise(get_law("vsg-2"), T_S))[0], T_S)
+        GainChanges(file, pack_law(discretise(get_law("vsg-2"), T_S))[0], T_S)
 
 
 def test_what_the_style_does_not_cover_is_said(tmp_path, refused):

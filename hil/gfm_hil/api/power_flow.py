@@ -34,7 +34,7 @@ class Bus(NamedTuple):
     rating: float | None  # of its machines
 
 
-class Branch(NamedTuple):
+class FlowBranch(NamedTuple):
     start: int  # the taps are there
     end: int
     Z: complex
@@ -51,7 +51,7 @@ class PowerFlow:
     S_b: float  #: VA
     f: float  #: Hz
     buses: Sequence[Bus]
-    branches: Sequence[Branch]
+    branches: Sequence[FlowBranch]
     slack: int  #: bus
     ignored: Sequence[str]  #: what the case has and a network has not
 
@@ -95,7 +95,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
         ratio, (a, b) = row[8] or 1.0, (place[int(n)] for n in row[:2])
         transformer = ratio != 1.0 or bus[a, 9] != bus[b, 9]
         Z = complex(row[2], row[3])
-        branches.append(Branch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
+        branches.append(FlowBranch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
     ratings = _ratings(case, where, place, S_b)
     ignored = [
@@ -155,7 +155,7 @@ def _load_pandapower(case: str) -> Any:
     return getattr(shipped, case)()
 
 
-def _admittance(shunt: NDArray[Any], branches: Sequence[Branch]) -> NDArray[np.complex128]:
+def _admittance(shunt: NDArray[Any], branches: Sequence[FlowBranch]) -> NDArray[np.complex128]:
     Y = np.diag(shunt).astype(complex)
     for one in branches:
         y, a, b = 1 / one.Z, one.start, one.end

@@ -164,8 +164,8 @@ class LibraryController(ExternalController):
         ):
             setattr(self._in, field, ref[self._ref[name]] * base)
 
-    def _call(self, name: str, *given_to: Any) -> None:
-        number = getattr(self._of, name)(self._self, *map(c.byref, given_to))
+    def _call(self, name: str, *arguments: Any) -> None:
+        number = getattr(self._of, name)(self._self, *map(c.byref, arguments))
         if number:
             said = None
             if hasattr(self._of, "gfmhil_fault"):

@@ -114,7 +114,7 @@ WAYS = tuple(sorted({way for one in TOPOLOGIES.values() for ways in one.conducts
 
 
 class _Watcher:
-    """Stands beside the timeline of a run, and goes through the ticks of a window once more."""
+    """Follows the timeline of a run, and goes through the ticks of a window once more."""
 
     running = False
     _kept: Network | None = None

@@ -19,7 +19,7 @@ from gfm_runtime.firmware.c_text import Choices, identifier, plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
 from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
-from gfm_runtime.firmware.tuning import Tuning
+from gfm_runtime.firmware.tuning import GainChanges
 from gfm_runtime.signals import TABLE_VERSION, Signal, command_rows, group, table_hash
 
 _INTERFACE = "IEEE_Cigre_DLLInterface.h"
@@ -105,7 +105,7 @@ def _string(text: str) -> str:
     return json.dumps(plain(text))
 
 
-def _parameters(tuning: Tuning) -> str:
+def _parameters(tuning: GainChanges) -> str:
     """The gains, which may change at any time."""
     return "\n".join(
         f"    {{{_string(name)}, {_string('Gains')}, {_string(of.source)}, {_string(of.unit)}, "

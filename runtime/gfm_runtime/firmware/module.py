@@ -30,7 +30,7 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, written
 from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
 from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
-from gfm_runtime.firmware.tuning import Tuning
+from gfm_runtime.firmware.tuning import GainChanges
 from gfm_runtime.inner import INNER_CONSTANTS, INNER_STATE, KINDS, NONE, PRIORITIES
 from gfm_runtime.inner_file import acting
 from gfm_runtime.kernel import N_MAX, pack_law
@@ -119,7 +119,7 @@ class Module:
     stages: bool = False
     counts: bool = False  #: whether the laws of its folder measure and modulate
     fixed: FixedLaw | None = None  #: the law in fixed point; None in a floating-point precision
-    tuning: Tuning | None = None  #: how its gains change while it runs, in style tunable
+    tuning: GainChanges | None = None  #: how its gains change while it runs, in style tunable
 
     @property
     def prefix(self) -> str:
@@ -243,11 +243,11 @@ def tunable(module: Module, file: LawFile, T_s: float) -> Module:
         T_s: sampling time, s.
 
     Raises:
-        LawError: as ``Tuning``.
+        LawError: as ``GainChanges``.
     """
     if module.law is not None:
         file = file.model_copy(update={"parameters": dict(module.law.parameters)})
-    return replace(module, tuning=Tuning(file, module.record, T_s))
+    return replace(module, tuning=GainChanges(file, module.record, T_s))
 
 
 def check_modules(modules: Sequence[Module]) -> None:

@@ -105,7 +105,7 @@ class Tick:
         n: states that an instance has room for.
         stages: whether it has an inner stage's variables.
         counts: whether it measures and modulates.
-        tuned: fields of the law whose numbers are coefficients in RAM, by ``Tuning.fields``.
+        tuned: fields of the law whose numbers are coefficients in RAM, by ``GainChanges.fields``.
         all_terms: count zeros too, as the generic step does.
     """
 

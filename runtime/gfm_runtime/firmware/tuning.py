@@ -330,7 +330,7 @@ def _mode(d: Sequence[Any], s: Any, T: Sequence[float]) -> list[Any]:
     return [x / t for x, t in zip(v, T, strict=True)]
 
 
-class Tuning:
+class GainChanges:
     """What C needs to change a law's gains while it runs.
 
     Args:
