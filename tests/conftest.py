@@ -50,6 +50,10 @@ _LONGEST = (
     "hil/run/test_network.py", "runtime/test_firmware.py", "hil/studies/test_conformity.py",
     "hil/links/test_inner_links.py", "plant/test_network.py", "hil/cli/test_network_design.py",
 )  # fmt: skip
+#: Of the fast tier: the file that compiles the loop in process first, and those that find it
+#: compiled if they begin when files of more tests than this have ended.
+_COMPILES, _AFTER = "hil/studies/test_conformity.py", 60
+_LATER = ("hil/cli/test_wrong_use.py", "hil/links/test_link_contract.py", "hil/cli/test_cli.py")
 _TIER_OF = {**dict.fromkeys(("apt", "soak", "uml"), "systems"), "compilers": "full"}
 FAST, TIERS = "fast", ("full", "processes", "systems")
 
@@ -89,12 +93,22 @@ def chosen(config: pytest.Config) -> set[str]:
     return {FAST, *TIERS} if "all" in tiers else tiers
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file that marks nothing for the tiers: all files together take 10 s to import."""
+    tiers = chosen(config)
+    if FAST in tiers or "full" in tiers or collection_path.suffix != ".py":  # helpers mark full too
+        return None
+    names = {*tiers, *(mark for mark, home in _TIER_OF.items() if home in tiers)}
+    words = collection_path.read_text(encoding="utf-8")
+    return None if any(f"pytest.mark.{name}" in words for name in names) else True
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run the fast tier on all processors, a file at a time, unless told how many (``-n``)."""
     if hasattr(config, "workerinput"):  # a worker, which must not start workers
         return
-    config.option.loadscopereorder = chosen(config) == {FAST}  # else see longest_first
+    config.option.loadscopereorder = False  # see longest_first
     if chosen(config) <= {FAST, "full"} and getattr(config.option, "numprocesses", 0) is None:
         workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
         config.option.numprocesses, config.option.dist = workers, "loadfile"
@@ -106,15 +120,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left:
         config.hook.pytest_deselected(items=left)
         items[:] = [item for item in items if tier(item.iter_markers()) in tiers]
-    if hasattr(config, "workerinput") and tiers != {FAST}:
-        longest_first(items)
+    if hasattr(config, "workerinput"):
+        longest_first(items, tiers == {FAST})
 
 
-def longest_first(items: list[pytest.Item]) -> None:
-    """Put the files of ``_LONGEST`` first, and the others by their number of tests."""
+def longest_first(items: list[pytest.Item], fast: bool) -> None:
+    """Put the files of ``_LONGEST`` first, and the others by their number of tests.
+
+    In the fast tier two workers would otherwise compile the same loop at the same time, for 36 s.
+    """
     here = Path(__file__).parent
-    rank = {here / name: k for k, name in enumerate(_LONGEST)}
+    rank = {here / name: k for k, name in enumerate((_COMPILES,) if fast else _LONGEST)}
     count = Counter(item.path for item in items)
+    if fast:
+        for name in _LATER:
+            count[here / name] = _AFTER
     items.sort(key=lambda item: (rank.get(item.path, len(rank)), -count[item.path], item.path))
 
 

@@ -52,6 +52,12 @@ def run(make: Make, tmp_path: Path) -> RunIt:
     return call
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without the figures of a run, which take most of their time."""
+    monkeypatch.setattr("gfm_hil.results.figures.draw_run", lambda *_: [])
+
+
 @contextmanager
 def unfinished() -> Iterator[list[tuple[Any, ...]]]:
     """A run in it ends before ``finish``, whose arguments are then in the list."""

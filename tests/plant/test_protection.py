@@ -105,7 +105,8 @@ OFF = {
 
 
 @pytest.mark.parametrize(
-    "u", [[0.5, 1.0, 1e12], [0.5, 1e300, 1.0], [-1e9, 1.0, 1.0], [0.5, 1.0, 1e308], [-2, 1, 1]]
+    "u",
+    [[0.5, 1.0, 1e12], [0.5, 1e300, 1.0], [-1e9, 1.0, 1.0], [0.5, 1.0, 1e308], [-2.0, 1.0, 1.0]],
 )
 def test_divergence_leaves_finite_values(rest, u):
     plant = rest(protection=OFF, sensors={"bandwidth_hz": 1000.0})

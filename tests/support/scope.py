@@ -16,13 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from selenium import webdriver
-from selenium.webdriver.chrome.options import Options
-from selenium.webdriver.chrome.service import Service
-from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.common.by import By
-from selenium.webdriver.support.ui import Select
-
 PATIENCE_S = 60.0
 # 1 kHz, so that two processors suffice for both sides and the browser
 RIG = """
@@ -159,13 +152,15 @@ class Browser:
     def __init__(
         self, width: int = 1440, height: int = 900, dark: bool = False, phone: bool = False
     ) -> None:
-        options = Options()
+        from selenium import webdriver  # not in every process that collects tests
+
+        options = webdriver.ChromeOptions()
         options.binary_location = shutil.which("chromium") or ""
         for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
             options.add_argument(argument)
         options.add_argument(f"--window-size={width},{height}")
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        service = Service(shutil.which("chromedriver") or "")
+        service = webdriver.ChromeService(shutil.which("chromedriver") or "")
         self.driver = webdriver.Chrome(options=options, service=service)
         self.driver.execute_cdp_cmd(
             "Emulation.setDeviceMetricsOverride",
@@ -197,21 +192,25 @@ class Browser:
 
     def click(self, selector: str) -> None:
         """Click like a user: only if the element is visible and nothing covers it."""
-        self.driver.find_element(By.CSS_SELECTOR, selector).click()
+        self.driver.find_element("css selector", selector).click()
 
     def write(self, selector: str, text: str) -> None:
         """Write text into a field."""
-        field = self.driver.find_element(By.CSS_SELECTOR, selector)
+        field = self.driver.find_element("css selector", selector)
         field.clear()
         field.send_keys(text)
 
     def choose(self, selector: str, value: str) -> None:
         """Choose from a list."""
-        Select(self.driver.find_element(By.CSS_SELECTOR, selector)).select_by_value(value)
+        from selenium.webdriver.support.ui import Select
+
+        Select(self.driver.find_element("css selector", selector)).select_by_value(value)
 
     def drag(self, selector: str, start: tuple[int, int], by: tuple[int, int]) -> None:
         """Drag with the pointer, from a place relative to the element's centre."""
-        element = self.driver.find_element(By.CSS_SELECTOR, selector)
+        from selenium.webdriver import ActionChains
+
+        element = self.driver.find_element("css selector", selector)
         moves = ActionChains(self.driver).move_to_element_with_offset(element, *start)
         moves.click_and_hold().move_by_offset(by[0] // 2, by[1] // 2)
         moves.move_by_offset(by[0] - by[0] // 2, by[1] - by[1] // 2).release().perform()

@@ -277,7 +277,7 @@ def test_compare_draws_the_laws_side_by_side(call):
         assert summary == json.loads(Path(f"both/{law}/summary.json").read_text())
 
 
-def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_json(call):
+def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_json(call, undrawn):
     content = {"link": {"type": "zmq"}, "mode": "realtime", "duration": 0.02}
     content["compare"] = ["vsg-2", "vsg-5"]
     code, out, _ = call("compare", scenario(**content), "--json", "--out", "x")
@@ -302,7 +302,7 @@ def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
     assert [row.split()[0] for row in rows] == listed  # no row is wrapped
 
 
-def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
+def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call, undrawn):
     content = {
         "events": [*TRIP["events"], {"t": 0.2, "type": "reference", "P_ref": 0.6}],
         "plant": {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}},
@@ -357,7 +357,7 @@ def own_law(folder: Path, name: str, **gains: float) -> Path:
     return gfmhil.Law.load("vsg-2").with_gains(name, **gains).save(path)
 
 
-def test_results_call_a_law_by_its_name_and_never_by_its_path(tmp_path, capsys):
+def test_results_call_a_law_by_its_name_and_never_by_its_path(tmp_path, capsys, undrawn):
     own = str(own_law(tmp_path, "mine", D_p=0.011))
     content = {
         "title": "own", "duration": 0.03, "law": own, "link": {"type": "inproc"},
@@ -393,7 +393,7 @@ def test_laws_of_one_name_are_told_apart(tmp_path):
     assert [*titles.values()] == ["vsg-2 (file.toml)", "vsg-2", "vsg-2 (file.toml, 2)", "mine"]
 
 
-def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
+def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys, undrawn):
     """By run, compare and laws show; of a stable one they say nothing."""
     own = str(own_law(tmp_path, "mine", k_34=50.0))
     words = r"the linear loop of mine has an unstable mode: [\d.]+ Hz, \+[\d.e+]+ 1/s "

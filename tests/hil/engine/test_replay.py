@@ -41,6 +41,7 @@ def trace(tmp_path):
     return path
 
 
+@pytest.mark.processes
 def test_a_trace_does_what_it_says_over_a_link_and_in_process(trace, tmp_path):
     plain = gfmhil.run(CONTENT)
     found = gfmhil.run(content(trace))

@@ -63,9 +63,8 @@ def test_a_page_holds_times_to_the_tick_and_values_to_its_levels():
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ten seconds of the rig, with noise."""
-    folder = tmp_path_factory.mktemp("report") / "run"
-    gfmhil.run("rig_pref_step", folder=folder, duration=10.0)
-    return folder / "report.html"
+    run = gfmhil.run("rig_pref_step", duration=10.0)
+    return run.save(tmp_path_factory.mktemp("report") / "run") / "report.html"
 
 
 def test_the_report_of_a_run_holds_its_curves(report):

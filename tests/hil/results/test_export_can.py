@@ -68,6 +68,7 @@ def exported(folder: Path, place: Path) -> tuple[list[can.Message], cantools.dat
         return list(reader), cantools.database.load_file(files[1])
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("port", "options", "frames", "content"),
     [
@@ -75,11 +76,7 @@ def exported(folder: Path, place: Path) -> tuple[list[can.Message], cantools.dat
         (19510, {"every": 3}, {"y": 1, "u": 1}, CONTENT),
         (19520, {"fd": False, "bitrate": 1_000_000, "every": 10}, {"y": 2, "u": 1}, CONTENT),
         pytest.param(
-            19550,
-            {"every": 2},
-            {"y": 1, "u": 1},
-            {**CONTENT, "law": "vsg-2", "inner": "cascaded"},
-            marks=pytest.mark.full,
+            19550, {"every": 2}, {"y": 1, "u": 1}, {**CONTENT, "law": "vsg-2", "inner": "cascaded"}
         ),
     ],
     ids=["FD", "FD every third tick", "classic", "inner stage"],
@@ -106,6 +103,7 @@ def test_the_frames_are_those_that_were_on_the_bus(tmp_path, port, options, fram
     assert transport <= {m.arbitration_id for m in heard}
 
 
+@pytest.mark.processes
 def test_cantools_decodes_what_the_run_recorded(tmp_path):
     run_over_can(tmp_path / "run", 19530)
     found, dbc = exported(tmp_path / "run", tmp_path)
@@ -131,6 +129,7 @@ def test_any_run_can_be_put_into_frames(run, tmp_path):
     assert len(found) == 2 * 200 + 2 * 2  # a status goes with the first two vectors of a state
 
 
+@pytest.mark.processes
 def test_a_safe_state_is_said_with_its_reason(tmp_path):
     """The plant trips at a phase jump and both sides report it, until the reset."""
     content = {

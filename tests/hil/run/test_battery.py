@@ -10,8 +10,8 @@ from gfm_hil.core.errors import UserError
 def test_a_full_battery_leaves_the_power_to_the_chopper(tmp_path):
     """VSG-2 takes 0.4 p.u. at 50.2 Hz by its droop of 1 %; the battery takes 0.3 of it, until it is
     full: 3 % of 60 s is 1.8 p.u. s."""
-    run = gfmhil.run("battery_charges", folder=tmp_path / "run")
-    found = gfmhil.load_run(tmp_path / "run")
+    run = gfmhil.run("battery_charges")
+    found = gfmhil.load_run(run.save(tmp_path / "run"))
     assert run.status == found.status == "completed"
     s = found.signals
     assert s["p"][-1] == pytest.approx(-0.4, abs=1e-6)

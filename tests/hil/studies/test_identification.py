@@ -80,6 +80,7 @@ def switched(law, bridge, **how):
     return gfmhil.scan(law, gfmhil.load_scenario("pref_step", plant=plant), settle_s=2.0, **how)
 
 
+@pytest.mark.full  # two scans of a switched bridge
 def test_a_switched_bridge_has_the_admittance_of_its_average():
     """750 Hz is a harmonic of the bridge in this frame, which a run without tones takes away; Y is
     small there."""
