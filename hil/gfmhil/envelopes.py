@@ -14,14 +14,17 @@ from gfm_hil.studies.envelopes import (
     scr_jump,
     scr_jump_response,
 )
+from gfm_hil.studies.unit_fit import UnitFit, fit_run
 
 __all__ = [
     "Envelope",
     "Tolerance",
     "Unit",
+    "UnitFit",
     "amplitude_step",
     "fit_jump",
     "fit_ramp",
+    "fit_run",
     "measure_unit",
     "phase_jump",
     "rocof",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,15 @@ from gfm_hil.api.law import Law, law_files
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.engine.processes import Progress
-from gfm_hil.recording.run import Run, converters_of
+from gfm_hil.recording.foreign import open_recording
+from gfm_hil.recording.run import Run, converters_of, nominal_frequency
 from gfm_hil.results.between_figure import plot_between
 from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
 from gfm_hil.results.report import write_report
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.between import BetweenTicks, between_ticks
 from gfm_hil.run.losses import losses
+from gfm_hil.run.metrics import event_metrics
 from gfm_hil.run.network_run import NetworkRun, save_network
 from gfm_hil.run.runner import Notice
 from gfm_hil.run.spectrum import spectrum
@@ -191,9 +194,29 @@ def _named(made: Run, law: Law) -> Run:
     return replace(made, scenario=scenario, law_text=law.to_toml())
 
 
-def load_run(folder: str | Path) -> Run:
-    """A run from its folder, see ``Run.load``."""
-    return Run.load(folder)
+def load_run(
+    folder: str | Path,
+    map: str | Path | None = None,
+    scenario: str | Path | Scenario | dict[str, Any] | None = None,
+) -> Run:
+    """A run from its folder, see ``Run.load``; or a recording that others made.
+
+    Args:
+        folder: of a run, or the recording: CSV, COMTRADE (its .cfg or .cff), Parquet, MF4 or MAT.
+        map: of a recording, the file that says what its channels are.
+        scenario: of a recording, what was done, as for ``run``. It is aligned to the first event.
+
+    Raises:
+        UserError: a file cannot be read, a channel is missing, or the recording does not begin
+            where the scenario does.
+    """
+    if map is None and scenario is None:
+        if Path(folder).is_file():
+            raise UserError(f"{folder}: a recording takes its map and the scenario")
+        return Run.load(folder)
+    if map is None or scenario is None:
+        raise UserError(f"{folder}: a recording takes both, its map and the scenario")
+    return open_recording(folder, map, _checked(scenario, {}, in_process=True))
 
 
 def recover(folder: str | Path) -> Run | NetworkRun:
@@ -260,6 +283,8 @@ def compare(
     laws: Sequence[str | Path | Law],
     folder: str | Path | None = None,
     *,
+    recording: str | Path | None = None,
+    map: str | Path | None = None,
     watch: Watch = SILENT,
     **changes: Any,
 ) -> Comparison:
@@ -270,6 +295,8 @@ def compare(
         laws: names, law files or ``Law``.
         folder: where to write a run folder for each law, comparison.png and comparison.json; the
             link and the mode are then those of the scenario. None keeps the runs in memory.
+        recording, map: a recording of the same that others made, which is laid beside the runs
+            under the name of its file, and the file that says what its channels are.
         watch: of the runs with a folder.
 
     Raises:
@@ -278,17 +305,40 @@ def compare(
     """
     if not laws:
         raise UserError("laws: name some laws to compare")
+    beside = {}
+    if recording is not None or map is not None:
+        if recording is None or map is None:
+            raise UserError("recording, map: give both or none")
+        done = _checked(scenario, changes, in_process=True)
+        beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}
     with law_files(laws) as files:
         if folder is None:
             names = [*files]
             each = zip(names, laws, strict=True)
-            return Comparison({name: run(scenario, law, **changes) for name, law in each})
+            return Comparison(beside | {name: run(scenario, law, **changes) for name, law in each})
         scenarios = {n: load_scenario(scenario, law=file, **changes) for n, file in files.items()}
-        return _compare_in(Path(folder), scenarios, watch)
+        return _compare_in(Path(folder), scenarios, beside, watch)
 
 
-def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -> Comparison:
-    """Run scenarios of different laws, each in a folder; an interruption ends all."""
+def _with_metrics(recorded: Run) -> Run:
+    """A recording with what followed each event, as far as it shows it."""
+    columns, events = recorded.columns, recorded.summary["events"]
+    f_n, T_s = nominal_frequency(recorded.scenario), recorded.scenario.T_s
+    if "true_omega_u" not in columns:
+        return recorded
+    ends = [*(e["tick"] for e in events[1:]), recorded.ticks]
+    told = [e | event_metrics(columns, e["tick"], end, T_s, f_n)
+            for e, end in zip(events, ends, strict=True)]  # fmt: skip
+    told = [{k: None if isinstance(x, float) and math.isnan(x) else x for k, x in e.items()}
+            for e in told]  # fmt: skip
+    return replace(recorded, summary=recorded.summary | {"events": told})
+
+
+def _compare_in(
+    folder: Path, scenarios: Mapping[str, Scenario], beside: Mapping[str, Run], watch: Watch
+) -> Comparison:
+    """Run scenarios of different laws, each in a folder; an interruption ends all. ``beside`` are
+    those that are run already."""
     first = next(iter(scenarios.values()))
     run_folder.check_free(
         folder, first.ticks * len(scenarios), first.carries, first.optional_signals
@@ -304,6 +354,6 @@ def _compare_in(folder: Path, scenarios: Mapping[str, Scenario], watch: Watch) -
         runs[name] = runner.run_scenario(one, folder / name, tell, watch.notice, _explained)
         if runs[name].status == "interrupted":
             break
-    made = Comparison(runs)
+    made = Comparison({**beside, **runs})
     made.write(folder)
     return made

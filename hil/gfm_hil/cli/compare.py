@@ -23,6 +23,11 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     common.add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
+    command.add_argument(
+        "--recording", metavar="FILE",
+        help="lay a recording of the same beside the runs: CSV, COMTRADE, Parquet, MF4 or MAT",
+    )  # fmt: skip
+    command.add_argument("--map", metavar="FILE", help="of --recording: what its channels are")
     command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
     common.add_study_options(command, "comparison.json")
 
@@ -38,7 +43,9 @@ def call(options: argparse.Namespace) -> int:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
     folder = common.new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
     with common.watching("compare", options.quiet) as watch:
-        found = compare(base, laws, folder, watch=watch)
+        found = compare(
+            base, laws, folder, recording=options.recording, map=options.map, watch=watch
+        )
     if options.json:
         print(json.dumps(found.summaries, indent=2))
     else:

@@ -493,6 +493,7 @@ def draw_laws(
         curves = [
             (columns, name, COLOURS[k % len(COLOURS)], law)
             for k, (law, columns) in enumerate(runs.items())
+            if name in columns  # a recording of others need not have it
         ]
         factor = _draw_columns(a, title, name, scenario, curves)
         for columns, _, colour, _ in curves:

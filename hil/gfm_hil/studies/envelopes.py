@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -314,7 +314,7 @@ def _ramp_modes(unit: Unit, scr: float, T_pll: float) -> tuple[Response, Respons
     """The poles of the response to a ramp of -1 p.u./s, and their weights."""
     swing = unit.swing(unit.X_eff + _reactance(scr))
     numerator = swing[2] * np.array([2 * unit.H * T_pll, 2 * unit.H + unit.D * T_pll])
-    return _modes(numerator, np.asarray(np.polymul([T_pll, 1.0, 0.0], swing), float))
+    return modes(numerator, np.asarray(np.polymul([T_pll, 1.0, 0.0], swing), float))
 
 
 def scr_jump_response(unit: Unit, t: Vector, before: float, after: float, P_0: float) -> Vector:
@@ -355,12 +355,12 @@ def fit_jump(
     largest = float(np.abs(p).max())
     if not largest > 0:
         raise UserError("fit: the power does not change")
-    X, zero, stiff = _fitted(off, abs(radians) / largest, largest)
+    X, zero, stiff = np.exp(fit_swing(off, abs(radians) / largest, 0.1 * largest).x)
     H = omega_b / (2 * stiff * X)
     X_eff = float(X - X_grid)
     if X_eff <= 0:
         raise UserError(f"fit: X = {X:.4g} p.u. in all: must be above X_grid = {X_grid:g} p.u.")
-    return Unit(2 * H * zero, H, X_eff)
+    return Unit(float(2 * H * zero), float(H), X_eff)
 
 
 def fit_nfp(hz: Vector, nfp: Response, omega_b: float) -> Unit:
@@ -381,16 +381,14 @@ def fit_nfp(hz: Vector, nfp: Response, omega_b: float) -> Unit:
         rest = -omega_b / X * (s + zero) / (s**2 + zero * s + stiff) - nfp
         return np.concatenate([rest.real, rest.imag])
 
-    X, zero, stiff = _fitted(off, 0.5, float(np.abs(nfp).max()))
+    X, zero, stiff = np.exp(fit_swing(off, 0.5, 0.1 * float(np.abs(nfp).max())).x)
     H = omega_b / (2 * stiff * X)
-    return Unit(2 * H * zero, H, X)
+    return Unit(float(2 * H * zero), float(H), float(X))
 
 
-def _fitted(
-    off: Callable[[float, float, float], Vector], X_0: float, largest: float
-) -> tuple[float, float, float]:
-    """X, D/2H and omega_b/2HX with which what is left is least, from a reactance to begin with.
-    Raises UserError: more than a tenth of the largest value is left."""
+def fit_swing(off: Callable[[float, float, float], Vector], X_0: float, most: float) -> Any:
+    """SciPy's result with the logarithms of X, D/2H and omega_b/2HX with which what is left is
+    least, from a reactance to begin with. Raises UserError: more than ``most`` RMS is left."""
 
     def at(z: Vector) -> Vector:
         return off(*np.exp(np.clip(z, -_FAR, _FAR)))
@@ -399,10 +397,9 @@ def _fitted(
     found = [least_squares(at, np.log([X_0, *start]), x_scale=1.0) for start in starts]
     best = min(found, key=lambda one: one.cost)
     rms = math.sqrt(2 * best.cost / len(best.fun))
-    if not rms < 0.1 * largest:
+    if not rms < most:
         raise UserError(f"fit: no swing equation fits: {rms:.2g} p.u. RMS are left")
-    X, zero, stiff = (float(x) for x in np.exp(best.x))
-    return X, zero, stiff
+    return best
 
 
 def fit_ramp(t: Vector, change: Vector, rate: float, settled_s: float) -> tuple[float, float]:
@@ -479,10 +476,10 @@ def _impulse(
     numerator: Sequence[float] | Vector, denominator: Sequence[float] | Vector, t: Vector
 ) -> Vector:
     """The impulse response of a strictly proper transfer function."""
-    return _sum(*_modes(numerator, denominator), t)
+    return _sum(*modes(numerator, denominator), t)
 
 
-def _modes(
+def modes(
     numerator: Sequence[float] | Vector, denominator: Sequence[float] | Vector
 ) -> tuple[Response, Response]:
     """The poles of a strictly proper transfer function, and their residues."""

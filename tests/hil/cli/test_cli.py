@@ -286,6 +286,21 @@ def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_
     assert found == dict.fromkeys(content["compare"], ("inproc", "lockstep"))
 
 
+def test_compare_lays_a_recording_beside_the_runs(call, tmp_path):
+    content = {**STEP, "compare": ["vsg-2"]}
+    made = gfmhil.run(scenario(**content), "vsg-2")
+    names = {"p": "p", "q": "q", "V": "V"}
+    rows = np.stack([made.signals[n] for n in ("t", *names)], 1)
+    np.savetxt("site.csv", rows, delimiter=",", header="t,p,q,V", comments="")
+    lines = ["S_n = 4e3", "V_n = 380.0", "[channels]", *(f'{n} = "{n}"' for n in names)]
+    Path("map.toml").write_text("\n".join(lines))
+    command = ("compare", scenario(**content), "--recording", "site.csv", "--out", "x")
+    code, out, _ = call(*command, "--map", "map.toml")
+    assert code == 0 and out.split()[:2] == ["site.csv", "vsg-2"]
+    assert list(json.loads(Path("x/comparison.json").read_text())) == ["site.csv", "vsg-2"]
+    assert call(*command)[0] == 2
+
+
 @pytest.mark.full
 def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
     laws = [f"{law}-tuned" for law in ("mimo-gfm", "droop-5", "vsg-12", "vsg-10", "matching-1")]

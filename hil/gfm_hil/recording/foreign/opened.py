@@ -86,14 +86,15 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
     way = "phases" if s.vectors else "channels" if of.v is None else "phasors"
     rate = f"{1 / s.dt:.6g} samples/s"
     about = {
-        "event_s": event, "resolution_s": resolution, "trips_seen": reason != "?",
+        "event_s": event, "resolution_s": resolution, "dt_s": s.dt, **of.meter.model_dump(),
+        "trips_seen": reason != "?",
         "words": f"{way} at {rate}; event at {event:.6g} s of its clock, {told}, laid on "
         f"{first:g} s of the test; what is slower than {1e3 * resolution:.3g} ms is seen",
     }  # fmt: skip
     events = [{"t": e.at(T_s) * T_s, "tick": e.at(T_s), "type": e.type, "label": e.label()}
               for e in scenario.sorted_events() if e.at(T_s) < keep]  # fmt: skip
     summary = {
-        "status": status, "reason": "" if reason == "?" else reason, "ticks": keep,
+        "status": status, "reason": "" if reason == "?" else reason, "unmet": [], "ticks": keep,
         "duration_s": round(keep * T_s, 9), "events": events, "controller": file.stem, "laws": [],
         ABOUT: about,
     }  # fmt: skip
@@ -106,17 +107,22 @@ def _event(s: Sampled, of: RecordingMap, scenario: Scenario, cycle: float) -> tu
     that the event is."""
     if not scenario.events:
         raise UserError("the scenario has no event to align it to")
-    rest = max(5, int(_BAND_S / s.dt))
+    from scipy.ndimage import uniform_filter1d  # a tenth of a second, of recordings only
+
+    # what the map says to lie before the event shows most of how the signals move at rest
+    rest_s = _BAND_S if of.event_s is None else max(_BAND_S, of.event_s - cycle - float(s.t[0]))
     found: list[tuple[int, str]] = []
-    for name in ("p", "q", "V"):
-        x = s.of[name]
-        middle = np.median(x[:rest])
-        band = max(_BAND, _SPREADS * float(np.max(np.abs(x[:rest] - middle))))
-        if (moved := np.abs(x - middle) > band).any():
-            found.append((int(np.argmax(moved)), name))
+    for width in (1, int(cycle / s.dt)):  # samples, or means of a cycle where noise hides all
+        for name in ("p", "q", "V") if width and not found else ():
+            x = uniform_filter1d(s.of[name], width, mode="nearest")
+            first = x[: max(5, int(rest_s / s.dt))]
+            middle = np.median(first)
+            band = max(_BAND, _SPREADS * float(np.max(np.abs(first - middle))))
+            if (moved := np.abs(x - middle) > band).any():
+                found.append((int(np.argmax(moved)), name))
     if not found:
         raise UserError(
-            f"no event: p, q and V stay as in the first {_BAND_S:g} s, which must be at rest"
+            f"no event: p, q and V stay as in the first {rest_s:g} s, which must be at rest"
         )
     k, name = min(found)
     at = float(s.t[max(0, k - 1)])  # the last sample of before

@@ -1,0 +1,49 @@
+"""gfmhil fit: D, H and X_eff of a run or of a recording, with intervals."""
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from gfm_hil.api.runs import load_run
+from gfm_hil.core.terminal import terminal
+from gfm_hil.recording.foreign import ABOUT
+from gfm_hil.results.table import Table
+from gfm_hil.studies.unit_fit import fit_run
+
+_UNITS = {"D": "p.u./p.u.", "H": "s", "X_eff": "p.u."}
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "The swing equation 2 H dω/dt = -p - D ω behind X_eff, fitted to p after a phase jump of a "
+        "stiff grid, the first event."
+    )
+    command.add_argument("what", type=Path, metavar="RUN|FILE", help="run folder, or a recording")
+    command.add_argument(
+        "--map", type=Path, metavar="FILE", help="of a recording: what its channels are"
+    )
+    command.add_argument(
+        "--scenario", metavar="NAME", help="of a recording: what was done, a name or a file"
+    )
+    command.add_argument("--json", action="store_true", help="print JSON, nothing else")
+
+
+def call(options: argparse.Namespace) -> int:
+    run = load_run(options.what, options.map, options.scenario)
+    found = fit_run(run)
+    if options.json:
+        print(json.dumps(asdict(found), indent=1))
+        return 0
+    console = terminal(highlight=False)
+    if ABOUT in run.summary:
+        console.print(run.summary[ABOUT]["words"], markup=False, soft_wrap=True)
+    rows = [
+        [name, f"{getattr(found, name):.4g}", f"{low:.4g} to {high:.4g}", _UNITS[name]]
+        for name, (low, high) in found.interval.items()
+    ]
+    console.print(Table(["", "", "95 %", ""], rows, text=None))
+    console.print(
+        f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}"
+    )
+    return 0
