@@ -29,6 +29,15 @@ Vector = NDArray[np.float64]
 _ROUNDS = 40
 _ROUNDING = 1e-12  # p.u.; a residual that is smaller is none
 _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
+_LOSES = 30  # rounds in which a command is found by what the bridge loses of it
+
+Drop = Callable[[complex, complex], complex]
+"""What a bridge loses of a voltage e, p.u., by the current of L_f and e, in any common frame."""
+
+
+def no_drop(i: complex, e: complex) -> complex:
+    """An ideal bridge's."""
+    return 0j
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,8 @@ class OperatingPoint:
     u: Vector
     y: Vector  #: the outputs as the sensors report them, shape (5,)
     x_law: Vector  #: the law's state, shape (n,)
-    e: complex  #: the bridge's voltage e_d + j e_q in that frame; E_u without an inner stage
+    #: the voltage e_d + j e_q in that frame that the bridge is commanded; E_u without a stage
+    e: complex
 
     @property
     def commands(self) -> Vector:
@@ -51,7 +61,12 @@ class OperatingPoint:
 
 
 def operating_point(
-    par: Record, law: DiscreteLaw, ref: Vector, omega_g: float = 1.0, V_g: float = 1.0
+    par: Record,
+    law: DiscreteLaw,
+    ref: Vector,
+    omega_g: float = 1.0,
+    V_g: float = 1.0,
+    drop: Drop = no_drop,
 ) -> OperatingPoint:
     """Solve for the operating point by Newton's method.
 
@@ -60,12 +75,13 @@ def operating_point(
         law: the law at its sampling time.
         ref: references (V_dcref, P_ref, omega_g, Q_ref, V_ref), shape (5,), p.u.
         omega_g, V_g: the grid, p.u.
+        drop: what the bridge loses of the voltage that it is commanded, p.u., by i and e.
 
     Raises:
         NoEquilibrium: the law has no steady state there (a frequency that its droop cannot reach
             within the line's capacity, or no steady state at all).
     """
-    side = _ConverterEquilibrium(par, law, np.asarray(ref))
+    side = _ConverterEquilibrium(par, law, np.asarray(ref), drop)
     z = _newton(lambda z: side.residual(z, V_g, omega_g), side.first(V_g, omega_g))
     if z is None:
         raise NoEquilibrium(side.no_steady_state(f"omega_g = {omega_g:g} p.u., V_g = {V_g:g} p.u."))
@@ -233,8 +249,8 @@ class _ConverterEquilibrium:
     The unknowns are the plant's state (8,), the DC current, E_u, and the law's states.
     """
 
-    def __init__(self, par: Record, law: DiscreteLaw, ref: Vector) -> None:
-        self.par, self.law, self.ref = par, law, ref
+    def __init__(self, par: Record, law: DiscreteLaw, ref: Vector, drop: Drop = no_drop) -> None:
+        self.par, self.law, self.ref, self.drop = par, law, ref, drop
         self.controlled = par[0]["i_u_gain"] != 0.0
         # row 1's states are left out of a plant whose DC source ignores it
         self.kept = np.array(
@@ -270,14 +286,14 @@ class _ConverterEquilibrium:
         dx = f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = dx[self._steady]
-        u[2] = abs(_internal(law, x, u, limited=False))
+        u[2] = abs(_internal(law, x, u, self._command(x, u), limited=False))
         change = (x_next - x_law)[self.kept] / law.T_s
         return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], change])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
         """The operating point at the unknowns z."""
         x, u, y, x_law = self._unpack(z, omega_g)
-        x, u, e = _in_frame_of_law(self.law, x, u)
+        x, u, e = _in_frame_of_law(self.law, x, u, self._command(x, u))
         return OperatingPoint(x, u, y, x_law, e)
 
     def _unpack(self, z: Vector, omega_g: float) -> tuple[Vector, Vector, Vector, Vector]:
@@ -288,6 +304,16 @@ class _ConverterEquilibrium:
         x_law = np.zeros(self.law.order)
         x_law[self.kept] = z[N_X + 2 :]
         return x, u, y, x_law
+
+    def _command(self, x: Vector, u: Vector) -> complex:
+        """What the bridge is commanded to give the voltage u[2] on the d axis."""
+        i, wanted = complex(x[0], x[1]), complex(u[2])
+        e = wanted
+        for _ in range(_LOSES):
+            before, e = e, wanted + self.drop(i, e)
+            if abs(e - before) < _ROUNDING:
+                break
+        return e
 
     def _law(self, x: Vector, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
         """The law's u (3,) and next state at held inputs; column 3 sees the plant's omega_u."""
@@ -330,9 +356,10 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
     return None
 
 
-def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> complex:
-    """The law's E for a bridge at a steady u: with an inner stage another voltage, behind it."""
-    inner, e = law.law.inner, complex(u[2])
+def _internal(law: DiscreteLaw, x: Vector, u: Vector, e: complex, limited: bool = True) -> complex:
+    """The law's E for a bridge at a steady command e: with an inner stage another voltage, behind
+    it."""
+    inner = law.law.inner
     if inner is None:
         return e
     if not limited:
@@ -344,13 +371,15 @@ def _internal(law: DiscreteLaw, x: Vector, u: Vector, limited: bool = True) -> c
         raise NoEquilibrium(str(problem)) from None
 
 
-def _in_frame_of_law(law: DiscreteLaw, x: Vector, u: Vector) -> tuple[Vector, Vector, complex]:
-    """The state, the law's output and the bridge's voltage, turned so that E lies on the d axis."""
-    E = _internal(law, x, u)
+def _in_frame_of_law(
+    law: DiscreteLaw, x: Vector, u: Vector, e: complex
+) -> tuple[Vector, Vector, complex]:
+    """The state, the law's output and the bridge's command, turned so that E lies on the d axis."""
+    E = _internal(law, x, u, e)
     turn = E.conjugate() / abs(E)
     turned = x.copy()
     for k in (0, 2, 4):
         w = complex(x[k], x[k + 1]) * turn
         turned[k : k + 2] = w.real, w.imag
     turned[DELTA] += cmath.phase(E)
-    return turned, np.array([u[0], u[1], abs(E)]), u[2] * turn
+    return turned, np.array([u[0], u[1], abs(E)]), e * turn

@@ -45,7 +45,6 @@ from gfm_design.margins.admittance import (
     line_impedance,
     passivity,
 )
-from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.dead_time import with_dead_time
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
@@ -346,24 +345,21 @@ def _check(scenario: Scenario, external: bool) -> None:
 
 
 def _model(scenario: Scenario) -> tuple[str, Callable[[Vector], Response], float]:
-    """The name of the law, its admittance by the linear model, and its slowest mode, 1/s; with the
-    dead time of a two-level bridge if its describing function takes the loop."""
+    """The name of the law, its admittance by the linear model, and its slowest mode, 1/s; with
+    the dead time of a two-level bridge."""
+    dead_time = scenario.plant.bridge.dead_time_s
     try:
         loop, name = scenario_loop(scenario)
+        if scenario.plant.bridge.kind == "two-level" and dead_time > 0.0:
+            loop = with_dead_time(loop, dead_time)
+            name += f", {1e6 * dead_time:g} µs of dead time"
     except NoEquilibrium as problem:
         raise UserError(str(problem)) from None
     worst = loop.modes()[0]
     if worst.sigma >= 0.0:
         raise UserError(
-            f"{name} is unstable on this grid: a mode at {worst.frequency_hz:.4g} Hz grows with "
-            f"{worst.sigma:.4g} 1/s; nothing can be measured"
-        )
-
-    dead_time = scenario.plant.bridge.dead_time_s
-    if scenario.plant.bridge.kind == "two-level" and dead_time > 0.0 and loop.stage is None:
-        dead = with_dead_time(loop, dead_time)
-        loop = ClosedLoop(
-            dead.plant, loop.law, loop.T_s, loop.u_delay, loop.y_delay, origin=loop.origin
+            f"{name}: cannot be scanned because it is unstable on this grid: a mode at "
+            f"{worst.frequency_hz:.4g} Hz grows with {worst.sigma:.4g} 1/s"
         )
 
     def admittance(hz: Vector) -> Response:
