@@ -24,14 +24,16 @@ typedef struct law {
     const void *counts;
     const int *channel;
     void (*sense)(const uint16_t adc[], real y[]);
+    int (*calibrate)(const uint16_t adc[], int *goes_on);
     int (*begin)(const real ref[], const uint16_t adc[]);
     int (*tick)(const real ref[], const uint16_t adc[], real u[], uint16_t cmp[]);
     int (*look)(const real ref[], const real y[], real u[]);
     int (*take_over)(const struct law *from, const real ref[], const uint16_t adc[], real *bump);
 } law_t;
 
-/* senses: what ticks will measure. begins: along the measured voltage, without current. takes_over: at
- * the old law's u, without a bump. */
+/* senses: what ticks will measure. calibrates: takes counts without current for the sensors' offsets, and
+ * goes on until it has as many as board.toml says. begins: along the measured voltage, without current,
+ * with these offsets. takes_over: at the old law's u, without a bump. */
 #define LAW(P, GUARD)                                                                              \
 static P##_t P;                                                                                    \
 static void P##_senses(const uint16_t adc[], real y[])                                             \
@@ -40,11 +42,20 @@ static void P##_senses(const uint16_t adc[], real y[])                          
     P##_sense(&now, adc);                                                                          \
     memcpy(y, now.counts.sensed, sizeof now.counts.sensed);                                        \
 }                                                                                                  \
+static int P##_calibrates(const uint16_t adc[], int *goes_on)                                      \
+{                                                                                                  \
+    const real before = P.counts.calibrated;                                                       \
+    const int reason = P##_calibrate(&P, adc);                                                     \
+    *goes_on = P.counts.calibrated != before;                                                      \
+    return reason;                                                                                 \
+}                                                                                                  \
 static int P##_begins(const real ref[], const uint16_t adc[])                                      \
 {                                                                                                  \
     static const real trend[NROWS];                                                                \
-    real y[NY], u[NROWS] = {0, 1, 1};                                                              \
+    real y[NY], u[NROWS] = {0, 1, 1}, shift[NADC];                                                 \
+    memcpy(shift, P.counts.shift, sizeof shift);                                                   \
     P##_init(&P);                                                                                  \
+    memcpy(P.counts.shift, shift, sizeof shift);                                                   \
     P##_align(&P, adc);                                                                            \
     P##_senses(adc, y);                                                                            \
     return P##_settle(&P, ref, y, u, trend, &y[GUARD##_Y_V_D]);                                    \
@@ -72,8 +83,8 @@ static int P##_takes_over(const law_t *from, const real ref[], const uint16_t ad
 
 #define ENTRY(P)                                                                                   \
     {                                                                                              \
-        #P, &P, sizeof P, P.trend, P.stage.e, &P.counts, &P.channel, P##_senses, P##_begins,       \
-            P##_ticks, P##_looks, P##_takes_over                                                   \
+        #P, &P, sizeof P, P.trend, P.stage.e, &P.counts, &P.channel, P##_senses, P##_calibrates,   \
+            P##_begins, P##_ticks, P##_looks, P##_takes_over                                       \
     }
 
 LAW(gfm_mimo_gfm, GFM_MIMO_GFM)
@@ -120,6 +131,8 @@ void firmware_start(void)
     TIM1->BDTR = TIM_BDTR_OSSI | TIM_BDTR_BKE | DTG_2_US; /* the trip input, active low */
     TIM1->SR = 0;
     TIM1->DIER = TIM_DIER_BIE;
+    gfm_mimo_gfm_init(&gfm_mimo_gfm);
+    gfm_vsg_2_init(&gfm_vsg_2);
     firmware.state = START;
     firmware.law = command.law;
     firmware.reason = firmware.settled = 0;
@@ -131,6 +144,20 @@ void TIM1_BRK_TIM9_IRQHandler(void)
 {
     TIM1->SR = ~TIM_SR_BIF;
     make_safe(TRIPPED, -1);
+}
+
+/* A tick in START with a charged DC link, while the gates are blocked and no current flows. */
+static void calibrate(const uint16_t adc[])
+{
+    int law, any = 0;
+    for (law = 0; law < LAWS && !firmware.settled && firmware.state == START; law++) {
+        int goes_on, reason = laws[law].calibrate(adc, &goes_on);
+        if (reason != GFM_VSG_2_OK)
+            make_safe(reason, *laws[law].channel);
+        any |= goes_on;
+    }
+    if (firmware.state == START && !any)
+        firmware.state = READY;
 }
 
 static void read_counts(uint16_t adc[])
@@ -189,7 +216,7 @@ void ADC_IRQHandler(void)
     if (firmware.state == SAFE && command.reset && !command.enable)
         firmware_start();
     if (firmware.state == START && adc[GFM_VSG_2_ADC_V_DC] >= V_DC_LOW)
-        firmware.state = READY;
+        calibrate(adc);
     if (firmware.state == RUN && !command.enable) {
         block();
         firmware.state = READY;

@@ -451,6 +451,13 @@ def test_impossible_networks(parts, message):
         make(BUS, **parts)
 
 
+def test_all_converters_average_as_many_conversions():
+    four, one = {"phases": {"samples": 4}}, {"phases": {}}
+    assert make({"a": (four, "bus"), "b": (four, "bus")}).net["conversions"] == 4
+    with pytest.raises(ValueError, match=r"phases\.samples: must be the same"):
+        make({"a": (four, "bus"), "b": (one, "bus")})
+
+
 @pytest.mark.parametrize(
     ("event", "message"),
     [

@@ -169,9 +169,12 @@ def test_the_firmware_of_the_example_enables_blocks_and_resets_as_it_should(tmp_
     assert said.splitlines() == [
         "power: START 0 0",
         "no v_dc: START 0 0",
-        "charged: READY 0 0",
+        "charged: START 0 0",
+        "calibrated: READY 0 0",
+        "20 20",
         "enabled: RUN 1 0",
         "runs: RUN 1 0",
+        "20",
         "1",
         "disabled: READY 0 0",
         "trip: SAFE 0 100",

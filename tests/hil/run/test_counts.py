@@ -98,6 +98,11 @@ def test_a_mean_of_n_conversions_has_less_noise(tmp_path):
         assert abs(wrong.mean()) < 1e-3
         spread.append(wrong.std())
     assert spread[0] / np.array(spread[1:]) == pytest.approx([2, 4], rel=0.05)
+    # 16 conversions of 12 bits at their ends: the largest sum that 16 bits hold
+    ends = {"samples": 16, "offset": {"i_o_a": 100.0, "i_o_b": -100.0}}
+    run = rig(counts=str(file), plant__phases=ends, duration=0.01)
+    assert set(run.signals["y_adc_i_o_a"]) == {16 * 4095} and 16 * 4095 < 2**16
+    assert set(run.signals["y_adc_i_o_b"]) == {0}
 
 
 def test_the_start_takes_the_offsets_of_the_currents(tmp_path):
@@ -195,6 +200,10 @@ def test_a_dll_and_a_library_from_counts_to_counts_are_controllers(tmp_path):
         ({"link__type": "can"}, "link.type = 'can': carries no counts"),
         ({"plant__bridge": {"timer_hz": 1e8}}, "plant.bridge has 5000: timer_hz and carriers"),
         ({"plant__phases": {"bits": 17}}, "plant.phases.bits: must be less than or equal to 16"),
+        (
+            {"plant__phases": {"samples": 32}},
+            "plant.phases.samples = 32: their sum must fit 16 bits, so with bits = 12 at most 16",
+        ),
         ({"plant__phases": {"v": [2.0, -2.0]}}, "range [2.0, -2.0]: must be [lo, hi] with lo < hi"),
         ({"plant__phases": {"skew_s": {"i_a": 2e-4}}}, "plant.phases.skew_s.i_a = 0.0002: must be"),
         ({"plant__bridge": {"kind": "two-level", "carrier_hz": 15e3}}, "must be 10000 or 20000"),

@@ -14,6 +14,8 @@ unsigned long clock_now(void)
     return 0;
 }
 
+enum { OFFSET = 20 };
+
 static int k;
 
 static void ticks(int n, double v_dc, double v_a)
@@ -24,6 +26,7 @@ static void ticks(int n, double v_dc, double v_a)
     for (; n > 0; n--, k++) {
         for (i = 0; i < GFM_VSG_2_NADC; i++)
             adc[i] = 2048;
+        adc[GFM_VSG_2_ADC_I_A] += OFFSET;
         for (i = 0; i < 3; i++)
             adc[GFM_VSG_2_ADC_V_A + i] =
                 (uint16_t)lrint(2048 + (i == 0 ? v_a : 1) * V_1 * cos(0.0314159265358979 * k - 2.0943951023932 * i));
@@ -39,6 +42,15 @@ static void say(const char *what)
            firmware.reason);
 }
 
+/* What a law takes from the counts of i_a. */
+static golden_real offset(int law)
+{
+    unsigned long size;
+    void *instance = firmware_instance(law, &size);
+    return law == VSG_2 ? ((gfm_vsg_2_t *)instance)->counts.shift[GFM_VSG_2_ADC_I_A]
+                        : ((gfm_mimo_gfm_t *)instance)->counts.shift[GFM_MIMO_GFM_ADC_I_A];
+}
+
 int main(void)
 {
     command.law = VSG_2;
@@ -48,13 +60,17 @@ int main(void)
     ticks(1, 0.1, 1);
     say("no v_dc");
     command.enable = 0;
-    ticks(5, 1, 1);
+    ticks(200, 1, 1);
     say("charged");
+    ticks(1, 1, 1);
+    say("calibrated");
+    printf("%g %g\n", (double)offset(MIMO_GFM), (double)offset(VSG_2));
     command.enable = 1;
     ticks(1, 1, 1);
     say("enabled");
     ticks(200, 1, 1);
     say("runs");
+    printf("%g\n", (double)offset(VSG_2));
     printf("%d\n", TIM1->CCR1 != TIM1->CCR2 && TIM1->CCR1 <= TIM1->ARR);
     command.enable = 0;
     ticks(1, 1, 1);
@@ -67,7 +83,7 @@ int main(void)
     ticks(3, 1, 1);
     say("reset while enabled");
     command.enable = 0;
-    ticks(1, 1, 1);
+    ticks(201, 1, 1);
     say("reset");
     command.reset = 0;
     command.enable = 1;
