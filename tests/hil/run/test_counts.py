@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -11,6 +12,11 @@ import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import load_scenario
+from gfm_runtime.assembly import Controller
+from gfm_runtime.counts import align, measure
+from gfm_runtime.firmware.module import at_rest
+from gfm_runtime.signals import NU, NY, names
+from gfm_runtime.switchover import settle_into
 
 from ...support.firmware import cc
 
@@ -173,11 +179,31 @@ def controlled(folder: Path, controller: str) -> gfmhil.Run:
     return gfmhil.Run.load(folder)
 
 
+@numba.njit
+def begin(laws, states, ref, adc, u, trend):
+    """As models begin: along the measured voltage, then at rest at u."""
+    align(laws[0], states[0], adc, 0)
+    states[1].angle[0], states[1].angle[1] = states[0].angle[0], states[0].angle[1]
+    measure(laws[0], states[1], adc, 0)
+    settle_into(laws[0], states[0], ref, states[1].sensed[:NY], u, trend)
+
+
+def start_as_a_model(controller: Controller, adc: Any, u: Any) -> None:
+    """Give a controller, which has started, the state in which a model begins with these counts."""
+    k = int(controller.ctl["active"][0])
+    states = np.zeros(2, controller.states.dtype)
+    states["angle"], states["sensed"], states["speed"] = (1.0, 0.0), at_rest(), 1.0
+    states["e"] = controller.states["e"][k]
+    begin(controller.laws[k : k + 1], states, controller.ctl["ref"][0], adc, u, np.zeros(NU))
+    controller.states[k] = states[0]
+
+
 @pytest.mark.processes
 @pytest.mark.compilers
-def test_a_dll_and_a_library_from_counts_to_counts_are_controllers(tmp_path):
-    """They align their frame by what they measure: near the run with the law itself, not its bits.
-    The library holds the same C, and has no frame in common with the plant: the same bits."""
+def test_a_dll_and_a_library_from_counts_to_counts_are_controllers(tmp_path, monkeypatch):
+    """They align their frame by what they measure: near the run with the law itself, not its bits,
+    unless that begins so too. The library holds the same C, and has no frame in common with the
+    plant: the same bits."""
     command = ["mimo-gfm", "--counts", "rig-dead-time", "--real", "float64", "-o", str(tmp_path)]
     assert main(["firmware", "dll", *command]) == 0 == main(["firmware", "export", *command])
     build = ["-O2", "-ffp-contract=off", "-shared", "-fPIC", f"-I{HEADERS}", f"-I{tmp_path}"]
@@ -191,6 +217,17 @@ def test_a_dll_and_a_library_from_counts_to_counts_are_controllers(tmp_path):
     for name, most in (("y_p", 0.04), ("y_v_dc", 1e-3), ("y_V", 1e-3)):
         apart = np.subtract(found.signals[name], own.signals[name])[2000:].reshape(-1, 200)
         assert np.abs(apart.mean(axis=1)).max() < most, name  # of a period: the ripple differs
+    adc = np.array([found.signals[f"y_{name}"][0] for name in names("adc")])
+    of_the_plant = Controller.start
+
+    def started(controller: Controller, x: Any, u: Any, *rest: Any) -> None:
+        of_the_plant(controller, x, u, *rest)
+        start_as_a_model(controller, adc, np.array(u))
+
+    monkeypatch.setattr(Controller, "start", started)
+    own = gfmhil.run("rig_switched", duration=1.2)
+    for name in ("y_p", "u_cmp_b", "true_v_re"):
+        assert np.array_equal(found.signals[name], own.signals[name]), name
 
 
 @pytest.mark.parametrize(
