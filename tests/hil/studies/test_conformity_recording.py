@@ -78,16 +78,51 @@ def waves(run: Run) -> Columns:
     return run.three_phase(si=True)
 
 
+def write_csv(file: Path, columns: Columns) -> None:
+    head, rows = ",".join(columns), np.stack([*columns.values()], 1)
+    np.savetxt(file, rows, "%.9g", ",", header=head, comments="")
+
+
+def write_parquet(file: Path, columns: Columns) -> None:
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table(columns), file)
+
+
+def write_mf4(file: Path, columns: Columns) -> None:
+    mdf = pytest.importorskip("asammdf")
+    signals = [mdf.Signal(x, columns["t"], name=n) for n, x in columns.items() if n != "t"]
+    with mdf.MDF(version="4.10") as made:
+        made.append(signals)
+        made.save(file, overwrite=True)
+
+
+def write_float_comtrade(file: Path, columns: Columns) -> None:
+    """COMTRADE 2013 of 32-bit floating-point numbers."""
+    pytest.importorskip("comtrade")
+    names = [n for n in columns if n != "t"]
+    t, x = columns["t"], np.stack([columns[n] for n in names], 1)
+    each = [f"{k},{n},,,V,1,0,0,-1e9,1e9,1,1,P" for k, n in enumerate(names, 1)]
+    size = f"{len(names)},{len(names)}A,0D"
+    when = ["01/01/2026,00:00:00.000000"] * 2
+    rate = f"{1 / (t[1] - t[0]):.6f},{len(t)}"
+    lines = ["site,1,2013", size, *each, "60", "1", rate, *when, "FLOAT32", "1", "0,0", "0,0"]
+    file.write_text("\r\n".join(lines) + "\r\n")
+    rows = np.empty(len(t), [("n", "<u4"), ("t", "<u4"), ("x", "<f4", (len(names),))])
+    rows["n"], rows["t"], rows["x"] = np.arange(1, len(t) + 1), np.round(t * 1e6), x
+    file.with_suffix(".dat").write_bytes(rows.tobytes())
+
+
+WRITERS: dict[str, Callable[[Path, Columns], None]] = {
+    "csv": write_csv, "mat": savemat, "parquet": write_parquet, "mf4": write_mf4,
+    "cfg": write_float_comtrade,
+}  # fmt: skip
+
+
 def judged(place: Path, columns: Columns, of: str = "waves.toml", kind: str = "mat") -> Verdicts:
     """The verdicts of the clauses on a recording of such columns, by kind."""
     file = place / f"recording.{kind}"
-    if kind == "cfg":
-        pass  # is there
-    elif kind == "mat":
-        savemat(file, columns)
-    else:
-        head, rows = ",".join(columns), np.stack([*columns.values()], 1)
-        np.savetxt(file, rows, "%.9g", ",", header=head, comments="")
+    if columns:  # or the file is there
+        WRITERS[kind](file, columns)
     converter = place / "converter.toml"
     made = gfmhil.judge_recording(file, place / of, TEST, PART, converter=converter)
     return {v.kind: v.verdict for v in made.parts[0].verdicts}
@@ -107,10 +142,11 @@ def phasors(waves: Columns) -> Columns:
     return made
 
 
+@pytest.mark.parametrize("kind", WRITERS)
 def test_the_phases_of_a_run_have_the_verdicts_of_the_run(
-    place: Path, waves: Columns, verdicts: Verdicts
+    place: Path, waves: Columns, verdicts: Verdicts, kind: str
 ) -> None:
-    found = judged(place, waves, kind="csv")
+    found = judged(place, waves, kind=kind)
     assert found.pop("stays_in_step") == CANNOT  # the angle of a converter shows outside nowhere
     assert found == {kind: verdicts[kind] for kind in found}
     assert PASS in found.values()
