@@ -39,6 +39,7 @@ def switchover(**changed: Any) -> Any:
     return load_scenario("switchover", mode="lockstep", link__type="inproc", **changed)
 
 
+@pytest.mark.processes
 @pytest.mark.attack(
     "8.1",
     "a controller that sends NaN 28 ms after the start of `switchover`, which expects a trip",
