@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,10 @@ import can
 import numpy as np
 import pytest
 
+from gfm_hil.cli import main
 from gfm_hil.core.roles import ROLES
 from gfm_hil.links.can.dbc import write_dbc
-from gfm_hil.recording.parts import RolePart
+from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import load_scenario, toml_text
 
 from ...support.can_reference import quantised_run
@@ -46,23 +46,20 @@ def write(name: str, link: dict[str, Any], **content: Any) -> str:
     return name
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "gfm_hil", *arguments]
-    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-
-
 def run_while(scenario: str, ticks: int, meanwhile: Callable[[], None]) -> dict[str, Any]:
-    """``gfmhil run``; calls ``meanwhile`` after that many ticks; returns the summary."""
-    process = start("run", scenario, "--out", "out", "--quiet", "--no-figures")
-    while True:
-        part = RolePart.open(Path("out"), "plant")
-        if part is not None and int(part.progress[0]) >= ticks:
-            break
-        assert process.poll() is None, process.communicate()[0]
-        time.sleep(0.01)
-    meanwhile()
-    said = process.communicate(timeout=PATIENCE_S)[0]
-    assert "Traceback" not in said
+    """Run it; calls ``meanwhile`` after that many ticks; returns the summary.
+
+    Two processes and not three: a process takes long to start here.
+    """
+    waiting = [meanwhile]
+
+    def progress(done: int, misses: int) -> None:
+        if done >= ticks and waiting:
+            waiting.pop()()
+
+    run_scenario(load_scenario(scenario), Path("out"), progress)
+    for log in Path("out").glob("*.log"):
+        assert "Traceback" not in log.read_text(encoding="utf-8")
     return json.loads(Path("out/summary.json").read_text(encoding="utf-8"))
 
 
@@ -96,31 +93,33 @@ def test_a_flooded_bus():
 
 
 _FLOOD = """
-import contextlib, time, can
-with can.Bus(interface="socketcan", channel="vcan0", fd=True) as bus:
-    message = can.Message(arbitration_id=1, is_extended_id=False, data=bytes(8))
+import contextlib, socket, struct, time
+with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:
+    bus.bind(("vcan0",))
     print("flooding", flush=True)
     while True:
         for _ in range(10):
-            with contextlib.suppress(can.CanOperationError):  # no room
-                bus.send(message)
+            with contextlib.suppress(OSError):  # no room
+                bus.send(struct.pack("=IB3x8x", 1, 8))
         time.sleep(1e-3)
 """
 
 
-def test_another_dbc_is_refused_by_both_processes():
+def test_another_dbc_is_refused_by_both_processes(capsys):
     Path("other.dbc").write_text(write_dbc(True).replace("(0.0002,0.0)", "(0.0004,0.0)"))
-    roles = {
-        "controller": start("controller", write("one.toml", {}), "--out", "one"),
-        "plant": start(
-            "plant", write("two.toml", {"options": {"dbc": "other.dbc"}}), "--out", "two"
-        ),
-    }
-    for role, process in roles.items():
-        said = process.communicate(timeout=PATIENCE_S)[0]
+    command = [sys.executable, "-m", "gfm_hil", "controller", write("one.toml", {}), "--out", "one"]
+    with subprocess.Popen(
+        command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as controller:
+        two = write("two.toml", {"options": {"dbc": "other.dbc"}})
+        codes = {"plant": main(["plant", two, "--out", "two"])}
+        said = {"plant": "".join(capsys.readouterr())}
+        said["controller"] = controller.communicate(timeout=PATIENCE_S)[0]
+        codes["controller"] = controller.returncode
+    for role in ROLES:
         other = ROLES[1 - ROLES.index(role)]
-        assert f"the {other} uses another DBC" in " ".join(said.split())
-        assert process.returncode == 3
+        assert f"the {other} uses another DBC" in " ".join(said[role].split())
+        assert codes[role] == 3
 
 
 def test_an_interface_that_goes_down_ends_the_run_in_safe():
@@ -155,7 +154,7 @@ def test_bus_off_ends_the_run_in_safe():
         (ENDPOINT, 16, "not set up for CAN FD (mtu 72); link.options.fd = false?"),
     ],
 )
-def test_a_bus_that_is_not_to_be_had(endpoint, mtu, said):
+def test_a_bus_that_is_not_to_be_had(endpoint, mtu, said, capsys):
     def set_mtu(size: int) -> None:
         link("down")
         subprocess.run(["ip", "link", "set", "vcan0", "mtu", str(size)], check=True)
@@ -163,10 +162,10 @@ def test_a_bus_that_is_not_to_be_had(endpoint, mtu, said):
 
     set_mtu(mtu)
     try:
-        process = start("plant", write("scenario.toml", {"endpoint": endpoint}), "--out", "out")
-        output = process.communicate(timeout=PATIENCE_S)[0]
+        scenario = write("scenario.toml", {"endpoint": endpoint})
+        assert main(["plant", scenario, "--out", "out"]) == 2
     finally:
         set_mtu(72)
+    output = "".join(capsys.readouterr())
     assert said in output
     assert output.count("\n") == 1
-    assert process.returncode == 2
