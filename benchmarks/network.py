@@ -1,30 +1,39 @@
-"""What a tick of several converters in one network costs, in process: ``python -m
+"""What a tick of many converters in one network costs, in process: ``python -m
 benchmarks.network``.
 
 Every converter runs VSG-2 behind its own feeder to one bus with a load, and all that a run in
-process does is in the tick: the plant, the controllers, the recording. Rounds of all sizes take
-turns, so that a busy machine is as busy for each of them.
+process does is in the tick: the plant, the controllers, the recording. ``--case case39`` has a
+published case instead, with converters at the buses of ``--converters``. Rounds of all sizes take
+turns. Times are those of the processor, so that a busy machine counts little.
+
+With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
+its EMT solver takes for the same feeders, in three phases, with a voltage source in place of each
+bridge: no DC link, no sensor, no controller, no recording.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import gfmhil
 from gfm_hil.engine.inproc import CHUNK, rows, run_ticks, stack
 from gfm_hil.engine.setup import make_benches
-from gfm_hil.scenario import load_scenario
+from gfm_hil.scenario import Scenario, load_scenario
+
+TICKS = 100_000  # of all converters of a case in a round
 
 
-class Case:
-    """A network of n converters, ready to run the same ticks again and again."""
-
-    def __init__(self, n: int) -> None:
-        names = [f"c{k}" for k in range(n)]
-        content: dict[str, Any] = {
+def star(n: int) -> Scenario:
+    """n converters on feeders."""
+    names = [f"c{k}" for k in range(n)]
+    return load_scenario(
+        {
             "title": f"{n} converters", "duration": 10.0, "law": "vsg-2",
             "link": {"type": "inproc"},
             "network": {
@@ -33,14 +42,34 @@ class Case:
                           for name in names},
                 "loads": {"load": {"node": "bus", "P": 0.45 * n, "Q": 0.1 * n}},
             },
-        }  # fmt: skip
-        benches = make_benches(load_scenario(content))
-        self.rows = rows(n, CHUNK, False)
+        }
+    )  # fmt: skip
+
+
+def published(case: str, converters: str, folder: str) -> Scenario:
+    """A power-flow case, with droop-3 at some of its buses; its files stay in a folder."""
+    made = gfmhil.network_from(case, dict.fromkeys(converters.split(","), "droop-3"))
+    return load_scenario(made.save(Path(folder) / "net"), in_process=True)
+
+
+class Case:
+    """A network ready to run the same ticks again and again."""
+
+    def __init__(self, name: str, scenario: Scenario) -> None:
+        self.name = name
+        began = time.process_time()
+        benches = make_benches(scenario)
+        self.set_up = time.process_time() - began
+        n = len(benches)
+        self.ticks = max(100, min(CHUNK, TICKS // n))
+        self.rows = rows(n, self.ticks, benches[0].inner, benches[0].options)
         self.stack, self.plant = stack(benches), benches[0].plant
         self.kept = self.plant.copy()
         self.arrays = [*self.stack.controllers, self.stack.y, self.stack.u]
         self.start = [array.copy() for array in self.arrays]
-        self.states = len(self.plant.wiring.order)
+        wiring = self.plant.wiring
+        self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
+        self.way = "series" if self.plant.net["sparse"][0] else "modes"
         self.ns: list[float] = []
         self.round()  # compiles
         self.ns.clear()
@@ -50,26 +79,89 @@ class Case:
         self.plant.restore(self.kept)
         for array, old in zip(self.arrays, self.start, strict=True):
             array[:] = old
-        began = time.perf_counter()
-        done = run_ticks(self.plant.records, self.stack, self.rows[0], self.rows[1], 0, CHUNK)
-        self.ns.append((time.perf_counter() - began) / CHUNK * 1e9)
-        if done != CHUNK:
-            raise SystemExit(f"the run ended at tick {done}")
+        began = time.thread_time()
+        done = run_ticks(self.plant.records, self.stack, *self.rows, 0, self.ticks)
+        self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
+        if done != self.ticks:
+            raise SystemExit(f"{self.name}: the run ended at tick {done}")
+
+
+def dpsim(n: int, steps: int) -> float:
+    """What a step of DPsim takes for n sources on feeders, ns."""
+    import dpsimpy  # type: ignore[import-not-found]
+
+    emt, node, omega = dpsimpy.emt.ph3, dpsimpy.emt.SimNode, 2 * np.pi * 50
+    unit = np.exp(2j / 3 * np.pi * np.array([[0], [-1], [1]]))
+    bus = node("bus", dpsimpy.PhaseType.ABC)
+    nodes, parts = [bus], list[Any]()
+
+    def add(kind: Any, name: str, ends: list[Any], **values: Any) -> None:
+        part = kind(name)
+        part.set_parameters(**values)
+        part.connect(ends)
+        parts.append(part)
+
+    def series(name: str, one: Any, other: Any, L: float, R: float) -> None:
+        nodes.append(node(f"{name}.m", dpsimpy.PhaseType.ABC))
+        add(emt.Resistor, f"{name}.R", [one, nodes[-1]], R=R * np.eye(3))
+        add(emt.Inductor, f"{name}.L", [nodes[-1], other], L=L / omega * np.eye(3))
+
+    for k in range(n):
+        e, v, at = (node(f"{name}{k}", dpsimpy.PhaseType.ABC) for name in ("e", "v", "at"))
+        nodes += [e, v, at]
+        add(emt.VoltageSource, f"E{k}", [node.gnd, e], V_ref=unit, f_src=50.0)
+        series(f"filter{k}", e, v, 0.1, 0.01)
+        add(emt.Capacitor, f"C{k}", [v, node.gnd], C=0.05 / omega * np.eye(3))
+        series(f"line{k}", v, at, 0.2, 0.01)
+        series(f"feeder{k}", at, bus, 0.1, 0.01)
+    add(emt.Resistor, "load", [bus, node.gnd], R=2.0 / n * np.eye(3))
+    one = dpsimpy.Simulation(f"star{n}", dpsimpy.LogLevel.off)
+    one.set_system(dpsimpy.SystemTopology(50.0, nodes, parts))
+    one.set_domain(dpsimpy.Domain.EMT)
+    one.set_time_step(1e-4)
+    one.set_final_time(1e4)
+    one.start()
+    found = []
+    for _ in range(10):
+        began = time.thread_time()
+        for _ in range(steps):
+            one.next()
+        found.append((time.thread_time() - began) / steps * 1e9)
+    return min(found)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=50)
-    rounds = parser.parse_args().rounds
-    cases = {n: Case(n) for n in (1, 2, 4, 10)}
-    for _ in range(rounds):
-        for case in cases.values():
+    parser.add_argument("--sizes", default="1,2,4,10,30,100,300", help="converters on feeders")
+    parser.add_argument("--case", help="a published case instead, such as case39")
+    parser.add_argument("--converters", default="30", help="its buses with converters")
+    parser.add_argument("--dpsim", action="store_true")
+    asked = parser.parse_args()
+    if asked.case:
+        with tempfile.TemporaryDirectory() as folder:
+            scenario = published(asked.case, asked.converters, folder)
+            cases = [Case(asked.case, scenario)]
+    else:
+        cases = [Case("feeders", star(int(n))) for n in asked.sizes.split(",")]
+    for _ in range(asked.rounds):
+        for case in cases:
             case.round()
-    print("| converters | currents and voltages | ns a tick, least | median | times real time |")
-    print("|--:|--:|--:|--:|--:|")
-    for n, case in cases.items():
-        least, middle = min(case.ns), float(np.median(case.ns))
-        print(f"| {n} | {case.states} | {least:.0f} | {middle:.0f} | {1e5 / middle:.0f} |")
+    print(
+        "| network | converters | machines | branches | states | solved by | set-up, s"
+        " | us a tick, least | median | times real time |" + " DPsim, us |" * asked.dpsim
+    )
+    print("|---|--:|--:|--:|--:|---|--:|--:|--:|--:|" + "--:|" * asked.dpsim)
+    for case in cases:
+        least, middle = min(case.ns) / 1e3, float(np.median(case.ns)) / 1e3
+        sizes = " | ".join(map(str, case.sizes))
+        theirs = ""
+        if asked.dpsim and not asked.case:
+            theirs = f" {dpsim(case.sizes[0], case.ticks // 10) / 1e3:.3g} |"
+        print(
+            f"| {case.name} | {sizes} | {case.way} | {case.set_up:.2g} | {least:.3g} |"
+            f" {middle:.3g} | {100 / least:.3g} |{theirs}"
+        )
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from gfm_plant.going_on import advance
 from gfm_plant.layout import field
 from gfm_plant.model import V_DC
 from gfm_plant.phases import along, stands
-from gfm_plant.records import PlantRecords
-from gfm_plant.solution import I_F, I_O, V, circuit, mirror_sources, own
+from gfm_plant.records import I_F, I_O, PlantRecords, V
+from gfm_plant.solution import circuit, mirror_sources, own
 from gfm_runtime.compiled import cached, compiled
 
 N_SEEN = 12  # columns of ``watch_period``

@@ -39,7 +39,8 @@ from gfm_plant.series import (
     make_powers,
     normal,
 )
-from gfm_plant.solution import circuit, grid_source, integrals, turned
+from gfm_plant.solution import circuit, grid_source, integrals
+from gfm_plant.sparse import turned
 from gfm_runtime.compiled import compiled, inlined
 
 _AXES = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])

@@ -21,11 +21,15 @@ from gfm_plant.network import Network
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
+from gfm_plant.sparse import entries_of
 from gfm_plant.wiring import ConverterCircuit, Wiring
 from gfm_runtime.signals import CHANNELS, COUNT_BITS, SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
+MOST_BY_MODES = 60
+"""States of a circuit up to which it is solved by its modes, and beyond which by its series, unless
+a bridge is switched."""
 CONNECTION, LINE = "connection", "line"
 """With a second inductor: the point of connection behind it, and the line from there."""
 
@@ -155,7 +159,9 @@ def _make(
         raise ValueError(
             f"{dynamic[0][0]}: cannot be beside a switched bridge yet; set bridge.kind = 'average'"
         )
-    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates)
+    large = not carriers and len(wiring.order) > MOST_BY_MODES
+    entries = entries_of(wiring) if large else 0
+    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries)
     network.net["updates"] = updates
     network.net["batteries"] = par["energy"].any()
     now = network.now
@@ -181,6 +187,7 @@ def _network(
     dynamic: Sequence[tuple[str, str, Dynamic]],
     measured: bool,
     units_of_carrier: int,
+    entries: int,
 ) -> Network:
     """Return a plant whose circuits are still to be made.
 
@@ -188,6 +195,7 @@ def _network(
         dynamic: table, name and options of each component with a record.
         measured: whether p, q and V of the connection points are looked at.
         units_of_carrier: see ``net_dtype``.
+        entries: of the sums of a large plant, 0: it is solved by its modes.
     """
     cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
@@ -203,6 +211,8 @@ def _network(
         units_of_carrier,
         carry_zero,
         len(wiring.breakers()) + 2,  # the grid's, and the second end of a line with a fault inside
+        len(wiring.nodes),
+        entries,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)

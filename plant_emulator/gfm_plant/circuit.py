@@ -16,18 +16,22 @@ frame that stands still belong to two real circuits, which have nothing to do wi
 ``join_axes`` makes one set of modes of both.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
 
 GROUND = "ground"
 
 WORST_CONDITION = 1e8
 """Largest condition number of the modes: beyond it half of the digits would be lost."""
+
+_DEAD = 1e-15  # p.u.; an admittance at each node, so that a dead part has a solution, zero
 
 
 @dataclass(frozen=True)
@@ -193,6 +197,50 @@ def find_modes(circuit: Circuit, omega_b: float, order: tuple[str, ...]) -> Mode
     return Modes(rates, states, modes, drive, mirror)
 
 
+def rest(
+    circuit: Circuit, order: Sequence[str], volts: Mapping[str, complex], turns: Mapping[str, float]
+) -> NDArray[np.complex128]:
+    """w at rest, in the common frame at t = 0: by the sparse equations of branches and nodes.
+
+    Args:
+        circuit, order: as for ``find_modes``.
+        volts, turns: of each source and sink its value and its speed, p.u.
+    """
+    fixed, charged, through = check_parts(circuit)
+    branches = circuit.branches
+    nodes = {node: None for branch in branches for node, _ in branch.taken()}
+    place = {node: k for k, node in enumerate(n for n in nodes if n != GROUND and n not in fixed)}
+    places = {name: k for k, name in enumerate(order)}
+    n_b, n = len(branches), len(branches) + len(place)
+    w = np.zeros(len(order), complex)
+    for omega in {turns[name] for name in circuit.names}:
+        those = {name: volts[name] if turns[name] == omega else 0j for name in circuit.names}
+        entries, right = list[tuple[int, int, complex]](), np.zeros(n, complex)
+        for j, b in enumerate(branches):
+            entries.append((j, j, -complex(b.R, omega * b.L)))
+            for node, sign in b.taken():
+                if node in fixed:
+                    right[j] -= sign * those[circuit.sources[fixed[node]].name]
+                elif node != GROUND:
+                    entries += [(j, n_b + place[node], sign), (n_b + place[node], j, sign)]
+        admittance = {node: 1j * omega * circuit.capacitors[k].C for node, k in charged.items()}
+        for node, k in place.items():
+            Y, R = admittance.get(node, _DEAD), through.get(node)
+            if R == 0.0:  # a metallic fault
+                entries = [one for one in entries if one[0] != n_b + k] + [(n_b + k, n_b + k, 1.0)]
+            else:
+                entries.append((n_b + k, n_b + k, Y + (1 / R if R else 0.0)))
+        for sink in circuit.sinks:
+            right[n_b + place[sink.node]] -= those[sink.name]
+        rows, columns, values = zip(*entries, strict=True)
+        found = splu(csc_matrix((values, (rows, columns)), (n, n), dtype=complex)).solve(right)
+        for j, b in enumerate(branches):
+            w[places[b.name]] += found[j]
+        for node, k in charged.items():
+            w[places[circuit.capacitors[k].name]] += found[n_b + place[node]]
+    return w
+
+
 def find_rates(circuit: Circuit, omega_b: float, order: Sequence[str]) -> Rates:
     """Return the equations of a circuit as they are, for whom solves them by a series; arguments
     and errors as for ``find_modes``."""
@@ -225,19 +273,11 @@ def assemble(circuit: Circuit, apart: str = "") -> Assembled:
         circuit: the circuit.
         apart: a node at which something else ends too: its shunt is left out.
     """
-    branches, capacitors = circuit.branches, circuit.capacitors
-    sources, sinks = circuit.sources, circuit.sinks
-    stored = {**{b.name: b.L for b in branches}, **{c.name: c.C for c in capacitors}}
-    for name, value in stored.items():
-        if not value > 0:
-            raise ValueError(f"{name} = {value}: must be > 0")
-    fixed = _places("source", sources)
-    charged = _places("capacitor", capacitors)
-    if both := set(fixed) & set(charged):
-        raise ValueError(f"node {min(both)}: a source and a capacitor in parallel")
-
-    through = {shunt.node: shunt.R for shunt in circuit.shunts}
-    n_b, n_c = len(branches), len(capacitors)
+    branches, sources, sinks = circuit.branches, circuit.sources, circuit.sinks
+    fixed, charged, through = check_parts(circuit, apart)
+    stored = [b.L for b in branches] + [c.C for c in circuit.capacitors]
+    names = [b.name for b in branches] + [c.name for c in circuit.capacitors]
+    n_b, n_c = len(branches), len(circuit.capacitors)
     n_s = len(sources) + len(sinks)
     M = np.zeros((n_b + n_c, n_b + n_c))  # of the stored quantities: L i' = M w + B s, C v' = M w
     B = np.zeros((n_b + n_c, n_s))
@@ -253,28 +293,51 @@ def assemble(circuit: Circuit, apart: str = "") -> Assembled:
             elif node != GROUND:
                 meets.setdefault(node, np.zeros(n_b + n_c))[j] = sign
     for j, sink in enumerate(sinks, len(sources)):
+        B[n_b + charged[sink.node], j] = -1.0
+    for node, k in charged.items():
+        if node in through:
+            M[n_b + k, n_b + k] -= 1 / through[node]
+    for node, row in list(meets.items()):
+        if node != apart and node in through:  # its voltage is R times the current that arrives
+            M -= through[node] * np.outer(row, row)
+            del meets[node]
+
+    return Assembled(names, M, B, np.sqrt(stored), meets)
+
+
+def check_parts(
+    circuit: Circuit, apart: str = ""
+) -> tuple[dict[str, int], dict[str, int], dict[str, float]]:
+    """The places of the sources and of the capacitors at their nodes, and R of the shunts; errors
+    and arguments as for ``assemble``."""
+    for part in circuit.branches:
+        if not part.L > 0:
+            raise ValueError(f"{part.name} = {part.L}: must be > 0")
+    for bank in circuit.capacitors:
+        if not bank.C > 0:
+            raise ValueError(f"{bank.name} = {bank.C}: must be > 0")
+    fixed = _places("source", circuit.sources)
+    charged = _places("capacitor", circuit.capacitors)
+    if both := set(fixed) & set(charged):
+        raise ValueError(f"node {min(both)}: a source and a capacitor in parallel")
+    through = {shunt.node: shunt.R for shunt in circuit.shunts}
+    for sink in circuit.sinks:
         if sink.node not in charged:
             raise ValueError(
                 f"node {sink.node}: {sink.name} draws a current, so the node needs a bank of"
                 " network.capacitors"
             )
-        B[n_b + charged[sink.node], j] = -1.0
-    for node, k in charged.items():
-        if node in through:
-            if not through[node] > 0:
-                raise ValueError(f"node {node}: a shunt of R = {through[node]} on a capacitor")
-            M[n_b + k, n_b + k] -= 1 / through[node]
-    for node, row in list(meets.items()):
-        if node == apart:
-            continue
-        if node in through:  # its voltage is R times the current that arrives
-            M -= through[node] * np.outer(row, row)
-            del meets[node]
-        elif np.count_nonzero(row) < 2:
-            only = branches[int(np.flatnonzero(row)[0])]
-            raise ValueError(f"node {node}: only {only.name} ends there")
-
-    return Assembled(list(stored), M, B, np.sqrt(list(stored.values())), meets)
+    for node in charged:
+        if not through.get(node, 1.0) > 0:
+            raise ValueError(f"node {node}: a shunt of R = {through[node]} on a capacitor")
+    met: dict[str, list[str]] = {}
+    for branch in circuit.branches:
+        for node, _ in branch.taken():
+            met.setdefault(node, []).append(branch.name)
+    for node, names in met.items():
+        if len(names) < 2 and node not in {GROUND, apart, *fixed, *charged, *through}:
+            raise ValueError(f"node {node}: only {names[0]} ends there")
+    return fixed, charged, through
 
 
 def join_axes(alpha: Modes, beta: Modes, angle: float) -> Modes:

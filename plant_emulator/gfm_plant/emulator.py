@@ -21,8 +21,8 @@ from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
-from gfm_plant.records import COMPARE, MAX_DELAY, N_COMMANDS, PlantRecords
-from gfm_plant.solution import I_F, V, circuit, enter, mirror_sources, node_voltage, own
+from gfm_plant.records import COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
+from gfm_plant.solution import circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled, inlined
 

@@ -52,6 +52,12 @@ def make_joint(n: Any, now: Any) -> None:
 
 
 @inlined
+def joint_circuit(n: Any) -> int:
+    """Return the place of the circuit of several contacts."""
+    return 0 if n.sparse else n.n_c - 1
+
+
+@inlined
 def fault_phases(now: Any) -> int:
     """Return the phases of the fault that conduct: 1 for a, 2 for b, 4 for c."""
     conducts = field(now, "conducts")
@@ -180,7 +186,7 @@ def _invert(n: Any, now: Any) -> None:
 @compiled
 def _fill(n: Any, now: Any) -> None:
     """Write modes, states and what drives them."""
-    c, eigen, half_h = n.n_c - 1, field(now, "eigen"), field(n, "half_h")
+    c, eigen, half_h = joint_circuit(n), field(now, "eigen"), field(n, "half_h")
     rate, decay, states = field(n, "rate"), field(n, "decay"), field(n, "states")
     of_w, node, node_w = field(n, "to_w"), field(n, "node_q"), field(n, "node_w")
     modes, drive, node_s = field(n, "modes"), field(n, "drive"), field(n, "node_s")
@@ -234,7 +240,7 @@ def _split(n: Any, now: Any, rows: Any, m: int, out: Any, c: int, at: int) -> No
 @compiled
 def _fill_rates(n: Any, now: Any) -> None:
     """Write the equations of w for `series`: W' of the modes, W and its conjugate."""
-    c, N, own_rates = n.n_c - 1, n.n_converters, field(n, "own_rates")
+    c, N, own_rates = joint_circuit(n), n.n_converters, field(n, "own_rates")
     count, place, link = field(n, "n_links"), field(n, "link_place"), field(n, "link")
     for which in range(2):
         e, columns = 0, n.n_states if which == 0 else now.n_s
@@ -264,7 +270,7 @@ def _rates(
 ) -> tuple[float, float, float, float]:
     """Return what a state, or (which = 1) a source, does to W' of another one: alpha to alpha, beta
     to beta, beta to alpha, alpha to beta."""
-    c, eigen, states = n.n_c - 1, field(now, "eigen"), field(n, "states")
+    c, eigen, states = joint_circuit(n), field(now, "eigen"), field(n, "states")
     direct, mirrored = 0j, 0j
     for m in range(n.reals):
         if which == 0:

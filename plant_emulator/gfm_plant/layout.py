@@ -21,6 +21,9 @@ intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's argu
 MOST_CONTACTS = 8
 """None, one of three phases, and what is left of it as these open: two of them, or one."""
 
+MOST_OF_SEVERAL = 500
+"""States up to which a large plant may have several contacts at a time, whose modes it makes."""
+
 CHECK_SIDES = 2
 """Nodes whose voltage a synchro-check looks at."""
 
@@ -48,12 +51,12 @@ _NET: _Arrays = {
     "lag_rate": (float, ("n_lags",)),  # 1/s
     # the modes of each circuit
     "n_modes": (int, ("n_c",)),
-    "rate": (complex, ("n_c", "n_z")),  # 1/s
-    "decay": (complex, ("n_c", "n_cuts", "n_z")),  # in half a piece of each cut
+    "rate": (complex, ("n_m", "n_z")),  # 1/s
+    "decay": (complex, ("n_m", "n_cuts", "n_z")),  # in half a piece of each cut
     # by the sources and by w, and by the mirror images of both, see `circuit.Modes`
-    "drive": (complex, ("n_c", 2, "n_z", "n_s")),
-    "states": (complex, ("n_c", "n_w", "n_z")),
-    "modes": (complex, ("n_c", 2, "n_z", "n_w")),
+    "drive": (complex, ("n_m", 2, "n_z", "n_s")),
+    "states": (complex, ("n_m", "n_w", "n_z")),
+    "modes": (complex, ("n_m", 2, "n_z", "n_w")),
     "unbalanced": (int, ("n_c",)),
     # of the contacts: the current of each phase by w, and what is left when it opens (-1:
     # it carries none), see `Wiring.contacts`
@@ -75,10 +78,30 @@ _NET: _Arrays = {
     # of nodes whose voltage is looked at, the two sides of a synchro-check first and then the
     # connection points: their voltages by w and by the sources, and by the mirror images of both;
     # what turns the latter; and the place in w of the current that reaches the node
-    "node_w": (complex, ("n_c", "n_nodes", 2, "n_w")),
-    "node_s": (complex, ("n_c", "n_nodes", 2, "n_s")),
+    "node_w": (complex, ("n_m", "n_nodes", 2, "n_w")),
+    "node_s": (complex, ("n_m", "n_nodes", 2, "n_s")),
     "node_turn": (complex, ("n_c",)),
     "node_i": (int, ("n_nodes",)),
+    # of a large plant, see `sparse.Sparse`, of each contact its axis alpha and its axis beta: how
+    # many states, sums for the voltages, rows of ``extra_at``, sums on the way in, and sums of no
+    # more than two, of three and of four entries; and of each node whose voltage is looked at its
+    # column, -1: it is zero
+    "n_sums": (int, ("n_sparse", 7)),
+    "norm": (float, ("n_sparse",)),
+    "own_by": (float, ("n_sparse", 6, "n_converters")),
+    "line_to": (int, ("n_sparse", "n_converters")),
+    "state_at": (int, ("n_sparse", "n_w")),
+    "x_of": (int, ("n_sparse", "n_w")),
+    "x_by": (float, ("n_sparse", "n_w")),
+    "extra_at": (int, ("n_sparse", "n_w")),
+    "sum_begin": (int, ("n_sparse", "n_columns")),
+    "sum_column": (int, ("n_sparse", "n_sum")),
+    "sum_value": (float, ("n_sparse", "n_sum")),
+    "enter_begin": (int, ("n_sparse", "n_columns")),
+    "enter_column": (int, ("n_sparse", "n_sum")),
+    "enter_value": (float, ("n_sparse", "n_sum")),
+    "node_column": (int, ("n_sparse", "n_nodes")),
+    "contact_axis": (complex, ("n_contacts",)),  # e^(-j angle) of alpha
     # with switched bridges, see `series`: which cut of the period each unit of the carrier belongs
     # to; of each circuit e^(-j angle) of its axis alpha, the axes of the legs, its fastest rate,
     # 1/s; of each converter what i_f, v, i_o and v, i_o of itself do to its v and i_o, on both
@@ -125,6 +148,13 @@ _NOW: _Arrays = {
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),
+    # of a large plant: the sources in the middle of a piece, and along it; the present term and the
+    # next of states, sources and voltages; and the states in the middle and at the end of a piece
+    "source_next": (complex, ("n_s",)),
+    "s_now": (float, (2, "n_s")),
+    "columns": (float, (2, 2, "n_columns")),
+    "x_middle": (float, (2, 2, "n_w")),
+    "x_end": (float, (2, 2, "n_w")),
     # of several contacts, the fault first and then the poles: which phases conduct, whether each of
     # them opens as soon as its current passes zero; and memory of `joint.make_joint`
     "conducts": (int, ("n_joint", 3)),
@@ -151,6 +181,7 @@ net_dtype = _header(
         ("T_s", "f8"),
         ("advance", "i8"),  # address, see `going_on`
         ("conversions", "i8"),  # of the A/D at the phases in a period
+        ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
         # units of a switched bridge's carrier in a period, between two loads of compare values (0:
@@ -178,7 +209,8 @@ net_dtype = _header(
 
 Circuits come in groups, one for each of `Wiring.contacts`, the first of which is none: row 0 of a
 group as the converters are, and row 1 + k with the bridge of converter k blocked besides. The last
-circuit is made in the loop, for several contacts at a time. Sources
+circuit is made in the loop, for several contacts at a time. A large plant has that one first, and
+then one circuit for each contact. Sources
 are the bridges, then the positive and the negative sequence of the grid, then the voltages and the
 currents of components; in an unbalanced circuit their mirror images follow in the same order. Such
 a circuit has up to two modes a state.
@@ -187,6 +219,11 @@ a circuit has up to two modes a state.
 now_dtype = _header(
     [
         ("row", "i8"),  # in the group of circuits
+        # of a large plant: whether a source is held at two values in a piece; e^(j omega_b t) at
+        # its beginning, which unbalanced circuits need, and e^(-j omega_b h) of half of it
+        ("held", "i8"),
+        ("upright", "c16"),
+        ("back", "c16"),
         ("order", "i8"),  # of the matrices of `powers`
         # e^(j omega_b t) at the beginning of a period, and its tick
         ("stands", "c16"),
@@ -234,6 +271,8 @@ def make_net_and_now(
     units: int = 0,
     zeros: int = 0,
     breakers: int = 0,
+    nodes: int = 0,
+    entries: int = 0,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -247,19 +286,28 @@ def make_net_and_now(
         units: of a switched bridge's carrier in a period, 0: none is switched.
         zeros: states of a zero sequence among these, which have one axis.
         breakers: how many ends of lines may open at a time.
+        nodes: between the parts.
+        entries: of the sums of a large plant, see `sparse`; 0: it is solved by its modes.
     """
+    modes, circuits = 2 * states - zeros, MOST_CONTACTS * (converters + 1) + 1
+    if entries:
+        modes, circuits = modes if states <= MOST_OF_SEVERAL else 0, MOST_CONTACTS + 1
     lengths = {
-        "n_converters": converters, "n_w": states, "n_z": 2 * states - zeros, "n_s": sources,
+        "n_converters": converters, "n_w": states, "n_z": modes, "n_s": sources,
         "n_phasors": 2 * sources, "n_contacts": MOST_CONTACTS,
-        "n_c": MOST_CONTACTS * (converters + 1) + 1, "n_parts": parts, "n_cuts": 2 * parts + 1,
+        "n_c": circuits, "n_m": 1 if entries else circuits,
+        "n_parts": parts, "n_cuts": 2 * parts + 1,
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
-        "n_units": units, "n_rates": MOST_CONTACTS * (converters + 1) + 1 if units else 0,
-        "n_q": 2 * states - zeros, "n_poles": breakers, "n_joint": breakers + 1,
-        "n_entries": states * max(states, sources), "n_terms": TERMS if units else 0,
+        "n_units": units, "n_rates": circuits if units else 0,
+        "n_q": modes, "n_poles": breakers if modes else 0, "n_joint": breakers + 1,
+        "n_sparse": 2 * MOST_CONTACTS if entries else 0, "n_sum": entries,
+        "n_columns": 4 * states + 2 * sources + 4 * (nodes + 4) if entries else 0,
+        "n_entries": states * max(states, sources) if units else 0,
+        "n_terms": TERMS if units else 0,
         "n_slots": SLOTS if units and converters == 1 else 0,
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
-    net["connections"] = connections
+    net["connections"], net["sparse"] = connections, entries > 0
     return net, now
 
 

@@ -22,6 +22,7 @@ from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.phases import convert_nothing
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
+from gfm_plant.sparse import pack_sparse
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
@@ -112,11 +113,11 @@ class Network:
         now, N, wiring = self.now[0], len(self.par), self.wiring
         turn = np.exp(1j * x[:, DELTA])
         now["unit"][:N] = turn
-        modes, sources = wiring.modes(wiring.blocked, None)
         order, omega_b, place_of = wiring.order, wiring.omega_b, wiring.sources()
         volts = {unit.bridge: complex(*u[k, 2:]) * turn[k] for k, unit in enumerate(wiring.units)}
         turns = {unit.bridge: float(u[k, 1]) for k, unit in enumerate(wiring.units)}
         volts[GRID_SOURCE], turns[GRID_SOURCE] = complex(now["V_g"]), float(now["omega_g"])
+        rests_at = wiring.resting if self.net[0]["sparse"] else wiring.resting_by_modes
         resting_at = rests or [(np.empty(0), float(u[0, 1]))] * len(wiring.fed)
         fed = [(*item, *rest) for item, rest in zip(self.fed(), resting_at, strict=True)]
         for name, one, record, z, omega in fed:
@@ -130,20 +131,12 @@ class Network:
         if (leader := self._leader()) is not None:
             now["omega_g"] = leader["omega"]
 
-        def resting() -> NDArray[np.complex128]:
-            z = np.zeros(len(modes.rates), complex)
-            for omega in {turns[name] for name in sources}:
-                speed = omega_b * (omega - 1.0)
-                those = [volts[name] if turns[name] == omega else 0.0 for name in sources]
-                z += modes.drive @ those / (1j * speed - modes.rates)
-            return np.asarray(modes.states @ z)
-
-        w = resting()
+        w = rests_at(volts, turns)
         currents = [item for item in fed if not item[1].is_voltage]
         for _ in range(_ROUNDS if currents else 0):  # they follow from the voltages
             for name, one, record, z, omega in currents:
                 volts[name] = one.start(record, complex(w[record["sees"]]), omega, omega_b, z)
-            w = resting()
+            w = rests_at(volts, turns)
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
             current = float(self.par[k]["current"])
@@ -245,19 +238,21 @@ def _connect(plant: Network, wiring: Wiring) -> None:
             record["leads"] = may_lead and name not in wiring.opened
             may_lead = may_lead and not record["leads"]
     found, which = {}, {}
-    for k in range(N + 1):
+    _pack_contacts(net, wiring)
+    looked_at = _nodes(net, wiring)
+    net["poles"], fastest = 0, []
+    if net["sparse"]:
+        fastest.append(pack_sparse(net, wiring, looked_at))
+    for k in range(0 if net["sparse"] else N + 1):
         blocked = frozenset(wiring.blocked | ({k - 1} if k > 0 else set()))
         for j, contact in enumerate(wiring.contacts):
             which[k + (N + 1) * j] = blocked, contact
             found[k + (N + 1) * j] = wiring.modes(blocked, contact)
-    _pack_contacts(net, wiring)
-    fastest = [np.abs(modes.rates.imag).max() for modes, _ in found.values()]
-    net["poles"] = 0
+    fastest += [np.abs(modes.rates.imag).max() for modes, _ in found.values()]
     if wiring.joint:
         fastest.append(_pack_joint(plant, wiring))
     _pack_pieces(plant, max(fastest))
     places = wiring.sources()
-    looked_at = _nodes(net, wiring)
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][circuit] = len(modes.rates)
         net["rate"][circuit, :n] = modes.rates

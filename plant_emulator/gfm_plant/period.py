@@ -19,12 +19,10 @@ from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.phases import apply_counts
-from gfm_plant.records import COMPARE, N_COMMANDS, PlantRecords
+from gfm_plant.records import COMPARE, I_F, I_O, N_COMMANDS, PlantRecords, V
 from gfm_plant.solution import (
-    I_F,
-    I_O,
-    V,
     circuit,
+    clear_forced,
     cut_to,
     drive,
     grid_source,
@@ -250,9 +248,8 @@ def _piece(plant: PlantRecords, c: int, part: int) -> None:
     """Go on by one piece of a stretch under the commands that act."""
     n, now = plant.net[0], plant.now[0]
     omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
-    forced, w, half_h = field(now, "forced"), field(now, "w"), field(n, "half_h")[part]
-    for m in range(field(n, "n_modes")[c]):
-        forced[m, 0] = forced[m, 1] = 0j
+    w, half_h = field(now, "w"), field(n, "half_h")[part]
+    clear_forced(n, now, c)
     every_begin(plant, c, part)
     for k in range(n.n_converters):
         s = plant.st[k]

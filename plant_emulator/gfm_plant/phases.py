@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gfm_plant.layout import field
 from gfm_plant.model import V_DC
 from gfm_plant.noise import gaussians
-from gfm_plant.records import COMPARE, N_PHASES, PlantRecords
-from gfm_plant.solution import I_F, I_O, V, own
+from gfm_plant.records import COMPARE, I_F, I_O, N_PHASES, PlantRecords, V
+from gfm_plant.solution import own
 from gfm_runtime.compiled import cached, compiled, inlined
 
 _A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])

@@ -30,8 +30,8 @@ from gfm_plant.names import (
     TRIPS,
     WOULD_TRIP,
 )
-from gfm_plant.records import N_OVERLOADS, N_TRIPS, PlantRecords
-from gfm_plant.solution import I_F, V, circuit, enter, own
+from gfm_plant.records import I_F, N_OVERLOADS, N_TRIPS, PlantRecords, V
+from gfm_plant.solution import circuit, enter, own
 from gfm_runtime.compiled import compiled, inlined
 
 _BLOCKED = {

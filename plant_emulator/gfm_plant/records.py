@@ -15,6 +15,9 @@ from gfm_plant.layout import Record as Record
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o
+I_F, V, I_O = 0, 1, 2
+"""Places of a converter's states in w, from ``own(k)`` on: currents of filter and line, and the
+voltage of the filter capacitor."""
 N_MEASURED, N_COMMANDS = 10, 7  # channels of A/D and D/A, see `options.MEASURED`, `COMMANDS`
 COMPARE = 4  # place of the compare values in a command, below 0: it has none
 N_PHASES = 10  # channels of the A/D at the phases, in the order of the group ``adc``

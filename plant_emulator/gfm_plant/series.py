@@ -33,8 +33,9 @@ from gfm_plant.powers import (
     find_slot,
     go_to,
 )
-from gfm_plant.records import PlantRecords
-from gfm_plant.solution import I_F, I_O, V, grid_source, own, turned
+from gfm_plant.records import I_F, I_O, PlantRecords, V
+from gfm_plant.solution import grid_source, own
+from gfm_plant.sparse import ENOUGH, how_many, turned
 from gfm_runtime.compiled import compiled, inlined
 
 DC, REG, SOURCE, MID = 6, 7, 8, 9
@@ -44,11 +45,8 @@ midpoint, behind i_f, v and i_o. Without a lag the source's current is what its 
 LARGEST = 0.6
 """Of the norm of A times the length of an interval; a longer one is cut."""
 
-_SMALLEST = 1e-15  # p.u.; of the first term that is left out
 _PER = np.array([1.0 / max(j, 1) for j in range(TERMS + 1)])  # 1 / j
-_ENOUGH = np.array([(_SMALLEST * math.factorial(j + 1)) ** (1 / (j + 1)) for j in range(TERMS)])
-
-_TWO_LEVELS = _ENOUGH[2 * POWERS - 1]
+_TWO_LEVELS = ENOUGH[2 * POWERS - 1]
 
 
 @inlined
@@ -147,15 +145,6 @@ def hold_current(plant: PlantRecords, k: int, c: int, i: complex) -> None:
     if field(plant.net[0], "alone")[c]:
         x = field(plant.now[0], "vector")
         x[0, 0], x[0, 1] = i.real, i.imag
-
-
-@inlined
-def how_many(x: float) -> int:
-    """Return how many terms the series needs for x = norm of A times h <= LARGEST."""
-    j = 3
-    while x > _ENOUGH[j] and j < TERMS - 1:
-        j += 1
-    return j
 
 
 @inlined

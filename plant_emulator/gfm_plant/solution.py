@@ -17,14 +17,20 @@ omega. See `circuit.join_axes`.
 import math
 from typing import Any
 
-from gfm_plant.joint import make_joint
-from gfm_plant.layout import field
+from gfm_plant.joint import joint_circuit, make_joint
+from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.records import N_OWN
+from gfm_plant.sparse import (
+    by_series,
+    end_states,
+    enter_sparse,
+    find_nodes,
+    found_voltage,
+    middle_state,
+    series_half,
+    turned,
+)
 from gfm_runtime.compiled import compiled, inlined
-
-I_F, V, I_O = 0, 1, 2
-"""Places of a converter's states in w, from ``own(k)`` on: currents of filter and line, and the
-voltage of the filter capacitor."""
 
 
 @compiled
@@ -40,18 +46,6 @@ def grid_source(n: Any) -> int:
 
 
 @compiled
-def turned(x: float) -> complex:
-    """Return e^(jx); by its series where they are exact to rounding."""
-    if abs(x) < 0.03:
-        x2 = x * x
-        return complex(
-            1 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320)))),
-            x * (1 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))),
-        )
-    return complex(math.cos(x), math.sin(x))
-
-
-@compiled
 def mirror_at(n: Any, tick: float) -> complex:
     """Return e^(-2 j omega_b t) at a tick, or between two: the mirror image of x is conj(x) times
     that."""
@@ -62,6 +56,9 @@ def mirror_at(n: Any, tick: float) -> complex:
 @compiled
 def mirror_sources(n: Any, now: Any, tick: float) -> None:
     """Set the unit phasors of the sources' mirror images."""
+    if by_series(n, now):
+        now.upright = mirror_at(n, -0.5 * tick)
+        return
     unit, turn = field(now, "unit"), mirror_at(n, tick)
     for k in range(now.n_s):
         unit[now.n_s + k] = unit[k].conjugate() * turn
@@ -79,6 +76,9 @@ def drive(n: Any, now: Any, c: int, part: int, k: int, E: complex, omega: float)
         E: the source's voltage over its unit phasor, p.u.
         omega: its speed, p.u.; negative for a negative sequence.
     """
+    if by_series(n, now):
+        _set_source(n, now, part, k, E, omega)
+        return
     _drive(n, now, c, part, k, k, E, omega)
     if field(n, "unbalanced")[c]:
         _drive(n, now, c, part, now.n_s + k, k, E.conjugate(), -omega)
@@ -101,6 +101,19 @@ def _drive(
 
 
 @compiled
+def _set_source(n: Any, now: Any, part: int, k: int, E: complex, omega: float) -> None:
+    """``drive`` of the series: keep the source at the beginning and in the middle of a piece."""
+    if field(now, "gain_omega")[part, k] != omega:
+        field(now, "gain_omega")[part, k] = omega
+        turn = turned(n.omega_b * (omega - 1.0) * field(n, "half_h")[part])
+        field(now, "turn")[part, k] = turn
+    field(now, "source")[k] = E * field(now, "unit")[k]
+    _turn_on(now, part, k)
+    field(now, "source_next")[k] = E * field(now, "halfway")[k]
+    field(now, "source_speed")[k] = n.omega_b * omega
+
+
+@compiled
 def _turn_on(now: Any, part: int, k: int) -> None:
     """Take the phasor at place k on by a piece."""
     unit, turn = field(now, "unit"), field(now, "turn")[part, k]
@@ -115,6 +128,11 @@ def _turn_on(now: Any, part: int, k: int) -> None:
 def draw(n: Any, now: Any, c: int, part: int, k: int, first: complex, second: complex) -> None:
     """Add to the forcing of every mode what source k does to it, which is held at one value in the
     first half of a piece and at another in the second, in the common frame."""
+    if by_series(n, now):
+        now.held = 1
+        field(now, "source")[k], field(now, "source_next")[k] = first, second
+        field(now, "source_speed")[k] = n.omega_b
+        return
     _draw(n, now, c, part, k, k, 1.0, first, second)
     if field(n, "unbalanced")[c]:
         j = now.n_s + k
@@ -170,6 +188,9 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
 @inlined
 def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
     """Take the modes on by half a piece: ``which`` is 0 for its first half, 1 for its second."""
+    if by_series(n, now):
+        series_half(n, now, field(n, "half_h")[part], which)
+        return
     decay, z, forced = field(n, "decay"), field(now, "z"), field(now, "forced")
     for m in range(field(n, "n_modes")[c]):
         z[m] = decay[c, part, m] * z[m] + forced[m, which]
@@ -177,7 +198,10 @@ def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
 
 @inlined
 def state(n: Any, now: Any, c: int, i: int) -> complex:
-    """Return state i of w, by the modes."""
+    """Return state i of w in the middle of a piece."""
+    if by_series(n, now):
+        middle: complex = middle_state(n, now, i)
+        return middle
     states, z, w = field(n, "states"), field(now, "z"), 0j
     for m in range(field(n, "n_modes")[c]):
         w += states[c, i, m] * z[m]
@@ -186,7 +210,10 @@ def state(n: Any, now: Any, c: int, i: int) -> complex:
 
 @compiled
 def read_states(n: Any, now: Any, c: int) -> None:
-    """Write all states of w by the modes."""
+    """Write all states of w at the end of a piece, or by the modes as they are."""
+    if by_series(n, now):
+        end_states(n, now)
+        return
     states, z, w = field(n, "states"), field(now, "z"), field(now, "w")
     modes = field(n, "n_modes")[c]
     for i in range(n.n_states):  # as `state`, with the arrays looked up once
@@ -196,10 +223,31 @@ def read_states(n: Any, now: Any, c: int) -> None:
         w[i] = found
 
 
+@inlined
+def clear_forced(n: Any, now: Any, c: int) -> None:
+    """Begin a piece, in which nothing drives the circuit yet."""
+    if by_series(n, now):
+        now.held = 0
+        field(now, "source")[grid_source(n) + 1] = field(now, "source_next")[grid_source(n) + 1] = (
+            0j
+        )
+        return
+    forced = field(now, "forced")
+    for m in range(field(n, "n_modes")[c]):
+        forced[m, 0] = forced[m, 1] = 0j
+
+
 @compiled
 def node_voltage(n: Any, now: Any, place: int, tick: float) -> complex:
     """Return the voltage of a node at a tick, p.u.; see ``node_w`` in `gfm_plant.layout`."""
     c = circuit(n, now)
+    if by_series(n, now):
+        if place <= CHECK_SIDES:  # all others follow at the same tick
+            if field(n, "unbalanced")[c]:
+                now.upright = mirror_at(n, -0.5 * tick)
+            find_nodes(n, now)
+        found: complex = found_voltage(n, now, place)
+        return found
     v = _by(n, now, c, place, 0)
     if field(n, "unbalanced")[c]:
         v += _by(n, now, c, place, 1).conjugate() * (field(n, "node_turn")[c] * mirror_at(n, tick))
@@ -226,9 +274,11 @@ def _by(n: Any, now: Any, c: int, place: int, image: int) -> complex:
 
 @compiled
 def circuit(n: Any, now: Any) -> int:
-    """Return which circuit is in force; the last one is that of several contacts, see `joint`."""
+    """Return which circuit is in force."""
     if now.joint:
-        return n.n_c - 1
+        return joint_circuit(n)
+    if n.sparse:
+        return 1 + now.contact
     return now.row + (n.n_converters + 1) * now.contact
 
 
@@ -289,6 +339,10 @@ def enter(n: Any, now: Any, tick: float, c: int) -> None:
     for part in range(len(known)):
         for k in range(now.n_phasors):
             known[part, k] = math.inf
+    if by_series(n, now):
+        now.upright = mirror_at(n, -0.5 * tick)
+        enter_sparse(n, now)
+        return
     for m in range(field(n, "n_modes")[c]):
         z[m] = 0j
         for i in range(n.n_states):

@@ -28,6 +28,7 @@ from gfm_plant.circuit import (
     find_rates,
     find_voltage,
     join_axes,
+    rest,
     without_ends,
 )
 from gfm_plant.components.part import Fed, emf
@@ -291,6 +292,11 @@ class Wiring:
         names += [emf(name) if one.is_voltage else name for name, one in self.fed]
         return {name: place for place, name in enumerate(names) if name}
 
+    @property
+    def places(self) -> int:
+        """How many places of sources there are."""
+        return len(self.units) + 2 + len(self.fed)
+
     def named_lines(self) -> dict[str, Branch]:
         """Lines and transformers by the name that people use: a converter's line has that of the
         converter."""
@@ -404,6 +410,29 @@ class Wiring:
         alpha, beta = (find_modes(one, self.omega_b, self.order) for one in circuits)
         return join_axes(alpha, beta, contact.angle), circuits[0].names
 
+    def resting_by_modes(
+        self, volts: Mapping[str, complex], turns: Mapping[str, float]
+    ) -> NDArray[np.complex128]:
+        """w at rest, in the common frame at t = 0.
+
+        Args:
+            volts, turns: of each source and sink its value, p.u., and its speed, p.u.
+        """
+        modes, sources = self.modes(self.blocked, None)
+        z = np.zeros(len(modes.rates), complex)
+        for omega in {turns[name] for name in sources}:
+            speed = self.omega_b * (omega - 1.0)
+            those = [volts[name] if turns[name] == omega else 0.0 for name in sources]
+            z += modes.drive @ those / (1j * speed - modes.rates)
+        return np.asarray(modes.states @ z)
+
+    def resting(
+        self, volts: Mapping[str, complex], turns: Mapping[str, float]
+    ) -> NDArray[np.complex128]:
+        """``resting_by_modes``, by the sparse equations of branches and nodes."""
+        circuit, _ = self.circuit(self.blocked, None, ALPHA)
+        return rest(circuit, self.order, volts, turns)
+
     def rates(
         self, blocked: frozenset[int], contact: Contact | None
     ) -> tuple[list[Rates], float, list[str]]:
@@ -494,19 +523,27 @@ class Wiring:
         """The voltage of a node on an axis as factors of w and of the sources, see
         ``find_voltage``; of a node where no current can flow, that of what it hangs on."""
         circuit, hanging = self.circuit(blocked, contact, axis)
+        if here := self.hangs_on(node, circuit, hanging):
+            return find_voltage(here, circuit, self.order)
+        return np.zeros(len(self.order)), np.zeros(len(circuit.sources))
+
+    @staticmethod
+    def hangs_on(node: str, circuit: Circuit, hanging: Sequence[Branch]) -> str:
+        """The node of a circuit that has the voltage of a node: itself, or what it hangs on where
+        no current can flow; "" if there is none."""
         there = {end for branch in circuit.branches for end in (branch.start, branch.end)}
         there |= {one.node for one in circuit.capacitors} | {one.node for one in circuit.sources}
         seen, reached = {node}, [node]
         while reached:
             here = reached.pop(0)
             if here in there or here == GROUND:
-                return find_voltage(here, circuit, self.order)
+                return here
             for branch in hanging:
                 if here in (branch.start, branch.end):
                     other = branch.end if branch.start == here else branch.start
                     reached += [other] if other not in seen else []
                     seen.add(other)
-        return np.zeros(len(self.order)), np.zeros(len(circuit.sources))
+        return ""
 
     def circuit(
         self, blocked: frozenset[int], contact: Contact | None, axis: int, place: str = GROUND
@@ -555,7 +592,8 @@ class Wiring:
         shunts = [s for s in shunts if s.node in met]
         sinks = tuple(sink for sink in self.sinks if sink.name not in self.opened)
         circuit = Circuit(tuple(branches), tuple(capacitors), tuple(sources), tuple(shunts), sinks)
-        return circuit, [branch for branch in whole if branch not in branches]
+        kept = {branch.name for branch in branches}
+        return circuit, [branch for branch in whole if branch.name not in kept]
 
     def whole(
         self, branches: Sequence[Branch], poles: Mapping[str, complex] = MappingProxyType({})

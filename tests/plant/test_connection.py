@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gfm_plant import CONNECTION, clear_fault, fault, grid_unbalance, plant_options
-from gfm_plant.solution import I_O, V
+from gfm_plant.records import I_O, V
 
 L, R, T_s = 0.15, 0.004, 2e-6
 GRID = {"scr": 3.0, "x_over_r": 8.0}

@@ -12,8 +12,10 @@ from gfm_plant import (
     Network,
     NetworkParts,
     Plant,
+    build,
     load_converter,
     make_network,
+    network,
     plant_command,
     plant_step,
     take_out,
@@ -413,8 +415,8 @@ def test_a_resistor_is_switched_on_beside_another_as_one_of_both_sizes(bank):
     for closed, P in ((True, 0.6), (False, 0.4)):
         line_breaker(two, "z", closed)
         one.rewire(replace(one.wiring, shunts=(Shunt("y", "bus", 1 / P),)))
-        for network in (two, one):
-            go(network, u, 50)
+        for plant in (two, one):
+            go(plant, u, 50)
         assert two.st["x"] == pytest.approx(one.st["x"], abs=1e-12)
 
 
@@ -475,3 +477,80 @@ def test_impossible_events(event, message):
         event(plant)
     assert plant.wiring == before.wiring
     assert [r.tobytes() for r in plant.memory] == [r.tobytes() for r in before.memory]
+
+
+def ring(sparse: bool, monkeypatch: pytest.MonkeyPatch) -> Network:
+    """Three converters with large DC links at a ring with taps, an earthed transformer, a machine,
+    a load of constant power, and nodes of all kinds: with a capacitor, with a resistor, with both,
+    with two branches and with more."""
+    monkeypatch.setattr(build, "MOST_BY_MODES", 0 if sparse else 1000)
+    monkeypatch.setattr(network, "_PIECE", 10.0)  # one piece a period, however fast the circuit is
+    options = {"factors": {"C_dc": 50.0}}
+    return make(
+        {
+            "a": (options, "m"), "b": ({"factors": {"C_dc": 50.0, "L_f": 1.3}}, "far"),
+            "c": ({"factors": {"C_dc": 50.0}, "lcl": {"L": 0.1, "R": 0.01}}, "k"),
+        },
+        lines={
+            "far": {"start": "far", "end": "n", "L": 0.1, "R": 0.01},
+            "l": {"start": "m", "end": "n", "L": 0.2, "R": 0.03},
+            "l2": {"start": "m", "end": "k", "L": 0.1, "R": 0.03},
+            "l3": {"start": "k", "end": "n", "L": 0.1, "R": 0.02},
+        },
+        transformers={
+            "t": {"start": "q", "end": "n", "S": 1.0, "X": 0.1, "R": 0.01, "ratio": 1.03},
+        },
+        loads={
+            "z": {"node": "n", "P": 0.8, "Q": 0.3}, "r": {"node": "k", "P": 0.4},
+            "s": {"node": "q", "P": 0.2},
+        },
+        capacitors={"d": {"node": "q", "Q": 0.3}},
+        constant_power={"p": {"node": "q", "P": 0.1}},
+    )  # fmt: skip
+
+
+def run(plant: Network, what: str) -> np.ndarray:
+    """w and the states of the converters after each tick."""
+    x, u = np.zeros((3, 8)), np.zeros((3, 4))
+    x[:, DELTA], x[:, V_DC] = [0.05, 0.0, 0.02], 1.0
+    u[:, 1], u[:, 2] = [1.002, 1.0, 1.0], [1.05, 0.99, 1.0]
+    plant.start(x, u)
+    names, found = plant.wiring.order, []
+    for k in range(250):
+        if k == 40 and what in ("3ph", "LL"):
+            fault(plant, None, 0.05, 0.006, node="k", kind=what)
+        if k == 40 and what in ("LG", "LLG", "several"):
+            kind = "LG" if what == "several" else what
+            fault(plant, 0.3, 0.05, 0.006, line="l", kind=kind)
+        if (k == 40 and what == "breaker") or (k == 60 and what == "several"):
+            line_breaker(plant, "l2", closed=False)
+        if k == 200 and what in ("breaker", "several"):
+            line_breaker(plant, "l2", closed=True)
+        go(plant, u, 1)
+        named = dict(zip(plant.wiring.order, plant.now["w"][0], strict=False))
+        own = [named[name] for name in names]
+        found.append(np.concatenate([own, plant.st["x"].ravel(), plant.st["sensed"].ravel()]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("what", ["3ph", "LL", "LG", "LLG", "breaker", "several"])
+def test_series_and_modes_agree(what, monkeypatch):
+    """A large plant is solved by the series of its sparse equations, a small one by its modes; over
+    a run with an event, whose phases open one by one."""
+    by_modes, by_series = (run(ring(sparse, monkeypatch), what) for sparse in (False, True))
+    assert np.abs(by_modes).max() > 1.0
+    assert np.abs(by_series - by_modes).max() < 1e-11
+
+
+def test_a_plant_chooses_by_its_size():
+    """Up to `build.MOST_BY_MODES` currents and voltages it has modes; a series needs no room that
+    grows with the square of its size."""
+
+    def star(n: int) -> Network:
+        each = {f"c{k}": ({}, f"at{k}") for k in range(n)}
+        lines = {f"l{k}": {"start": f"at{k}", "end": "bus", "L": 0.1} for k in range(n)}
+        return make(each, lines=lines, loads={"z": {"node": "bus", "P": 0.4 * n, "Q": 0.1}})
+
+    few, many, more = star(10), star(50), star(100)
+    assert not few.net["sparse"] and many.net["sparse"] and more.net["sparse"]
+    assert more.net.nbytes < 2.1 * many.net.nbytes

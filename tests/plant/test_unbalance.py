@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from gfm_plant import grid_unbalance, phase_jump
-from gfm_plant.solution import V
+from gfm_plant.records import V
 
 WEAK = {"scr": 3.0, "x_over_r": 6.0}
 OFF = {

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from gfm_plant import clear_fault, fault, grid_impedance, grid_unbalance, phase_jump
 from gfm_plant.grid import breaker
-from gfm_plant.solution import I_F, I_O, V
+from gfm_plant.records import I_F, I_O, V
 
 WEAK = {"scr": 3.0, "x_over_r": 6.0}
 NO_TRIP = {

@@ -10,9 +10,12 @@ import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
 
 from gfm_plant import Network, NoEquilibrium, plant_equilibrium
 from gfm_plant.circuit import GROUND
@@ -28,6 +31,7 @@ Vector = NDArray[np.float64]
 
 _ROUNDS = 40
 _ROUNDING = 1e-12  # p.u.; a residual that is smaller is none
+_MOST_BY_SQUARES = 500  # unknowns; the time of least squares grows with their cube
 _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
 _LOSES = 30  # rounds in which a command is found by what the bridge loses of it
 
@@ -140,7 +144,8 @@ class _NetworkEquilibrium:
             for k, (law, ref) in enumerate(zip(laws, refs, strict=True))
         ]
         self.fixed = wiring.grid if wiring.closed else None
-        self.free = [node for node in wiring.nodes if node != self.fixed]
+        self.nodes = wiring.nodes
+        self.free = [node for node in self.nodes if node != self.fixed]
         feeding = {unit.node for unit in wiring.units}
         feeding |= {one.node for _, one in wiring.fed if one.is_voltage}
         groups = wiring.islands()
@@ -158,7 +163,7 @@ class _NetworkEquilibrium:
         if self.fixed is not None:
             volts[self.fixed] = self.V_g
         at = self.island_of
-        speeds = {n: float(omegas[at[n]]) if n in at else self.omega_g for n in self.wiring.nodes}
+        speeds = {n: float(omegas[at[n]]) if n in at else self.omega_g for n in self.nodes}
         speeds |= {unit.terminal: speeds[unit.node] for unit in self.wiring.units}
         return own, volts, speeds
 
@@ -166,7 +171,7 @@ class _NetworkEquilibrium:
         """What must vanish: the slopes of each converter, what components want, and the currents
         that meet at each node; the voltage of each island's first node has no imaginary part."""
         wiring, (own, volts, speeds) = self.wiring, self._split(z)
-        missing = dict.fromkeys(wiring.nodes, 0j)  # current that comes to each node
+        missing = dict.fromkeys(self.nodes, 0j)  # current that comes to each node
         rows = []
         for side, unit, mine in zip(self.sides, wiring.units, own, strict=False):
             v, omega = volts[unit.node], speeds[unit.node]
@@ -199,9 +204,47 @@ class _NetworkEquilibrium:
         met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
 
+    def _rows(self) -> list[set[int]]:
+        """The rows of ``residual`` that each unknown acts on; a speed may act on all."""
+        wiring = self.wiring
+        fed = sorted(enumerate(wiring.fed), key=lambda item: item[1][1].is_voltage)
+        lengths = [side.size for side in self.sides]
+        lengths += [
+            one.unknowns for _, (name, one) in fed if one.is_voltage or name not in wiring.opened
+        ]
+        starts = np.cumsum([0, *lengths])
+        blocks = [{*range(a, b)} for a, b in pairwise(starts)]
+        place = {node: int(starts[-1]) + 2 * k for k, node in enumerate(self.free)}
+        at = {node: {k, k + 1} for node, k in place.items()}
+        reached = {node: set(rows) for node, rows in at.items()}  # by the voltage of each node
+        for k, nodes in enumerate(self.islands):
+            reached[nodes[0]].add(int(starts[-1]) + 2 * len(self.free) + k)
+        for branch in wiring.branches:
+            for one, other in ((branch.start, branch.end), (branch.end, branch.start)):
+                if one in reached:
+                    reached[one] |= at.get(other, set())
+        own = [blocks[k] | at.get(unit.node, set()) for k, unit in enumerate(wiring.units)]
+        terminals = {unit.terminal: k for k, unit in enumerate(wiring.units)}
+        for k, unit in enumerate(wiring.units):
+            reached.get(unit.node, set()).update(blocks[k])
+        mine: dict[int, set[int]] = {}
+        left = iter(blocks[len(own) :])
+        for k, (name, component) in fed:
+            rows = next(left) if component.is_voltage or name not in wiring.opened else set()
+            mine[k] = rows | at.get(component.node, set())
+            if component.node in terminals:
+                own[terminals[component.node]] |= rows
+            reached.get(component.node, set()).update(rows)
+        found = [rows for rows, side in zip(own, self.sides, strict=True) for _ in range(side.size)]
+        found += [reached[node] for node in self.free for _ in range(2)]
+        for k, (_, component) in enumerate(wiring.fed):
+            found += [mine[k]] * component.unknowns
+        everything = {*range(int(starts[-1]) + 2 * len(self.free) + len(self.islands))}
+        return found + [everything] * len(self.islands)
+
     def solved(self) -> Vector:
         """The unknowns. Raises NoEquilibrium: there is none, or the search does not find it."""
-        z = _newton(self.residual, self.first())
+        z = _newton(self.residual, self.first(), self._rows())
         if z is None:
             each = zip(self.wiring.units, self.laws, strict=True)
             names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
@@ -332,21 +375,33 @@ class _ConverterEquilibrium:
         )
 
 
-def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
+def _newton(
+    residual: Callable[[Vector], Vector], z: Vector, rows: Sequence[set[int]] = ()
+) -> Vector | None:
     """A zero of ``residual`` near z, or None.
 
     The slopes are found anew only when a step was not much shorter than the one before it.
+
+    Args:
+        residual, z: what must vanish, and where the search begins.
+        rows: those that each unknown acts on; none: each acts on all.
     """
+    groups = _apart(rows or [{0}] * len(z))
     before, largest, jacobian = 0.0, math.inf, np.empty((0, 0))
     for _ in range(_ROUNDS):
         now = residual(z)
         if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
             return z
         if not largest < 0.1 * before:
-            nudges = _NUDGE * np.eye(len(z))
-            slopes = [(residual(z + n) - residual(z - n)) / (2 * _NUDGE) for n in nudges]
-            jacobian = np.stack(slopes, axis=1)
-        step = np.linalg.lstsq(jacobian, now, rcond=1e-12)[0]
+            jacobian = np.zeros((len(now), len(z)))
+            for group in groups:
+                nudge = np.zeros(len(z))
+                nudge[group] = _NUDGE
+                slopes = (residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE)
+                for column in group:
+                    those = [*rows[column]] if rows else slice(None)
+                    jacobian[those, column] = slopes[those]
+        step = _solve(jacobian, now)
         before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
         if not np.isfinite(z).all():
@@ -354,6 +409,31 @@ def _newton(residual: Callable[[Vector], Vector], z: Vector) -> Vector | None:
         if largest < 1e-10:
             return z if np.abs(residual(z)).max() <= 1e-5 else None
     return None
+
+
+def _apart(rows: Sequence[set[int]]) -> list[list[int]]:
+    """The unknowns in groups, no two of which act on the same row."""
+    groups: list[tuple[list[int], set[int]]] = []
+    for column, those in enumerate(rows):
+        for group, taken in groups:
+            if not those & taken:
+                group.append(column)
+                taken |= those
+                break
+        else:
+            groups.append(([column], set(those)))
+    return [group for group, _ in groups]
+
+
+def _solve(jacobian: NDArray[np.float64], right: Vector) -> Vector:
+    """The step of Newton's method: of least squares, but for a large network whose rows are
+    independent."""
+    if len(right) > _MOST_BY_SQUARES and len(right) == jacobian.shape[1]:
+        try:
+            return np.asarray(splu(csc_matrix(jacobian)).solve(right))
+        except RuntimeError:  # a part without a voltage
+            pass
+    return np.asarray(np.linalg.lstsq(jacobian, right, rcond=1e-12)[0])
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, e: complex, limited: bool = True) -> complex:

@@ -21,7 +21,8 @@ from pydantic import Field
 from gfm_plant.components.part import DRAWN, Drawing, LinearPart, Matrix, see_middle
 from gfm_plant.layout import field
 from gfm_plant.parameters import Options, Positive
-from gfm_plant.solution import draw, turned
+from gfm_plant.solution import draw
+from gfm_plant.sparse import turned
 from gfm_plant.steady_state import NoEquilibrium
 from gfm_runtime.compiled import compiled
 
