@@ -17,7 +17,7 @@ from gfm_hil.recording.foreign import open_recording
 from gfm_hil.recording.run import Run, converters_of, nominal_frequency
 from gfm_hil.results.between_figure import plot_between
 from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
-from gfm_hil.results.report import write_report
+from gfm_hil.results.report import write_report, write_together
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.between import BetweenTicks, between_ticks
 from gfm_hil.run.losses import losses
@@ -266,11 +266,13 @@ class Comparison(dict[str, Run]):
         return plot_laws(self)
 
     def write(self, folder: Path) -> None:
-        """Write comparison.json, and comparison.png of the runs that recorded anything."""
+        """Write comparison.json, and comparison.png and report.html of the runs that recorded
+        anything."""
         first = next(iter(self.values()))
         signals = {law: one.columns for law, one in self.items() if "true_p" in one.columns}
         if signals:
             draw_comparison(folder / "comparison.png", first.scenario, signals, self.events)
+            write_together(folder, first.scenario, self, self.events, "law", "comparison.png")
         write_text(folder / "comparison.json", json.dumps(self.summaries, indent=2) + "\n")
 
     def __repr__(self) -> str:
@@ -293,8 +295,9 @@ def compare(
     Args:
         scenario, changes: as for ``run``.
         laws: names, law files or ``Law``.
-        folder: where to write a run folder for each law, comparison.png and comparison.json; the
-            link and the mode are then those of the scenario. None keeps the runs in memory.
+        folder: where to write a run folder for each law, report.html, comparison.png and
+            comparison.json; the link and the mode are then those of the scenario. None keeps the
+            runs in memory.
         recording, map: a recording of the same that others made, which is laid beside the runs
             under the name of its file, and the file that says what its channels are.
         watch: of the runs with a folder.

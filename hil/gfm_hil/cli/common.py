@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import sys
 import time
 import tomllib
 from collections.abc import Iterator
@@ -285,6 +286,25 @@ def exit_code(run: Run | NetworkRun) -> int:
     if not run.summary["unmet"]:
         return 0
     return EXIT_INTERRUPTED if run.status == "interrupted" else EXIT_OTHERWISE
+
+
+def add_open(command: argparse.ArgumentParser) -> None:
+    """The option that opens the report."""
+    command.add_argument("--open", action="store_true", help="open the report in a browser")
+
+
+def show_page(options: argparse.Namespace, page: Path) -> None:
+    """Name the report that a command has left, if there is one, as its last line, and open it if
+    ``add_open``'s option is given."""
+    if not page.is_file():
+        return
+    if not getattr(options, "json", False):
+        terminal().print(escape(f"report: {page}"), highlight=False, soft_wrap=True)
+    if options.open:
+        import webbrowser
+
+        if not webbrowser.open(page.resolve().as_uri()):
+            print(f"gfmhil: --open: there is no browser; open {page}", file=sys.stderr)
 
 
 def split_laws(text: str) -> list[str]:

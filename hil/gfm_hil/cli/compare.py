@@ -11,7 +11,7 @@ from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.setup import ONE_CONVERTER
-from gfm_hil.results.report import event_rows
+from gfm_hil.results.report import PAGE, event_rows
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.scenario import find_scenario
 
@@ -29,6 +29,7 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument("--map", metavar="FILE", help="of --recording: what its channels are")
     command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
+    common.add_open(command)
     common.add_study_options(command, "comparison.json")
 
 
@@ -52,7 +53,7 @@ def call(options: argparse.Namespace) -> int:
         _print(found.summaries, found.events)
         for why in filter(None, (s.get("unstable_mode") for s in found.summaries.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
-        terminal().print(f"figure: {folder / 'comparison.png'}", highlight=False, soft_wrap=True)
+    common.show_page(options, folder / PAGE)
     return max(common.exit_code(run) for run in found.values())
 
 

@@ -9,11 +9,20 @@ from typing import Any
 from rich.markup import escape
 
 from gfm_hil.api.studies import conform, judge_recording
-from gfm_hil.cli.common import add_inner, add_map, add_study_options, new_folder, watching
+from gfm_hil.cli.common import (
+    add_inner,
+    add_map,
+    add_open,
+    add_study_options,
+    new_folder,
+    show_page,
+    watching,
+)
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import terminal
 from gfm_hil.realtime.priority import processors
+from gfm_hil.results.report import PAGE
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.result import Conformity
@@ -98,6 +107,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "--list", nargs="?", const="tests", choices=("tests", "limits"),
         help="list the tests, or all limits with source and how each is known; run nothing",
     )  # fmt: skip
+    add_open(command)
     add_study_options(command, "results.json")
 
 
@@ -131,6 +141,7 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(found.plain(), indent=1))
     else:
         _print(found, time.monotonic() - began)
+    show_page(options, folder / PAGE)
     return _EXIT[found.verdict]
 
 
@@ -158,6 +169,7 @@ def _recording(options: argparse.Namespace) -> int:
         for words in found.recordings.values():
             terminal().print(escape(words), highlight=False, soft_wrap=True)
         _print(found, time.monotonic() - began)
+    show_page(options, folder / PAGE)
     return _EXIT[found.verdict]
 
 
@@ -219,5 +231,3 @@ def _print(result: Conformity, wall_s: float) -> None:
     if not result.under.plant.model_fields_set - {"converter"}:
         text = f"converter under test: {result.under.plant.converter}, {result.under.instruments}"
         console.print(text, highlight=False, soft_wrap=True)
-    report = Path(result.folder or ".") / "report.html"
-    console.print(escape(f"report: {report}"), highlight=False, soft_wrap=True)

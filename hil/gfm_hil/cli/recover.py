@@ -5,7 +5,8 @@ import json
 from pathlib import Path
 
 from gfm_hil.api.runs import recover
-from gfm_hil.cli.common import print_run
+from gfm_hil.cli.common import add_open, print_run, show_page
+from gfm_hil.results.report import PAGE
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -16,6 +17,7 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
+    add_open(command)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -24,4 +26,5 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(run.summary, indent=2))
     else:
         print_run(run, options.folder)
+    show_page(options, options.folder / PAGE)
     return 0

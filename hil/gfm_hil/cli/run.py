@@ -14,6 +14,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.ports import PORTS
 from gfm_hil.ports.port import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
+from gfm_hil.results.report import PAGE
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import INPROC, find_scenario
 
@@ -39,6 +40,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
     command.add_argument("--no-figures", action="store_true", help="neither figures nor report")
+    common.add_open(command)
     command.add_argument(
         "--waveforms", type=common.window, metavar="FROM:TO",
         help="override waveforms: the window of the figure of the three phases, s",
@@ -79,6 +81,7 @@ def call(options: argparse.Namespace) -> int:
             print(json.dumps(run.summary, indent=2), flush=True)
         else:
             common.print_run(run, folder, why=True)
+        common.show_page(options, folder / PAGE)
         for name, process in stay.items():
             if process.poll() is None and run.status != "interrupted":
                 print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)

@@ -8,14 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.results.figures import as_svg, in_a_page
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
@@ -24,6 +25,8 @@ from gfm_runtime import law_titles
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
+#: places of a report: the curves of one converter, and those of some beside each other
+OF, ONLY = "of-", "only="
 
 
 @dataclass
@@ -36,19 +39,32 @@ class _Bar:
     rows: list[int] = field(default_factory=list)
 
 
-def draw_diagram(folder: Path, scenario: Scenario) -> Path:
-    """Draw the diagram into network.svg of a run folder; returns its path."""
+def draw_diagram(folder: Path, scenario: Scenario, report: str | None = None) -> str:
+    """Draw the diagram into network.svg of a run folder; returns it as an element of a page.
+
+    Args:
+        report: as for ``fill_diagram``; the links of the element are within its own page.
+    """
     figure = Figure()
-    fill_diagram(figure, scenario)
-    path = folder / "network.svg"
-    # the same bytes for the same scenario
-    with matplotlib.rc_context({"svg.hashsalt": "gfmhil"}), replacing(path) as part:
-        figure.savefig(part, format="svg", metadata={"Date": None})
-    return path
+    fill_diagram(figure, scenario, report)
+    drawn = as_svg(figure)
+    with replacing(folder / "network.svg") as part:
+        part.write_bytes(drawn)
+    root = in_a_page(drawn)
+    for link in root.iter("a"):
+        _, hash, place = link.attrib["href"].partition("#")
+        link.attrib = {"href": hash + place}  # in the same tab
+        link.set("aria-label", f"curves of {place.removeprefix(OF).removeprefix(ONLY)}")
+    return ElementTree.tostring(root, encoding="unicode")
 
 
-def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
-    """Fill a figure, whose size it sets, with the diagram; events that make faults are marked."""
+def fill_diagram(figure: Figure, scenario: Scenario, report: str | None = None) -> Axes:
+    """Fill a figure, whose size it sets, with the diagram; events that make faults are marked.
+
+    Args:
+        report: address of the page on whose curves converters and lines are links, a line on those
+            of the converters at its ends; None for no links.
+    """
     plants, laws, nodes = _converters(scenario)
     bars, lines = _bars(scenario, nodes)
     faults = [event for event in scenario.events if isinstance(event, Fault)]
@@ -58,6 +74,8 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-0.2, width), ylim=(-_ROW * top + 0.55, 0.95), aspect="equal")
     axes.axis("off")
+    passing = [(r, 0.0) for bar in bars.values() for r in bar.rows[: len(bar.converters)]]
+    passing += [(r, min(_at(bars[a]), _at(bars[b]))) for r, a, b, *_ in lines.values()]
     spots: dict[str, tuple[float, float, float]] = {}  # of lines: y, where it begins and ends
     for name, bar in bars.items():
         x = _at(bar)
@@ -67,13 +85,17 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
             _inductor(axes, _LINE + 0.2, -_ROW * row)
             behind = not converter and plants[converter].lcl is not None
             spots[converter] = -_ROW * row, _LINE + 1.1 if behind else _TERMINAL, x
+            if report is not None:
+                _area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{OF}{converter}")
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
             _hang(axes, x, -_ROW * row, symbol, text, closed)
         ys = [-_ROW * row for row in bar.rows]
         ys += [-_ROW * row for row, start, end, *_ in lines.values() if name in (start, end)]
-        axes.plot(
-            [x, x], [max(ys) + 0.35, min(ys) - 0.35], color=_INK, lw=3.5, solid_capstyle="butt"
-        )
+        ends = min(ys) - 0.35, max(ys) + 0.35
+        axes.plot([x, x], ends, color=_INK, lw=3.5, solid_capstyle="butt", zorder=2.4)
+        for row, left in passing:  # wires of others pass behind it
+            if left < x and ends[0] < -_ROW * row < ends[1] and -_ROW * row not in ys:
+                axes.plot([x - 0.15, x + 0.15], [-_ROW * row] * 2, color="white", lw=4, zorder=2.2)
         axes.text(x, max(ys) + 0.45, name, ha="center", fontsize=8.5, color=_INK)
     for name, (row, start, end, symbol, text, closed) in lines.items():
         (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
@@ -81,10 +103,20 @@ def fill_diagram(figure: Figure, scenario: Scenario) -> Axes:
         _IN_LINE.get(symbol, _box)(axes, (left + right) / 2, y)
         _breaker(axes, left + 0.5, y, closed)
         axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
+        at_ends = [c for c, node in nodes.items() if node in (start, end)]
+        if report is not None and at_ends:
+            _area(axes, (left + 0.1, right - 0.1), y, f"{report}#{ONLY}{','.join(at_ends)}")
         spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
     for event in faults:
         _fault(axes, scenario, event, bars, spots)
     return axes
+
+
+def _area(axes: Axes, x: tuple[float, float], y: float, url: str) -> None:
+    """A link as large as what is drawn along a row."""
+    axes.add_patch(
+        Rectangle((x[0], y - 1.0), x[1] - x[0], 1.6, fc="none", ec="none", url=url, zorder=5)
+    )
 
 
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
@@ -139,15 +171,18 @@ def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar]
 
 
 def _give_columns(bars: Mapping[str, _Bar], lines: _Lines, last: str | None) -> None:
-    """Put every node one column left of its neighbour on the way to the grid, which is last."""
-    away, front = {last or next(iter(bars)): 0}, [last or next(iter(bars))]
-    while front:
-        here = front.pop(0)
+    """Put every node left of its neighbours on the way to the grid, which is last; those that a
+    line connects are in different columns."""
+    first = last or next(iter(bars))
+    away, front = {first: 0}, [first]
+    for here in front:
         for _, start, end, *_ in lines.values():
             other = {start: end, end: start}.get(here)
-            if other is not None and other not in away:
-                away[other] = away[here] + 1
+            if other is not None and other not in front:
                 front.append(other)
+    for k, name in enumerate(front[1:], 1):
+        ends = [{start: end, end: start}.get(name) for _, start, end, *_ in lines.values()]
+        away[name] = 1 + max(away[other] for other in front[:k] if other in ends)
     for name, bar in bars.items():
         bar.column = max(away.values()) - away.get(name, 0)
 

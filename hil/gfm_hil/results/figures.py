@@ -18,7 +18,7 @@ from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, ColumnLike, C
 from gfm_hil.recording.run import Run, bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
-from gfm_hil.results.curves import Panel, few_ticks
+from gfm_hil.results.curves import POINTS, Panel, few_ticks
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
@@ -219,15 +219,7 @@ def panels(figure: Figure) -> list[str]:
         if a.get_shared_x_axes().joined(a, axes[-1]):
             a.tick_params(labelbottom=True)
             a.set_xlabel(axes[-1].get_xlabel(), fontsize=9)
-    from matplotlib import rc_context
-
-    whole = io.BytesIO()
-    with rc_context(_IN_A_PAGE):
-        figure.savefig(whole, format="svg", metadata={"Date": None})
-    root = ElementTree.fromstring(whole.getvalue())
-    for element in root.iter():  # a page knows SVG without namespaces
-        element.tag = element.tag.partition("}")[2]
-        element.attrib = {k.rpartition("}")[2]: v for k, v in element.attrib.items()}
+    root = in_a_page(as_svg(figure))
     shared = root.findall("defs")  # the paths that clip curves
     points, height = 72 / figure.dpi, 72 * figure.get_figheight()
     boxes = {a: a.get_tightbbox() for a in axes}
@@ -246,6 +238,27 @@ def panels(figure: Figure) -> list[str]:
         svg.extend([*shared, drawn])
         found.append(ElementTree.tostring(svg, encoding="unicode"))
     return found
+
+
+def as_svg(figure: Figure) -> bytes:
+    """A figure as a file of SVG."""
+    from matplotlib import rc_context
+
+    whole = io.BytesIO()
+    with rc_context(_IN_A_PAGE):
+        figure.savefig(whole, format="svg", metadata={"Date": None})
+    return whole.getvalue()
+
+
+def in_a_page(svg: bytes) -> ElementTree.Element:
+    """A file of SVG as an element of a page, which knows SVG without namespaces."""
+    root = ElementTree.fromstring(svg)
+    for element in root.iter():
+        element.tag = element.tag.partition("}")[2]
+        element.attrib = {k.rpartition("}")[2]: v for k, v in element.attrib.items()}
+    for about in root.findall("metadata"):
+        root.remove(about)
+    return root
 
 
 def headline(figure: Figure, text: str, size: float = 11) -> None:
@@ -267,7 +280,7 @@ def _figure(size: tuple[float, float]) -> Figure:
     return Figure(figsize=size, layout="constrained")
 
 
-def _save(figure: Figure, path: Path, few_colours: bool = False) -> Picture:
+def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
     """Save a figure; of many slanted curves, whose edges have many shades, 64 colours take a
     quarter of the bytes and look the same."""
     from PIL import Image  # matplotlib needs it too
@@ -278,30 +291,40 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> Picture:
             with Image.open(part) as picture:
                 few = picture.convert("RGB").quantize(64, dither=Image.Dither.NONE)
             few.save(part, "PNG", optimize=True)
-    return Picture(path, panels(figure))
 
 
 def draw_run(
     folder: Path, scenario: Scenario, signals: Columns, timing: Columns, summary: dict[str, Any]
-) -> list[Picture]:
-    """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png."""
-    pictures = []
+) -> Picture | None:
+    """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png, which
+    is returned; a page shows the others as ``panels_of_run`` and ``panels_of_waves``."""
     if "true_p" in signals:
         figure = _figure(SIZE)
         draw_signals(figure, scenario, signals, summary)
-        pictures.append(_save(figure, folder / "signals.png"))
+        _save(figure, folder / "signals.png")
     if signals.keys() >= {*NEEDS}:
         figure = _figure(SIZE_WAVES)
         if draw_waveforms(figure, scenario, signals, summary):
-            pictures.append(_save(figure, folder / "waveforms.png", few_colours=True))
+            _save(figure, folder / "waveforms.png", few_colours=True)
     if summary["mode"] == "realtime" and summary["round_trip_us"]:
-        pictures.append(draw_timing(folder, scenario, timing, summary))
-    return pictures
+        return draw_timing(folder, scenario, timing, summary)
+    return None
 
 
 SIZE = (10.5, 7.4)  # inches, of the six panels of a run
 SIZE_WAVES = (10.5, 6.4)
 SIZE_LAWS = (8.6, 8.2)
+
+#: what a figure of several runs shows: title and column
+SHARED = (
+    ("active power p", "true_p"),
+    ("frequency", "true_omega_u"),
+    ("reactive power q", "true_q"),
+    ("DC voltage v_dc", "true_v_dc"),
+    ("voltage V", "true_V"),
+    ("current |i_dq|", "true_i"),
+)
+PAPER = SHARED[:4]  #: as in the paper
 
 
 class Quantity(NamedTuple):
@@ -347,22 +370,79 @@ def draw_signals(
     return axes
 
 
-def panels_of_run(scenario: Scenario, signals: Columns, summary: dict[str, Any]) -> Iterator[Panel]:
-    """The ``quantities`` of a run for a page in which a reader can zoom."""
+def panels_of_run(
+    scenario: Scenario, signals: Columns, summary: dict[str, Any], most: int = POINTS
+) -> Iterator[Panel]:
+    """The ``quantities`` of a run for a page in which a reader can zoom, ``most`` points each."""
     panels, signals = quantities(scenario, signals)
     t = signals["t"]
-    events = [(float(e["t"]), str(e["label"])) for e in summary["events"]]
-    events += [(float(x["t"]), reason_name(x["reason"])) for x in summary.get("trips", [])]
     limited = _limited(t, signals["limited"]) if "limited" in signals else []
     for title, named in panels:
         shown = TABLE[named[0][0]].shown(nominal_frequency(scenario))
-        at = few_ticks([signals[n] for n, _, _ in named])
+        at = few_ticks([signals[n] for n, _, _ in named], most)
         curves = {label: _at(signals[n], at) * shown.factor for n, _, label in named}
         yield Panel(
             f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
-            sorted(events), colours=[colour for _, colour, _ in named],
+            _happened(summary), colours=[colour for _, colour, _ in named],
             bands=limited if title == "currents" else (),
         )  # fmt: skip
+
+
+def panels_of_waves(
+    scenario: Scenario, signals: Columns, summary: dict[str, Any]
+) -> Iterator[Panel]:
+    """The panels of ``draw_waveforms`` for a page; none if nothing was recorded in the window."""
+    rows, waves = _waves(scenario, signals, summary)
+    t = signals["t"][rows]
+    if not len(t):
+        return
+    ends = float(t[0]), float(t[-1])
+    events = [(at, label) for at, label in _happened(summary) if ends[0] <= at <= ends[1]]
+    for title, phases in waves:
+        curves = {name: np.asarray(x[rows], dtype=float) for name, x in phases.items()}
+        yield Panel(title, np.asarray(t, dtype=float), curves, ends, events, colours=COLOURS[:3])
+
+
+def panels_of_all(
+    scenario: Scenario,
+    runs: Mapping[str, Columns],
+    events: Sequence[dict[str, Any]],
+    most: int = POINTS,
+) -> Iterator[Panel]:
+    """The quantities ``SHARED`` of several runs for a page, a curve a run."""
+    t = max((columns["t"] for columns in runs.values()), key=len)
+    happened = [(float(e["t"]), str(e["label"])) for e in events]
+    for title, name in SHARED:
+        shown = TABLE[name].shown(nominal_frequency(scenario))
+        each = {run: _Padded(columns[name], len(t)) for run, columns in runs.items()}
+        at = few_ticks([*each.values()], most)
+        curves = {run: _at(column, at) * shown.factor for run, column in each.items()}
+        yield Panel(
+            f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
+            happened, colours=[COLOURS[k % len(COLOURS)] for k in range(len(each))],
+        )  # fmt: skip
+
+
+class _Padded:
+    """A column of a run that may have ended before the others, NaN up to their end."""
+
+    def __init__(self, column: ColumnLike, ticks: int) -> None:
+        self._column, self._ticks, self.dtype = column, ticks, np.dtype(float)
+
+    def __len__(self) -> int:
+        return self._ticks
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        first, last, _ = rows.indices(self._ticks)
+        known = np.asarray(self._column[first:last], dtype=float)
+        return np.pad(known, (0, last - first - len(known)), constant_values=np.nan)
+
+
+def _happened(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
+    """Events and trips of a run by their time, s."""
+    events = [(float(e["t"]), str(e["label"])) for e in summary["events"]]
+    trips = [(float(x["t"]), reason_name(x["reason"])) for x in summary.get("trips", [])]
+    return sorted(events + trips)
 
 
 def _at(column: ColumnLike, ticks: NDArray[np.intp]) -> NDArray[Any]:
@@ -411,28 +491,18 @@ def draw_waveforms(
     Raises:
         UserError: the recording lacks what ``three_phase`` needs.
     """
-    base = bases(scenario)
-    waves = three_phase(signals, base)
-    start, stop = window or scenario.waveforms or usual_window(summary, nominal_frequency(scenario))
-    rows = slice(max(0, round(start / scenario.T_s)), max(0, round(stop / scenario.T_s) + 1))
+    rows, waves = _waves(scenario, signals, summary, window)
     t = signals["t"][rows]
     if not len(t):
         return []
     axes = _panels(figure, 3, 1)
-    V, A = (f"{np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
-    for a, name, title in zip(
-        axes,
-        ("v", "i", "i_o"),
-        (f"capacitor voltages [p.u. of {V} V]", f"bridge currents [p.u. of {A} A]",
-         "line currents [p.u.]"),
-        strict=True,
-    ):  # fmt: skip
+    for a, (title, phases) in zip(axes, waves, strict=True):
         curves = [
-            (t, waves[wave(name, phase, False)][rows], colour, phase)
-            for phase, colour in zip(PHASES, COLOURS, strict=False)
+            (t, x[rows], colour, phase)
+            for (phase, x), colour in zip(phases.items(), COLOURS, strict=False)
         ]
         draw_panel(a, title, curves, styles=("-",))
-        a.set_xlim(float(t[0]), max(stop, float(t[-1])))
+        a.set_xlim(float(t[0]), max(rows.stop - 1, rows.start) * scenario.T_s)
     if "limited" in signals:
         _shade(axes[1], t, signals["limited"][rows])
         if axes[1].collections:
@@ -440,6 +510,28 @@ def draw_waveforms(
     _legend(axes[0], len(PHASES))
     _mark_run(figure, axes, scenario, summary, float(t[0]), float(t[-1]))
     return axes
+
+
+def _waves(
+    scenario: Scenario,
+    signals: Columns,
+    summary: Mapping[str, Any],
+    window: tuple[float, float] | None = None,
+) -> tuple[slice, list[tuple[str, dict[str, ColumnLike]]]]:
+    """The ticks of a window, see ``draw_waveforms``, and the columns of the phases by title."""
+    base = bases(scenario)
+    waves = three_phase(signals, base)
+    start, stop = window or scenario.waveforms or usual_window(summary, nominal_frequency(scenario))
+    rows = slice(max(0, round(start / scenario.T_s)), max(0, round(stop / scenario.T_s) + 1))
+    V, A = (f"{np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
+    titles = {
+        "v": f"capacitor voltages [p.u. of {V} V]", "i": f"bridge currents [p.u. of {A} A]",
+        "i_o": "line currents [p.u.]",
+    }  # fmt: skip
+    return rows, [
+        (title, {phase: waves[wave(name, phase, False)] for phase in PHASES})
+        for name, title in titles.items()
+    ]
 
 
 def draw_timing(
@@ -469,7 +561,8 @@ def draw_timing(
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
     dress(right, f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}")
     right.set_xlabel("t [s]", fontsize=9)
-    return _save(figure, folder / "timing.png")
+    _save(figure, folder / "timing.png")
+    return Picture(folder / "timing.png", panels(figure))
 
 
 def draw_laws(
@@ -477,19 +570,14 @@ def draw_laws(
     scenario: Scenario,
     runs: Mapping[str, Columns],
     events: Sequence[dict[str, Any]],
+    quantities: Sequence[tuple[str, str]],
 ) -> list[Axes]:
-    """Fill a figure with p, frequency, q and v_dc of several laws, like the paper's."""
-    axes = _panels(figure, 4, 1)
+    """Fill a figure with some of ``SHARED`` of several runs, four below each other, six by twos."""
+    axes = _panels(figure, 4, 1) if len(quantities) == 4 else _panels(figure, 3, 2)
     whole = max(len(s["t"]) for s in runs.values())
     if all(s["t"][0:1] == 0 for s in runs.values()):  # not only a window of each run
         whole = scenario.ticks
-    panels = (
-        ("active power p", "true_p"),
-        ("frequency", "true_omega_u"),
-        ("reactive power q", "true_q"),
-        ("DC voltage v_dc", "true_v_dc"),
-    )
-    for a, (title, name) in zip(axes, panels, strict=True):
+    for a, (title, name) in zip(axes, quantities, strict=True):
         curves = [
             (columns, name, COLOURS[k % len(COLOURS)], law)
             for k, (law, columns) in enumerate(runs.items())
@@ -507,11 +595,15 @@ def draw_laws(
 
 
 def draw_comparison(
-    path: Path, scenario: Scenario, runs: Mapping[str, Columns], events: Sequence[dict[str, Any]]
+    path: Path,
+    scenario: Scenario,
+    runs: Mapping[str, Columns],
+    events: Sequence[dict[str, Any]],
+    quantities: Sequence[tuple[str, str]] = PAPER,
 ) -> None:
-    """Draw several laws into a file, see ``draw_laws``."""
-    figure = _figure(SIZE_LAWS)
-    draw_laws(figure, scenario, runs, events)
+    """Draw several runs into a file, see ``draw_laws``."""
+    figure = _figure(SIZE_LAWS if len(quantities) == 4 else SIZE)
+    draw_laws(figure, scenario, runs, events, quantities)
     with replacing(path) as part:
         figure.savefig(part, dpi=110)
 
@@ -598,8 +690,8 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
 
 
 def plot_network(run: NetworkRun) -> list[Axes]:
-    """p, frequency, q and v_dc of all converters in one figure."""
-    return draw_laws(pyplot_figure(SIZE_LAWS), run.scenario, run.columns, run.events)
+    """p, frequency, q, v_dc, V and current of all converters in one figure."""
+    return draw_laws(pyplot_figure(SIZE), run.scenario, run.columns, run.events, SHARED)
 
 
 def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
@@ -607,4 +699,4 @@ def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
     first = next(iter(runs.values()))
     events = max((one.summary["events"] for one in runs.values()), key=len)
     columns = {law: one.columns for law, one in runs.items()}
-    return draw_laws(pyplot_figure(SIZE_LAWS), first.scenario, columns, events)
+    return draw_laws(pyplot_figure(SIZE_LAWS), first.scenario, columns, events, PAPER)

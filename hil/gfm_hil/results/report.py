@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.recording.run import Run, controlled_by
+from gfm_hil.recording.waveforms import NEEDS
 from gfm_hil.results.curves import POINTS, PackedCurves, Panel
-from gfm_hil.results.page import inline, plot_script, write_page
+from gfm_hil.results.page import plot_script, write_page
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.summary import END_METRICS
+from gfm_hil.scenario import Scenario, scenario_toml
 
 if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture
+
+PAGE = "report.html"
+_OF_ALL = 40_000  # points of a panel times runs, so that a page of many runs stays small
 
 EVENT_COLUMNS = (
     ("label", "event"),
@@ -85,58 +92,132 @@ def inner_stages(summary: Mapping[str, Any]) -> str:
     return ", ".join(f"{law}: {kind}" for law, kind in kinds.items())
 
 
+@dataclass(frozen=True)
+class Chapter:
+    """What a report tells of one run."""
+
+    name: str  # of the converter or the law; empty if the report has no other run
+    summary: Mapping[str, Any]
+    panels: Sequence[Panel]
+    waves: Sequence[Panel]
+    timing: Picture | None
+
+    @property
+    def place(self) -> str:
+        """Where in the page it is."""
+        return "of-" + re.sub(r"[^\w-]+", "-", self.name)
+
+    @property
+    def look(self) -> str:
+        """The class of the status."""
+        return "expected" if as_expected(self.summary) else str(self.summary["status"])
+
+    @property
+    def facts(self) -> Table:
+        """What is told before the figures."""
+        rows = [(Cell(name, "head"), value) for name, value in _facts(self.summary)]
+        return Table((), rows, text=None)
+
+    @property
+    def events(self) -> Table:
+        """What followed from each event."""
+        return _events(self.summary["events"])
+
+
 def write_report(run: Run | NetworkRun) -> None:
     """Draw the figures of a run and write report.html into its folder; of several converters in a
-    network only the figures that they share."""
+    network only the figures that they share, and one report of all."""
     # a second of imports, which the sides' processes do without
     from gfm_hil.results.diagram import draw_diagram
-    from gfm_hil.results.figures import draw_comparison, draw_run, panels_of_run
+    from gfm_hil.results.figures import SHARED, draw_comparison, draw_run
 
     folder, scenario = run.folder, run.scenario
     assert folder is not None
     if isinstance(run, NetworkRun):
-        draw_comparison(folder / "converters.png", scenario, run.columns, run.events)
-        draw_diagram(folder, scenario)
+        draw_comparison(folder / "converters.png", scenario, run.columns, run.events, SHARED)
+        diagram = draw_diagram(folder, scenario, PAGE)
+        write_together(
+            folder, scenario, run.runs, run.events, "converter", "converters.png", diagram
+        )
         return
-    pictures = draw_run(folder, scenario, run.columns, run.timing, run.summary)
-    panels = []
-    if "true_p" in run.columns:  # the first picture, as a reader can zoom it
-        pictures = pictures[1:]
-        panels = list(panels_of_run(scenario, run.columns, run.summary))
-    _write_page(run, folder, panels, pictures, draw_diagram(folder, scenario))
+    timing = draw_run(folder, scenario, run.columns, run.timing, run.summary)
+    chapter = _chapter("", run, POINTS, timing)
+    content = {"chapters": [chapter], "shared": [], "kind": ""}
+    diagram = draw_diagram(folder, scenario)
+    _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
+
+
+def write_together(
+    folder: Path,
+    scenario: Scenario,
+    runs: Mapping[str, Run],
+    events: Sequence[dict[str, Any]],
+    kind: str,
+    picture: str,
+    diagram: str = "",
+) -> None:
+    """Write report.html of several runs, which show the same quantities beside each other.
+
+    Args:
+        folder: which holds ``picture``, for readers without JavaScript.
+        scenario: of the network, or of the first run.
+        runs: by name; those that recorded the plant are shown.
+        events: that all figures of all runs mark.
+        kind: what the names are of, ``converter`` or ``law``.
+        diagram: of the network; drawn if there is none.
+    """
+    from gfm_hil.results.diagram import draw_diagram
+    from gfm_hil.results.figures import panels_of_all
+
+    known = {name: run for name, run in runs.items() if run.ticks and "true_p" in run.columns}
+    most = min(POINTS, _OF_ALL // max(1, len(known)))
+    columns = {name: run.columns for name, run in known.items()}
+    chapters = [_chapter(name, run, most) for name, run in known.items()]
+    rows = [
+        [Cell(c.name, "head", f"#{c.place}"), controlled_by(c.summary),
+         c.summary["status"], c.summary["reason"], c.summary["misses"]]
+        for c in chapters
+    ]  # fmt: skip
+    content = {
+        "chapters": chapters,
+        "kind": kind,
+        "runs": Table([kind, "controlled by", "status", "reason", "misses"], rows, text=4),
+        "shared": [*panels_of_all(scenario, columns, events, most)] if columns else [],
+    }
+    ticks = max((run.ticks for run in known.values()), default=0)
+    diagram = diagram or draw_diagram(folder, scenario)
+    source = folder if kind == "converter" else next(iter(runs.values())).folder
+    _write_page(folder, scenario, content, diagram, most, ticks, picture, source)
+
+
+def _chapter(name: str, run: Run, most: int, timing: Picture | None = None) -> Chapter:
+    from gfm_hil.results.figures import panels_of_run, panels_of_waves
+
+    what = run.scenario, run.columns, run.summary
+    panels = [*panels_of_run(*what, most)] if "true_p" in run.columns else []
+    waves = [*panels_of_waves(*what)] if run.columns.keys() >= {*NEEDS} else []
+    return Chapter(name, run.summary, panels, waves, timing)
 
 
 def _write_page(
-    run: Run, folder: Path, panels: Sequence[Panel], pictures: Sequence[Picture], diagram: Path
-) -> None:
-    summary, scenario = run.summary, run.scenario
-    resolved = (folder / "scenario.toml").read_text("utf-8")
+    folder: Path, scenario: Scenario, content: Mapping[str, Any], diagram: str, most: int,
+    ticks: int, picture: str, source: Path | None,
+) -> None:  # fmt: skip
+    from markupsafe import Markup
+
+    if source is None:
+        resolved = scenario_toml(scenario)
+    else:  # which names the files of its events there
+        resolved = (source / "scenario.toml").read_text("utf-8")
     for one in [scenario, *map(scenario.of, scenario.converters)]:
         for law in {*one.laws(), *one.compare}:
             resolved = resolved.replace(f'"{law}"', f'"{Path(law).name}"')
+    curves, script = PackedCurves(), plot_script()
     write_page(
-        folder / "report.html",
-        "run.html",
-        title=scenario.title,
-        description=scenario.description,
-        status=summary["status"],
-        look="expected" if as_expected(summary) else summary["status"],
-        reason=summary["reason"],
-        unmet=summary["unmet"],
-        unstable=summary.get("unstable_mode", ""),
-        facts=Table(
-            (), [(Cell(name, "head"), value) for name, value in _facts(summary)], text=None
-        ),
-        panels=panels,
-        ticks=summary["ticks"],
-        points=POINTS,
-        curves=PackedCurves(),
-        script=plot_script(),
-        pictures=pictures,
-        diagram=inline(diagram),
-        events=_events(summary["events"]),
-        resolved=resolved,
-    )
+        folder / PAGE, "run.html", title=scenario.title,
+        description=scenario.description, **content, most=most, ticks=ticks,
+        curves=curves, script=script, picture=picture, diagram=Markup(diagram), resolved=resolved,
+    )  # fmt: skip
 
 
 def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -305,7 +305,7 @@ def test_the_window_of_the_report_is_that_of_the_scenario(make, tmp_path):
     one = Run.load(folder)
     assert one.scenario.waveforms == (0.01, 0.03)
     assert (folder / "waveforms.png").stat().st_size > 20_000
-    assert 'aria-label="waveforms"' in (folder / "report.html").read_text(encoding="utf-8")
+    assert 'data-group="waves"' in (folder / "report.html").read_text(encoding="utf-8")
     with pytest.raises(UserError, match=r"waveforms = \[0.03, 0.01\]: must be \[from, to\]"):
         make(waveforms=[0.03, 0.01])
     with pytest.raises(UserError, match=r"from before the end of the run at 0\.1 s"):

@@ -70,7 +70,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_report_of_a_run_holds_its_curves(report):
     run, page = gfmhil.load_run(report.parent), report.read_text("utf-8")
     plots = unpacked(page)
-    assert len(page) < 1_000_000 and len(plots) == 6
+    assert len(page) < 1_000_000 and len(plots) == 9  # the last three are the phases
     assert "at most 16,000 of the 100,000 ticks" in page
     ticks = np.rint(plots[0]["x"] / 1e-4).astype(int)
     p = np.asarray(run.signals["true_p"])

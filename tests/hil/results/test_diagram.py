@@ -129,8 +129,20 @@ def test_every_shipped_scenario_is_drawn_within_its_picture(name):
 def test_the_report_shows_it(make, tmp_path, undrawn):
     one = gfmhil.run(make(events=[FAULT]), folder=tmp_path / "run")
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert 'alt="network" src="data:image/svg+xml;base64,' in report
+    assert "fault, 0.02 s" in report and "<a href" not in report[report.index("diagram") :]
     drawn = one.file("network.svg").read_bytes()
     assert ET.fromstring(drawn).tag == "{http://www.w3.org/2000/svg}svg"
     (tmp_path / "again").mkdir()
-    assert draw_diagram(tmp_path / "again", one.scenario).read_bytes() == drawn
+    draw_diagram(tmp_path / "again", one.scenario)
+    assert (tmp_path / "again" / "network.svg").read_bytes() == drawn
+
+
+def test_converters_and_lines_are_links_to_their_curves(tmp_path):
+    """Lines of a mesh too, each between columns of its own."""
+    scenario = load_scenario("dynawo_three_converters")
+    page = ET.fromstring(draw_diagram(tmp_path, scenario, "report.html"))
+    links = [link.attrib["href"] for link in page.iter("a")]
+    assert links[:3] == ["#of-droop", "#of-dvoc", "#of-matching"] and len(links) == 3 + 5
+    assert "#only=droop,matching" in links  # line12
+    alone = (tmp_path / "network.svg").read_text("utf-8")
+    assert 'xlink:href="report.html#of-dvoc"' in alone

@@ -3,11 +3,15 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.cli import main
 from gfm_hil.recording.columns import printed
 
+from ...support.page import unpacked
+from ...support.processes import wait_for
 from ...support.scope import HAS_BROWSER, Browser
 
 
@@ -26,7 +30,44 @@ def test_it_is_in_words(report):
     text = report.read_text("utf-8")
     assert "controller: 12 lost, 1 crc; plant: none" in text and "{'" not in text
     assert "2026-11-24 03:15:21 UTC" in text
-    assert text.count('class="plot"') == 6 and text.count("<svg") == 3  # those of the waveforms
+    assert text.count('class="plot"') == 9 and text.count("<svg") == 1  # the diagram
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of three converters in a mesh, a line that opens and a fault, at 10 kHz."""
+    folder = tmp_path_factory.mktemp("report") / "run"
+    gfmhil.run_network("dynawo_three_converters", folder, duration=2.5, T_s=1e-4)
+    return folder / "report.html"
+
+
+def test_a_network_has_one_report(network):
+    text = network.read_text("utf-8")
+    titles = re.findall(r'<h2 id="([^"]*)"', text)
+    assert titles == ["network", "all", "of-droop", "of-dvoc", "of-matching", "scenario"]
+    plots = unpacked(text)
+    assert len(plots) == 6 + 3 * 9 and {*plots[0]["curves"]} == {"droop", "dvoc", "matching"}
+    run = gfmhil.load_run(network.parent / "dvoc")
+    V = plots[4]
+    assert [label for _, label in V["events"]] == ["line12 off", "fault at node bus4 for 0.15 s"]
+    at = np.rint(V["x"] / 1e-4).astype(int)
+    assert V["curves"]["dvoc"] == pytest.approx(run.signals["V"][at], abs=2 / 4094)
+
+
+@pytest.mark.parametrize("opened", [True, False])
+def test_a_comparison_has_a_report_which_the_command_names_and_opens(
+    opened, tmp_path, capsys, monkeypatch
+):
+    asked = list[str]()
+    monkeypatch.setattr("webbrowser.open", lambda url: asked.append(url) or opened)
+    words = ["--laws", "vsg-2,droop-5", "--duration", "0.3", "--out", str(tmp_path / "c"), "--open"]
+    main(["compare", "pref_step", *words])
+    page = tmp_path / "c" / "report.html"
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == f"report: {page}" and asked == [page.as_uri()]
+    assert ("there is no browser" in said.err) is not opened
+    plots = unpacked(page.read_text("utf-8"))
+    assert {*plots[0]["curves"]} == {"vsg-2", "droop-5"} and len(plots) == 6 + 2 * 9
 
 
 def test_names_of_signals_are_printed_in_the_notation_of_the_field():
@@ -62,3 +103,27 @@ def test_it_is_readable_in_a_browser(report, width, dark):
         paper = page.js("return getComputedStyle(document.body).backgroundColor")
         lightness = sum(map(int, re.findall(r"\d+", paper))) / 3
         assert lightness < 50 if dark else lightness > 200
+
+
+@pytest.mark.systems
+@pytest.mark.apt
+@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver")
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_diagram_is_the_entrance_to_the_curves(network, width, dark):
+    with Browser(width, 900, dark=dark, phone=width < 500) as page:
+        page.driver.get(network.as_uri())
+        page.click(".diagram a[href='#of-droop']")
+        place = "return document.getElementById('of-droop').getBoundingClientRect().top"
+        wait_for(lambda: abs(page.js(place)) < 100)
+        page.js("location.hash = '#only=dvoc,matching'")
+        off = (
+            "return [...document.querySelectorAll('#all ~ .panels .plot')][0]"
+            ".querySelectorAll('.u-series.u-off').length"
+        )
+        wait_for(lambda: page.js(off) == 1)
+        assert page.text("#shown b") == "dvoc, matching"
+        page.click("#shown a")
+        wait_for(lambda: page.js(off) == 0)
+        assert page.js("return document.documentElement.scrollWidth") <= width
+        assert page.complaints() == []

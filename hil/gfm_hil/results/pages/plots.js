@@ -125,17 +125,60 @@
     }, data, place);
   };
 
-  const rest = new Set(document.querySelectorAll(".plot")), drawn = [];
-  const show = (place) => rest.delete(place) && drawn.push([place, draw(place)]);
+  // A finger drags as a mouse does; up and down it scrolls, see .u-over in the style.
+  const touch = (u) => {
+    for (const [from, to] of [["touchstart", "mousedown"], ["touchmove", "mousemove"], ["touchend", "mouseup"]]) {
+      u.over.addEventListener(from, ({ changedTouches: [{ clientX, clientY }] }) => {
+        const at = { clientX, clientY, bubbles: true, detail: 1 };
+        if (to === "mousedown") u.over.dispatchEvent(new MouseEvent("mousemove", at));
+        u.over.dispatchEvent(new MouseEvent(to, at));
+      }, { passive: true });
+    }
+  };
+
+  const rest = new Set(document.querySelectorAll(".plot")), drawn = new Map();
+  const show = (place) => {
+    if (!rest.delete(place)) return;
+    const plot = draw(place), same = [...drawn].find(([{ dataset }]) => dataset.group === place.dataset.group);
+    if (same) plot.setScale("x", same[1].scales.x);  // others may have been zoomed
+    drawn.set(place, plot);
+    touch(plot);
+    choose(place);
+  };
   const seen = new IntersectionObserver((found) => {
     for (const { isIntersecting, target } of found) if (isIntersecting) show(target);
   }, { rootMargin: "600px" });
   rest.forEach((place) => seen.observe(place));
+
+  // #only=A,B shows the curves of some runs of all, #only= those of all of them.
+  let only = [];
+  const ofAll = [...document.querySelectorAll("#all ~ .panels")].slice(0, 1).flatMap((row) => [...row.querySelectorAll(".plot")]);
+  const choose = (place) => {
+    const plot = drawn.get(place);
+    if (!plot || !ofAll.includes(place)) return;
+    plot.series.forEach(({ label }, k) => {
+      const wanted = !only.length || only.includes(label);
+      if (k && plot.series[k].show !== wanted) plot.setSeries(k, { show: wanted });
+    });
+  };
+  const follow = () => {
+    const [, names] = decodeURIComponent(location.hash).split("#only=");
+    if (names === undefined) return;
+    only = names ? names.split(",") : [];
+    const told = document.getElementById("shown");
+    told.hidden = !only.length;
+    told.querySelector("b").textContent = only.join(", ");
+    ofAll.forEach(choose);
+    document.getElementById("all").scrollIntoView();
+  };
+  addEventListener("hashchange", follow);
+  follow();
+
   addEventListener("beforeprint", () => {
     rest.forEach(show);
-    drawn.forEach(([, plot]) => plot.setSize({ width: 440, height: HEIGHT }));  // two in a row
+    drawn.forEach((plot) => plot.setSize({ width: 440, height: HEIGHT }));  // two in a row
   });
   addEventListener("afterprint", () => {
-    drawn.forEach(([place, plot]) => plot.setSize({ width: place.clientWidth, height: HEIGHT }));
+    drawn.forEach((plot, place) => plot.setSize({ width: place.clientWidth, height: HEIGHT }));
   });
 })();
