@@ -7,6 +7,7 @@ from gfm_hil.api.plot import (
     participations,
     pole_map,
     root_locus,
+    save,
     stability_map,
     step,
 )
@@ -23,6 +24,7 @@ __all__ = [
     "passivity",
     "pole_map",
     "root_locus",
+    "save",
     "stability_map",
     "step",
 ]

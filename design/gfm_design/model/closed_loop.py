@@ -185,6 +185,7 @@ class ClosedLoop(LinearLoop):
         many, n_u, n_y = plant.A.shape[:-2], plant.B.shape[-1], plant.C.shape[-2]
         self.plant, self.law, self.T_s, self.origin = plant, law, T_s, origin
         self.stage, self.around = stage, around
+        self.where = ""  #: title of the scenario, for figures
         self.u_delay: Matrix = np.broadcast_to(np.asarray(u_delay, float), (*many, n_u))
         self.y_delay: Matrix = np.broadcast_to(np.asarray(y_delay, float), (*many, n_y))
         if T_s is None and (self.u_delay.any() or self.y_delay.any()):

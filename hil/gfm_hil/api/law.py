@@ -271,7 +271,9 @@ class Law:
             law = build_law(self.staged(on, converter))
             if converter is None:
                 more = {"references": on.references.vector(), "T_s": on.T_s, **more}
-                return ClosedLoop.of(law, on.plant, ideal=ideal, **more)
+                loop = ClosedLoop.of(law, on.plant, ideal=ideal, **more)
+                loop.where = on.title
+                return loop
             if ideal or more:
                 raise UserError(f"{', '.join(more) or 'ideal'}: not of a converter of a network")
             return loop_under(law, on, converter)
@@ -355,7 +357,17 @@ class Law:
         return path
 
     def __repr__(self) -> str:
-        return f"<Law {self.name}: {self.file.title}>"
+        cells = [
+            [u, *(cell_text(self.file, f"{i + 1}{j + 1}") for j in range(NY))]
+            for i, u in enumerate(U_NAMES)
+        ]
+        rows = [["", *Y_NAMES], *cells]
+        wide = [max(len(row[j]) for row in rows) for j in range(NY + 1)]
+        matrix = (
+            "  " + "  ".join(x.ljust(n) for x, n in zip(row, wide, strict=True)).rstrip()
+            for row in rows
+        )
+        return "\n".join([f"<Law {self.name}: {self.file.title}", *matrix, ">"])
 
     def _repr_html_(self) -> str:
         """The matrix of elements and the parameters, for a notebook."""

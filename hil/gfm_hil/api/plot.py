@@ -6,8 +6,9 @@ gives a ``NetworkLoop``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,19 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
-from gfm_hil.results.figures import COLOURS, GREY, complex_plane, draw_panel, dress, pyplot_panels
+from gfm_hil.recording.columns import printed
+from gfm_hil.results.figures import (
+    COLOURS,
+    GREY,
+    complex_plane,
+    draw_panel,
+    dress,
+    headline,
+    pyplot_panels,
+    symbol,
+)
+from gfm_hil.results.look import figure_of, look, own_colour, rc, with_look
+from gfm_hil.results.look import save as save
 from gfm_hil.studies.linear_loop import title_of
 from gfm_hil.studies.margin_figures import NO_POINT, draw_sigma
 from gfm_runtime.signals import U_NAMES, Y_NAMES
@@ -36,8 +49,11 @@ _SHOWN = 12  # modes of the figure of participations
 _LEAST = 0.005  # a part below this in every mode is left out
 
 
+@with_look
 def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
-    """Draw gain [dB] and phase [degrees] of L over Hz, see ``ClosedLoop.loop_gain``.
+    """Draw gain [dB] and phase [degrees] of L over Hz, see ``ClosedLoop.loop_gain``, with the
+    least margins of each loop: of the phase where |L| crosses 0 dB, of the gain where the phase
+    crosses an odd multiple of 180 degrees.
 
     Args:
         at: channels of u or y at which one loop is cut; each command that acts if none is given.
@@ -45,23 +61,76 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     Raises:
         UserError: the loop does not use such a channel.
     """
-    gain, phase = pyplot_panels(2, _TWO)
+    gain, phase = pyplot_panels(2, _TWO, below=1)
+    margins = []
     for k, (name, hz, L) in enumerate(_gains(loop, at)):
-        _curve(gain, hz, 20 * np.log10(np.abs(L)), k, name)
-        _curve(phase, hz, _degrees(L), k, name)
+        dB, degrees = 20 * np.log10(np.abs(L)), _degrees(L)
+        _curve(gain, hz, dB, k, printed(name))
+        _curve(phase, hz, degrees, k, "_")
+        margins.append((hz, dB, degrees))
+    for k, found in enumerate(margins):
+        _mark_margins(gain, phase, *found, k)
+    if phase.get_legend_handles_labels()[1]:
+        phase.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     gain.axhline(0.0, color=GREY, lw=0.8)
     gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
     phase.axhline(-180.0, color=GREY, lw=0.8)
-    return _finish([gain, phase], f"{title_of(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
+    _tick_degrees(phase)
+    return _finish([gain, phase], f"{_named(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
 
 
+def _named(loop: ClosedLoop) -> str:
+    """The law, and the scenario if it is known."""
+    return f"{title_of(loop)}, {loop.where}" if loop.where else title_of(loop)
+
+
+def _tick_degrees(axes: Axes) -> None:
+    """Ticks at multiples of 45°, where these are too many of 90° or more."""
+    from matplotlib.ticker import MultipleLocator
+
+    low, high = axes.get_ylim()
+    most = 9 if not look().paper else 6
+    step = next(s for s in (45, 90, 180, 360, 720, 1e6) if (high - low) / s <= most)
+    axes.yaxis.set_major_locator(MultipleLocator(step))
+
+
+def _mark_margins(gain: Axes, phase: Axes, hz: Vector, dB: Vector, degrees: Vector, k: int) -> None:
+    """Mark the least margins of a loop: of the phase in the panel of the phase, of the gain in that
+    of the gain."""
+    log, turn = np.log(hz), 360.0
+    first, last = math.floor(degrees.min() / turn), math.ceil(degrees.max() / turn)
+    odd = [_crossings(log, degrees - turn * n + 180.0) for n in range(first, last + 1)]
+    style: Any = {"color": own_colour(COLOURS[k % len(COLOURS)]), "ms": 4.0, "ls": "none"}
+    for axes, at, values, sign, unit in (
+        (phase, _crossings(log, dB), degrees, "φ_m", "°"),
+        (gain, np.concatenate(odd), dB, "g_m", " dB"),
+    ):
+        there = np.interp(at, log, values)
+        margins = (there + turn) % turn - 180.0 if axes is phase else -there
+        if not len(at):
+            continue
+        least = int(np.argmin(np.abs(margins)))
+        f = float(np.exp(at[least]))
+        said = f"{sign} {margins[least]:.3g}{unit} at {f:.3g} Hz"
+        axes.plot(f, there[least], "o", label=said, **style)
+
+
+def _crossings(x: Vector, y: Vector) -> Vector:
+    """Where y, linear between its points, crosses zero."""
+    at = np.flatnonzero((y[:-1] < 0.0) != (y[1:] < 0.0))
+    share = y[at] / (y[at] - y[at + 1])
+    return np.asarray(x[at] + share * (x[at + 1] - x[at]))
+
+
+@with_look
 def nyquist(loop: ClosedLoop, *at: str) -> Axes:
     """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
     ``bode``."""
     loci = {name: L for name, _, L in _gains(loop, at)}
-    return complex_plane(f"{title_of(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
+    return complex_plane(f"{_named(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
 
 
+@with_look
 def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float = 1.0) -> list[Axes]:
     """Draw y = (v_dc, p, omega_u, q, V) [p.u.] after a unit step, of a network those of all
     converters; see ``step_response``.
@@ -83,7 +152,7 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
             t, each = loop.step_response(of, seconds)
             curves = [(each[one], colours[one], one) for one in loop.names]
         else:
-            title = f"{title_of(loop)}: {title}"
+            title = f"{_named(loop)}: {title}"
             t, y = loop.step_response(of, seconds)
             curves = [(y, COLOURS[0], "")]
     except ValueError as problem:
@@ -91,11 +160,11 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
     panels = pyplot_panels(len(Y_NAMES), (8.6, 8.2))
     for k, (axes, signal) in enumerate(zip(panels, Y_NAMES, strict=True)):
         lines = [(t, x[:, k], colour, name or signal) for x, colour, name in curves]
-        draw_panel(axes, f"{signal} [p.u.]", lines)
-    panels[-1].set_xlabel("t [s]", fontsize=9)
+        draw_panel(axes, symbol(signal), lines, label=symbol(signal))
+    panels[-1].set_xlabel("t [s]", fontsize=rc("axes.labelsize", 9))
     if len(curves) > 1:
-        panels[0].legend(fontsize=8, frameon=False, loc="best", ncols=4)
-    panels[0].figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+        panels[0].legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best", ncols=4)
+    headline(figure_of(panels), title)
     return panels
 
 
@@ -104,6 +173,7 @@ def stepped_by_default(loop: ClosedLoop | NetworkLoop) -> str:
     return f"{loop.names[0]}.P_ref" if isinstance(loop, NetworkLoop) else "P_ref"
 
 
+@with_look
 def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     """Draw the poles: sigma [1/s] and frequency [Hz], over symmetric logarithms; of a network each
     in the colour of the part that takes part in it most."""
@@ -119,17 +189,18 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
         ):
             some = poles[here]
             axes.plot(some.real, some.imag / (2 * np.pi), marker, color=colour, ms=5)
-        title = f"{title_of(loop)}: poles, stable where σ < 0"
+        title = f"{_named(loop)}: poles, stable where σ < 0"
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
     dress(axes, title)
     if isinstance(loop, NetworkLoop):
-        axes.legend(fontsize=8, frameon=False, loc="best")
+        axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     return axes
 
 
+@with_look
 def root_locus(sweep: GainSweep) -> Axes:
     """Draw the poles of ``gfmhil.design.sweep``: sigma [1/s] and frequency [Hz], over symmetric
     logarithms, in the colour of the parameter's value; those of the law's own value as crosses."""
@@ -144,7 +215,7 @@ def root_locus(sweep: GainSweep) -> Axes:
     if sweep.values[0] <= sweep.own <= sweep.values[-1]:
         near = sweep.poles[int(np.argmin(np.abs(sweep.values - sweep.own)))]
         axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=f"near {sweep.own:g}")
-        axes.legend(fontsize=8, loc="upper left")
+        axes.legend(fontsize=rc("legend.fontsize", 8), loc="upper left")
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
@@ -153,6 +224,7 @@ def root_locus(sweep: GainSweep) -> Axes:
     return axes
 
 
+@with_look
 def stability_map(stability: StabilityMap) -> Axes:
     """Draw ``gfmhil.design.stability_map``: sigma [1/s] over the parameter and the short-circuit
     ratio, its zero as a line, the law's own value dashed."""
@@ -165,7 +237,7 @@ def stability_map(stability: StabilityMap) -> Axes:
     axes.set(xlabel=stability.gain, ylabel="short-circuit ratio")
     axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
     if np.isnan(stability.sigma).any():
-        axes.legend(handles=[NO_POINT], fontsize=8, loc="upper left")
+        axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
     return axes
 
 
@@ -185,6 +257,7 @@ def _mark_parts(axes: Axes, loop: NetworkLoop) -> None:
                 label = None
 
 
+@with_look
 def impedance(loop: ClosedLoop) -> list[Axes]:
     """Draw gain [p.u. of Z_b] and phase [degrees] of ``ClosedLoop.output_impedance`` over Hz.
 
@@ -199,10 +272,12 @@ def impedance(loop: ClosedLoop) -> list[Axes]:
         _curve(size, hz, np.abs(Z[:, i, j]), k, name)
         _curve(phase, hz, _degrees(Z[:, i, j]), k, name)
     size.set_yscale("log")
-    title = f"{title_of(loop)}: output impedance at the capacitor, dq"
+    title = f"{_named(loop)}: output impedance at the capacitor, dq"
+    _tick_degrees(phase)
     return _finish([size, phase], title, "|Z| [p.u.]", "∠Z [°]")
 
 
+@with_look
 def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     """Draw who takes part in the modes, the slowest to decay first: a bar for each, with the
     participations of ``modes()``.
@@ -223,7 +298,8 @@ def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     axes.invert_yaxis()
     axes.set(xlim=(0.0, 1.0), xlabel="participation")
     dress(axes)
-    axes.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
+    size = rc("legend.fontsize", 8)
+    axes.legend(fontsize=size, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
     return axes
 
 
@@ -258,7 +334,8 @@ def _hz(loop: ClosedLoop) -> Vector:
 
 
 def _curve(axes: Axes, hz: Vector, values: Vector, k: int, label: str) -> None:
-    axes.semilogx(hz, values, color=COLOURS[k % len(COLOURS)], lw=1.2, label=label)
+    own, width = own_colour(COLOURS[k % len(COLOURS)]), rc("lines.linewidth", 1.2)
+    axes.semilogx(hz, values, color=own, lw=width, label=label)
 
 
 def _degrees(L: NDArray[np.complex128]) -> Vector:
@@ -270,8 +347,18 @@ def _degrees(L: NDArray[np.complex128]) -> Vector:
 def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
     for axes, label in zip(panels, labels, strict=True):
         dress(axes)
-        axes.set_ylabel(label, fontsize=9.5)
-    panels[0].set_title(title, loc="left", fontsize=9.5, color="#222222")
-    panels[-1].set_xlabel("frequency [Hz]", fontsize=9.5)
-    panels[0].legend(fontsize=8, frameon=False, loc="best")
+        axes.set_ylabel(label, fontsize=rc("axes.labelsize", 9.5))
+    size = rc("axes.titlesize", 9.5)
+    panels[0].set_title(title, loc="left", fontsize=size, color="#222222", wrap=True)
+    panels[-1].set_xlabel("frequency [Hz]", fontsize=rc("axes.labelsize", 9.5))
+    if look().paper and not look().ax:  # its labels may be wider than the panels
+        both = [one.get_legend_handles_labels() for one in panels]
+        for one in filter(None, (axes.get_legend() for axes in panels)):
+            one.remove()
+        handles, labels = ([x for pair in part for x in pair] for part in zip(*both, strict=True))
+        figure_of(panels).legend(
+            handles, labels, loc="outside lower left", frameon=False, ncols=2, columnspacing=1.0
+        )
+    else:
+        panels[0].legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     return panels

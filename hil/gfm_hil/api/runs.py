@@ -17,7 +17,8 @@ from gfm_hil.recording.foreign import open_recording
 from gfm_hil.recording.run import Run, converters_of, nominal_frequency
 from gfm_hil.results.between_figure import plot_between
 from gfm_hil.results.figures import draw_comparison, plot, plot_laws, plot_network, plot_waveforms
-from gfm_hil.results.report import write_report, write_together
+from gfm_hil.results.page import fragment
+from gfm_hil.results.report import events_table, write_report, write_together
 from gfm_hil.run import run_folder, runner
 from gfm_hil.run.between import BetweenTicks, between_ticks
 from gfm_hil.run.losses import losses
@@ -71,9 +72,15 @@ def look_between_ticks(
         return between_ticks(run, scenario, start, stop, step)
 
 
+def run_as_html(run: Run) -> str:
+    """The status and the metrics of a run, rounded, for a notebook."""
+    words = repr(run).removeprefix("<Run ").removesuffix(">")
+    return fragment(replace(events_table(run.summary["events"]), title=words))
+
+
 # what a run does by functions of rooms above its own
 Run.plot, Run.plot_waveforms, Run.save = plot, plot_waveforms, save
-Run.between_ticks = look_between_ticks
+Run._repr_html_, Run.between_ticks = run_as_html, look_between_ticks
 BetweenTicks.spectrum, BetweenTicks.losses, BetweenTicks.plot = spectrum, losses, plot_between
 NetworkRun.plot, NetworkRun.save = plot_network, save
 
@@ -136,7 +143,7 @@ def run(
     """
     if folder is not None:
         if isinstance(law, Law):
-            raise UserError(f"law = {law!r}: save it first, as the folder names its file")
+            raise UserError(f"law = {law.name!r}: save it first, as the folder names its file")
         checked = _checked(scenario, {**changes, "law": law})
         command = runner.controller_program(checked, controller, ports, notice)
         report = _explained if figures else None
@@ -261,9 +268,13 @@ class Comparison(dict[str, Run]):
         """Those of the summary of the run that came furthest."""
         return max((one.summary["events"] for one in self.values()), key=len)
 
-    def plot(self) -> list[Axes]:
-        """p, frequency, q and v_dc of all laws in one figure."""
-        return plot_laws(self)
+    def plot(self, *names: str, **look: Any) -> list[Axes]:
+        """Draw signals of all laws, one a panel; p, frequency, q and v_dc without names.
+
+        Args:
+            look: ``signals``, ``ax``, ``xlim``, ``size`` and ``style``, as of ``Run.plot``.
+        """
+        return list(plot_laws(self, *names, **look))
 
     def write(self, folder: Path) -> None:
         """Write comparison.json, and comparison.png and report.html of the runs that recorded

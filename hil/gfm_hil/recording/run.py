@@ -127,6 +127,7 @@ class Run:
         plot_waveforms: ClassVar[Callable[..., list[Axes]]]
         between_ticks: ClassVar[Callable[..., Any]]
         save: ClassVar[Callable[..., Path]]
+        _repr_html_: ClassVar[Callable[..., str]]
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:

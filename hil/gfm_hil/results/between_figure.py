@@ -86,4 +86,4 @@ def plot_between(between: BetweenTicks) -> Sequence[Axes]:
     """Draw legs, currents, v_dc and spectrum with pyplot."""
     from gfm_hil.results.figures import pyplot_figure
 
-    return draw_between(pyplot_figure(SIZE), between)
+    return draw_between(pyplot_figure(SIZE, 4), between)

@@ -14,11 +14,24 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.columns import I_REF, PHASES, PIECE, TABLE, ColumnLike, Columns, pieces, wave
+from gfm_hil.recording.columns import (
+    HERTZ,
+    I_REF,
+    PHASES,
+    PIECE,
+    TABLE,
+    ColumnLike,
+    Columns,
+    pieces,
+    unit_of,
+    wave,
+)
 from gfm_hil.recording.run import Run, bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
 from gfm_hil.results.curves import POINTS, Panel, few_ticks
+from gfm_hil.results.look import COLOURS as COLOURS
+from gfm_hil.results.look import figure_of, look, own_axes, own_colour, rc, with_look
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
@@ -27,8 +40,6 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: the functions tha
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart, and which print well
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 # gaps wide enough to see an identical curve below
 _STYLES = ("-", (0, (5, 4)), (0, (6, 4, 1.5, 4)), (0, (1.5, 4)))
 _POINTS = 4000  # drawn a curve; each pixel column keeps its least and its largest value
@@ -66,12 +77,17 @@ def _thin(t: ColumnLike, x: ColumnLike, factor: float) -> tuple[NDArray[Any], ND
     )
 
 
-def dress(axes: Axes, title: str = "") -> None:
-    """What every panel has: a title at the left, a faint grid, no box."""
-    axes.set_title(title, loc="left", fontsize=9.5, color="#222222")
-    axes.grid(True, color="#e4e4e4", lw=0.6)
+def dress(axes: Axes, title: str = "", label: str = "") -> None:
+    """What every panel has: a title at the left, a faint grid, no box. In a paper the ordinate has
+    a label, if there is one, in place of the title."""
+    if label and look().paper:
+        axes.set_ylabel(label)
+    else:
+        axes.set_title(title, loc="left", fontsize=rc("axes.titlesize", 9.5), color="#222222")
+    axes.grid(True, color=rc("grid.color", "#e4e4e4"), lw=rc("grid.linewidth", 0.6))
     axes.set_axisbelow(True)
-    axes.tick_params(labelsize=8.5, color=GREY)
+    axes.tick_params(axis="x", labelsize=rc("xtick.labelsize", 8.5), color=GREY)
+    axes.tick_params(axis="y", labelsize=rc("ytick.labelsize", 8.5), color=GREY)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -84,17 +100,41 @@ def draw_panel(
     curves: Sequence[tuple[ColumnLike, ColumnLike, str, str]],
     factor: float = 1.0,
     styles: Sequence[Any] = _STYLES,
+    label: str = "",
 ) -> None:
-    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label."""
-    for k, (t, x, colour, label) in enumerate(curves):
-        style = styles[k % len(styles)]
-        axes.plot(*_thin(t, x, factor), color=colour, lw=1.1, ls=style, label=label)
-    dress(axes, title)
+    """One quantity: curves of t [s], values to be multiplied by ``factor``, colour and label;
+    ``label``: of the ordinate, see ``dress``."""
+    width = rc("lines.linewidth", 1.1)
+    for k, (t, x, ours, name) in enumerate(curves):
+        points, style = _thin(*_within(t, x), factor), styles[k % len(styles)]
+        axes.plot(*points, color=own_colour(ours), lw=width, ls=style, label=name)
+    dress(axes, title, label)
     axes.ticklabel_format(useOffset=False)
     low, high = axes.get_ylim()
     least = 1e-3 * max(abs(low), abs(high), 1e-3)  # a flat line is not blown up to noise
     if high - low < least:
         axes.set_ylim((low + high - least) / 2, (low + high + least) / 2)
+
+
+def _within(t: ColumnLike, x: ColumnLike) -> tuple[ColumnLike, ColumnLike]:
+    """What a plot shows of a curve if someone has asked for a part of it, to a point beyond."""
+    if look().xlim is None:
+        return t, x
+    first, last = np.searchsorted(t[:], look().xlim)
+    rows = slice(max(0, first - 1), last + 1)
+    return t[rows], x[rows]
+
+
+def symbol(name: str, unit: str | None = None) -> str:
+    """Symbol and unit of a signal, see ``Signals``, as an axis shows them; ``unit``: another one
+    than that of the recording."""
+    row = TABLE.get(name) or TABLE.get(f"true_{name}")
+    if name == HERTZ or (row and unit == "Hz" and row.unit == "p.u. (omega_n)"):
+        return "$f$ [Hz]"
+    if row is None or not row.symbol:
+        return name
+    text = row.symbol.replace(r"\lvert", "|").replace(r"\rvert", "|")  # unknown to matplotlib
+    return f"${text}$ [{unit_of(name) if unit is None else unit}]"
 
 
 def _draw_columns(
@@ -108,7 +148,8 @@ def _draw_columns(
     name of one of them, colour and label. Returns the factor from what is recorded."""
     shown = TABLE[name].shown(nominal_frequency(scenario))
     drawn = [(columns["t"], columns[n], colour, label) for columns, n, colour, label in curves]
-    draw_panel(axes, f"{title} [{shown.unit}]", drawn, shown.factor)
+    text = symbol(name, shown.unit)
+    draw_panel(axes, f"{title} [{shown.unit}]", drawn, shown.factor, label=text)
     return shown.factor
 
 
@@ -119,6 +160,8 @@ def _mark(
 
     The labels stand in three rows, the lowest of which is ``above`` points above the panel.
     """
+    if (ends := look().xlim) is not None:
+        events = [e for e in events if ends[0] <= e["t"] <= ends[1]]
     if not events:
         return
     from matplotlib.collections import LineCollection
@@ -137,7 +180,8 @@ def _mark(
         late = event["t"] > first + 0.6 * (last - first)  # its label would be cut at the right
         axes[0].annotate(
             event["label"], (event["t"], 1.0), (-3 if late else 3, above + 10 * (k % 3)),
-            xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+            xycoords=("data", "axes fraction"), textcoords="offset points",
+            fontsize=rc("legend.fontsize", 8),
             ha="right" if late else "left",
             color="#444444" if colour == GREY else colour,
         )  # fmt: skip
@@ -182,10 +226,15 @@ def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
 
 def _legend(axes: Axes, columns: int) -> None:
     """A legend above the panel, where it covers no curve; matplotlib warns that it is slow to look
-    for a free place among many points."""
+    for a free place among many points. In a paper it has as many columns as fit."""
+    if look().paper:
+        labels = axes.get_legend_handles_labels()[1]
+        letters = axes.get_figure().get_figwidth() * 72 / (0.55 * 7.0)  # type: ignore[union-attr]
+        columns = min(columns, max(1, int(letters / (max(map(len, labels), default=1) + 6))))
     axes.legend(
-        fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), borderpad=0.2,
-        borderaxespad=0, ncols=columns, handlelength=1.6, columnspacing=1.2, handletextpad=0.5,
+        fontsize=rc("legend.fontsize", 8), frameon=False, loc="lower right", bbox_to_anchor=(1, 1),
+        borderpad=0.2, borderaxespad=0, ncols=columns, handlelength=1.6, columnspacing=1.2,
+        handletextpad=0.5,
     )  # fmt: skip
 
 
@@ -262,16 +311,24 @@ def in_a_page(svg: bytes) -> ElementTree.Element:
 
 
 def headline(figure: Figure, text: str, size: float = 11) -> None:
-    """The title of a whole figure, in as many lines as it needs."""
-    letters = int(figure.get_figwidth() * 72 / (0.58 * size))  # mean width of a letter
+    """The title of a whole figure, in as many lines as it needs; none in a paper, which has
+    captions, and none for axes that are of somebody's figure."""
+    if look().paper or look().ax:
+        return
+    size = rc("figure.titlesize", size)
+    points = size if isinstance(size, float | int) else 12.0
+    letters = int(figure.get_figwidth() * 72 / (0.58 * points))  # mean width of a letter
     figure.suptitle(textwrap.fill(text, letters), fontsize=size, x=0.01, ha="left")
 
 
 def _panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
-    for a in axes[-1]:
-        a.set_xlabel("t [s]", fontsize=9)
-    return list(axes.ravel())
+    axes = own_axes(rows * columns)
+    if not axes:
+        shape = (rows * columns, 1) if look().paper else (rows, columns)
+        axes = list(figure.subplots(*shape, sharex=True, squeeze=False).ravel())
+    for a in axes[-1:] if look().paper or look().ax else axes[-columns:]:
+        a.set_xlabel("t [s]", fontsize=rc("axes.labelsize", 9))
+    return axes
 
 
 def _figure(size: tuple[float, float]) -> Figure:
@@ -584,10 +641,10 @@ def draw_laws(
             if name in columns  # a recording of others need not have it
         ]
         factor = _draw_columns(a, title, name, scenario, curves)
-        for columns, _, colour, _ in curves:
+        for columns, _, ours, _ in curves:
             t, x = columns["t"], columns[name]
             if len(t) < whole:  # this run ended early
-                a.plot(t[len(t) - 1 :], x[len(t) - 1 :] * factor, "x", color=colour)
+                a.plot(t[len(t) - 1 :], x[len(t) - 1 :] * factor, "x", color=own_colour(ours))
     _legend(axes[0], min(4, len(runs)))
     _mark(axes, events)
     headline(figure, scenario.title)
@@ -611,16 +668,24 @@ def draw_comparison(
 # Figures for a notebook, drawn with pyplot.
 
 
-def pyplot_figure(size: tuple[float, float]) -> Figure:
-    """An empty figure of pyplot, of a size in inches."""
+def pyplot_figure(size: tuple[float, float], rows: int) -> Figure:
+    """An empty figure of pyplot, of a size in inches, for so many rows of panels in a paper; or
+    that of the caller's axes."""
     from matplotlib import pyplot
 
-    return pyplot.figure(figsize=size, layout="constrained")
+    if look().ax:
+        return figure_of(look().ax)
+    return pyplot.figure(figsize=look().figure_size(size, rows), layout="constrained")
 
 
-def pyplot_panels(rows: int, size: tuple[float, float]) -> list[Axes]:
-    """Panels below each other over one axis in a figure of pyplot, of a size in inches."""
-    return list(pyplot_figure(size).subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+def pyplot_panels(rows: int, size: tuple[float, float], below: int = 0) -> list[Axes]:
+    """Panels below each other over one axis in a figure of pyplot, of a size in inches; in a paper
+    with room for so many more ``below``."""
+    if axes := own_axes(rows):
+        return axes
+    return list(
+        pyplot_figure(size, rows + below).subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    )
 
 
 def complex_plane(
@@ -638,8 +703,9 @@ def complex_plane(
     """
     (axes,) = pyplot_panels(1, (5.6, 5.6))
     for k, (label, z) in enumerate(loci.items()):
-        colour = COLOURS[k % len(COLOURS)]
-        axes.plot(z.real, z.imag, style, color=colour, ms=2.5, lw=1.1, label=label)
+        own = own_colour(COLOURS[k % len(COLOURS)])
+        width = rc("lines.linewidth", 1.1)
+        axes.plot(z.real, z.imag, style, color=own, ms=2.5, lw=width, label=label)
     centre, radius, name = circle
     z = centre + radius * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
     axes.plot(z.real, z.imag, color=GREY, lw=0.7, ls=(0, (4, 3)), label=name)
@@ -647,24 +713,43 @@ def complex_plane(
     axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
     axes.set(xlabel=f"Re {of}".rstrip(), ylabel=f"Im {of}".rstrip())
     dress(axes, title)
-    axes.legend(fontsize=8, frameon=False, loc="upper right")
+    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="upper right")
     return axes
 
 
-def plot(run: Run, *names: str) -> list[Axes]:
+@with_look
+def plot(run: Run, *names: str, signals: Sequence[str] = ()) -> list[Axes]:
     """Draw signals over time, one a panel; without names the six panels of the report. Raises
     UserError: a signal that was not recorded."""
-    if not names:
-        return draw_signals(pyplot_figure(SIZE), run.scenario, run.columns, run.summary)
-    signals = run.signals
-    curves = [(signals["t"], signals[name], COLOURS[0], name) for name in names]
-    axes = pyplot_panels(len(names), (8.6, 2.2 * len(names)))
-    for a, curve in zip(axes, curves, strict=True):
-        draw_panel(a, curve[-1], [curve])
-    axes[-1].set_xlabel("t [s]")
+    if names or signals:
+        return _draw_named({"": run}, [*names, *signals], run.summary["events"])
+    return draw_signals(pyplot_figure(SIZE, 6), run.scenario, run.columns, run.summary)
+
+
+def _draw_named(
+    runs: Mapping[str, Run], names: Sequence[str], events: Sequence[dict[str, Any]]
+) -> list[Axes]:
+    """Draw signals of some runs, one a panel."""
+    curves = {
+        name: [
+            (run.signals["t"], run.signals[name], COLOURS[k % len(COLOURS)], label or name)
+            for k, (label, run) in enumerate(runs.items())
+        ]
+        for name in names
+    }
+    figure = pyplot_figure((8.6, 2.2 * len(names)), len(names))
+    axes = _panels(figure, len(names), 1)
+    for a, (name, drawn) in zip(axes, curves.items(), strict=True):
+        row = TABLE.get(name)
+        origin = f", {row.origin}" if row is not None and name.startswith(("y_", "m_")) else ""
+        draw_panel(a, symbol(name) + origin, drawn, label=symbol(name))
+    if len(runs) > 1:
+        _legend(axes[0], min(4, len(runs)))
+    _mark(axes, events)
     return axes
 
 
+@with_look
 def plot_waveforms(run: Run, start: float | None = None, stop: float | None = None) -> list[Axes]:
     """Draw the three phases of the voltages and currents, as the report does.
 
@@ -680,7 +765,7 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
     if (start is None) != (stop is None):
         raise UserError(f"start = {start}, stop = {stop}: give both or neither")
     window = None if start is None or stop is None else (start, stop)
-    figure = pyplot_figure(SIZE_WAVES)
+    figure = pyplot_figure(SIZE_WAVES, 3)
     axes = draw_waveforms(figure, run.scenario, run.columns, run.summary, window)
     if not axes:
         pyplot.close(figure)
@@ -689,14 +774,22 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
     return axes
 
 
-def plot_network(run: NetworkRun) -> list[Axes]:
-    """p, frequency, q, v_dc, V and current of all converters in one figure."""
-    return draw_laws(pyplot_figure(SIZE), run.scenario, run.columns, run.events, SHARED)
+@with_look
+def plot_network(run: NetworkRun, *names: str, signals: Sequence[str] = ()) -> list[Axes]:
+    """Draw signals of all converters, one a panel; p, frequency, q, v_dc, V and current without
+    names. Raises UserError: as ``plot``."""
+    if names or signals:
+        return _draw_named(run.runs, [*names, *signals], run.events)
+    return draw_laws(pyplot_figure(SIZE, 6), run.scenario, run.columns, run.events, SHARED)
 
 
-def plot_laws(runs: Mapping[str, Run]) -> list[Axes]:
-    """p, frequency, q and v_dc of several laws in one figure."""
+@with_look
+def plot_laws(runs: Mapping[str, Run], *names: str, signals: Sequence[str] = ()) -> list[Axes]:
+    """Draw signals of several laws, one a panel; p, frequency, q and v_dc without names. Raises
+    UserError: as ``plot``."""
     first = next(iter(runs.values()))
     events = max((one.summary["events"] for one in runs.values()), key=len)
+    if names or signals:
+        return _draw_named(runs, [*names, *signals], events)
     columns = {law: one.columns for law, one in runs.items()}
-    return draw_laws(pyplot_figure(SIZE_LAWS), first.scenario, columns, events, PAPER)
+    return draw_laws(pyplot_figure(SIZE_LAWS, 4), first.scenario, columns, events, PAPER)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gfm_hil.core.files import write_text
-from gfm_hil.results.table import shown
+from gfm_hil.results.table import Table, shown
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -35,6 +35,12 @@ def render(template: str, **values: Any) -> str:
 
     values["style"] = Markup(values.get("style", ""))
     return _environment().get_template(template).render(values)
+
+
+def fragment(table: Table) -> str:
+    """A table as HTML, for a notebook."""
+    text = '{% from "macros.html" import table %}{{ table(t) }}'
+    return _environment().from_string(text).render(t=table)
 
 
 class PlotScript(NamedTuple):

@@ -24,7 +24,7 @@ _CELLS = ("dd", "dq", "qd", "qq")
 
 def admittance(of: FrequencyScan) -> list[Axes]:
     """Gain and phase of the four entries: two rows of panels a row of Y."""
-    figure = pyplot_figure((9.2, 8.6))
+    figure = pyplot_figure((9.2, 8.6), 4)
     panels = figure.subplots(4, 2, sharex=True, height_ratios=[3, 2, 3, 2])
     for k, cell in enumerate(_CELLS):
         row, column = divmod(k, 2)
@@ -66,7 +66,7 @@ def nfp(of: FrequencyScan, figure: Figure | None = None) -> list[Axes]:
     """Gain and phase of the change of p over that of the grid's frequency; in a figure of its own
     if none is given."""
     if figure is None:
-        figure = pyplot_figure((7.6, 5.6))
+        figure = pyplot_figure((7.6, 5.6), 2)
         headline(figure, f"{of.name}: network frequency perturbation", 9.5)
     gain, phase = figure.subplots(2, 1, sharex=True)
     _bode(gain, phase, of.frequency, of.nfp, of.nfp_model)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import gfmhil
 from gfm_design.model.closed_loop import REFERENCES
@@ -63,7 +64,7 @@ def test_a_law_is_changed_run_compared_and_saved(tmp_path):
     path = softer.save(tmp_path / "softer.toml")
     from_file = gfmhil.run("pref_step", law=path, duration=2.5)
     assert np.array_equal(from_file.signals["p"], both["softer"].signals["p"])
-    assert "<table>" in law._repr_html_() and "Law vsg-2" in repr(law)
+    assert "<table>" in law._repr_html_() and "\n  E_u      0     0   0        I  I\n" in repr(law)
     with pytest.raises(gfmhil.LawError, match="unknown to vsg-2; known"):
         law.with_gains(no_such=1.0)
 
@@ -94,6 +95,13 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
         expected = loop.loop_gain(curve.get_label(), 2 * np.pi * hz)
         assert np.allclose(gain, 20 * np.log10(np.abs(expected)))
     hz, phase = plot.bode(loop, "E_u")[1].lines[0].get_data()
+    gain_margin, phase_margin = (axes.lines[1] for axes in plot.bode(loop, "E_u"))
+    (f,), (there,) = phase_margin.get_data()
+    assert abs(loop.loop_gain("E_u", 2 * np.pi * f)) == pytest.approx(1.0, abs=0.02)
+    assert phase_margin.get_label() == f"φ_m {there + 180:.3g}° at {f:.3g} Hz"
+    (f,), (there,) = gain_margin.get_data()
+    L = complex(loop.loop_gain("E_u", 2 * np.pi * f))
+    assert pytest.approx(-(10 ** (there / 20)), abs=0.03 * abs(L)) == L
     turned = phase / 360 - np.angle(loop.loop_gain("E_u", 2 * np.pi * hz)) / (2 * np.pi)
     assert np.allclose(turned, np.round(turned)) and np.abs(np.diff(phase)).max() < 180
     labels = [line.get_label() for line in plot.nyquist(loop).lines]
@@ -139,8 +147,42 @@ def test_tables_of_other_libraries():
 def test_figures():
     run = gfmhil.run("pref_step", duration=2.5)
     assert len(run.plot()) == 6
-    assert [axes.get_title(loc="left") for axes in run.plot("p", "f_hz")] == ["p", "f_hz"]
-    assert len(gfmhil.compare("pref_step", ["mimo-gfm", "vsg-2"], duration=2.5).plot()) == 4
+    titles = [axes.get_title(loc="left") for axes in run.plot("p", "f_hz")]
+    assert titles == ["$p$ [p.u.]", "$f$ [Hz]"]
+    laws = gfmhil.compare("pref_step", ["mimo-gfm", "vsg-2"], duration=2.5)
+    assert len(laws.plot()) == 4
+    drawn = laws.plot("omega_u", "v_dc", "i", style="paper", xlim=(0.9, 1.4))
+    assert [a.get_ylabel() for a in drawn] == [
+        r"$\omega_u$ [p.u.]", "$v_{dc}$ [p.u.]", r"$| i_{dq} |$ [p.u.]"
+    ]  # fmt: skip
+    assert drawn[0].figure.get_figwidth() == 3.5 and drawn[-1].get_xlim() == (0.9, 1.4)
+    line = drawn[1].lines[1]
+    assert (line.get_ydata()[1:] == laws["vsg-2"].signals["v_dc"][9000:14001]).all()
+
+
+def test_a_figure_follows_what_its_caller_has_set(tmp_path):
+    run = gfmhil.run("pref_step", duration=1.2)
+    with pyplot.style.context({"lines.linewidth": 3.0, "axes.prop_cycle": "cycler('color', 'rg')"}):
+        figure, axes = pyplot.subplots(2)
+        assert run.plot("p", "q", ax=axes) == [*axes] and figure.get_suptitle() == ""
+    (line, *_) = axes[0].lines
+    assert line.get_linewidth() == 3.0 and line.get_color() == "r"
+    paths = plot.save(run.plot("p", style="paper", size=(3.0, 2.0)), tmp_path / "p")
+    assert [path.name for path in paths] == ["p.pdf", "p.svg", "p.csv"]
+    assert b"/MediaBox [ 0 0 216 144 ]" in paths[0].read_bytes()
+    head, first, *_ = paths[2].read_text("utf-8").splitlines()
+    assert head == "panel,curve,x,y" and first == f"$p$ [p.u.],p,0,{run.signals['p'][0]:.9g}"
+    for wrong, said in (
+        ({"style": "papr"}, r"style = 'papr': must be one of .*; did you mean 'paper'\?"),
+        ({"xlim": (2, 1)}, r"xlim = \(2, 1\): must be two numbers, from < to"),
+        ({"size": 3.5}, "size = 3.5: must be two numbers"),
+        ({"ax": axes[0]}, "ax: the plot has 6 panels, and ax is 1"),
+        ({"signals": ["pp"]}, "signal = 'pp': was not recorded"),
+    ):
+        with pytest.raises(gfmhil.UserError, match=said):
+            run.plot(**wrong)
+    with pytest.raises(gfmhil.UserError, match="format 'doc': must be one of"):
+        plot.save(axes, tmp_path / "p", "doc")
 
 
 @pytest.mark.parametrize(
