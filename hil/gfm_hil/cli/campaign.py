@@ -9,12 +9,15 @@ from gfm_hil.api.studies import campaign
 from gfm_hil.cli.common import (
     EXIT_INTERRUPTED,
     EXIT_OTHERWISE,
+    add_open,
     add_study_options,
     new_folder,
+    show_page,
     watching,
 )
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.priority import processors
+from gfm_hil.results.report import PAGE
 from gfm_hil.studies.campaign.execute import checks_progress, run_alone
 from gfm_hil.studies.campaign.loading import load_campaign
 from gfm_hil.studies.campaign.tables import print_campaign, print_record
@@ -30,6 +33,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--x", metavar="PATH", help="drawn path of the figure, or a sum a+b")
     command.add_argument("--y", metavar="PATH", help="the same; the first two drawn by default")
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
+    add_open(command)
     add_study_options(command, "campaign.json")
 
 
@@ -55,6 +59,8 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(found.plain(), indent=2))
     else:
         print_campaign(found)
+    if found.folder is not None:
+        show_page(options, found.folder / PAGE)
     if missing := found.summary["missing"]:
         again = f"go on with: gfmhil campaign {options.file} --out {found.folder} --resume"
         why = lost or "interrupted"

@@ -33,6 +33,7 @@ class Panel:
     over: str = "t [s]"  # the abscissa
     log: tuple[bool, bool] = (False, False)  # whether abscissa and ordinate are logarithmic
     bands: Sequence[tuple[float, float]] = field(default=())  # shaded, from when to when, s
+    dots: bool = False  # points without lines; those of a curve ``run`` are values alone
 
 
 def few_ticks(columns: Sequence[ColumnLike], most: int = POINTS) -> NDArray[np.intp]:
@@ -125,6 +126,7 @@ class PackedCurves:
                 "ends": panel.ends,
                 "over": panel.over,
                 "log": panel.log,
+                "dots": panel.dots,
             }
         )
         return len(self.plots) - 1

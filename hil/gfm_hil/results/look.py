@@ -69,7 +69,8 @@ def rc(name: str, ours: Any) -> Any:
     """A value of ``rcParams`` if someone has set it, else ours."""
     from matplotlib import rcParams, rcParamsDefault
 
-    return rcParams[name] if rcParams[name] != rcParamsDefault[name] else ours
+    theirs, defaults = dict[str, Any](rcParams), dict[str, Any](rcParamsDefault)
+    return theirs[name] if theirs[name] != defaults[name] else ours
 
 
 def own_colour(ours: str) -> str:
@@ -115,7 +116,7 @@ def with_look(draw: Callable[..., Any]) -> Callable[..., Any]:
             _pair("size", size, "width and height in inches, above 0", lambda a, b: min(a, b) > 0),
             style == "paper",
         )  # fmt: skip
-        paper = {name: rc(name, value) for name, value in _PAPER.items()} if asked.paper else {}
+        paper: Any = {name: rc(name, value) for name, value in _PAPER.items() if asked.paper}
         token = _LOOK.set(asked)
         try:
             with rc_context(paper):
@@ -224,7 +225,10 @@ def _write_csv(file: Path, axes: Sequence[Axes]) -> None:
             for line in panel.lines:
                 label = str(line.get_label())
                 label = "" if label.startswith("_") else label  # matplotlib's own numbers
-                for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True):
+                if line.get_transform() != panel.transData:  # a line across the panel
+                    continue
+                points: Any = line.get_data()
+                for x, y in zip(*points, strict=True):
                     writer.writerow((name, label, f"{x:.9g}", f"{y:.9g}"))
 
 

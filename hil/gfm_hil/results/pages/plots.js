@@ -29,7 +29,7 @@
   };
 
   const mark = (of) => (u) => {
-    const c = u.ctx, { left, top, width, height } = u.bbox, px = devicePixelRatio;
+    const c = u.ctx, { left, top, width, height } = u.bbox, px = u.px ?? devicePixelRatio;
     const x = (t) => u.valToPos(t, "x", true), y = (v) => u.valToPos(v, "y", true);
     c.save();
     c.beginPath();
@@ -85,6 +85,57 @@
     c.restore();
   };
 
+  // Takes what `mark` draws on a canvas as SVG.
+  const recorder = (out) => ({
+    lineWidth: 1, globalAlpha: 1, path: "", dash: "",
+    save() {}, restore() {}, rect() {}, clip() {},
+    beginPath() { this.path = ""; },
+    moveTo(x, y) { this.path += `M${x} ${y}`; },
+    lineTo(x, y) { this.path += `${this.path && "L"}${this.path ? "" : "M"}${x} ${y}`; },
+    setLineDash(dash) { this.dash = dash.join(" "); },
+    measureText: (text) => ({ width: 5 * text.length }),
+    stroke() {
+      out.push(`<path d="${this.path}" fill="none" stroke="${this.strokeStyle}" stroke-width="${this.lineWidth}" stroke-dasharray="${this.dash}"/>`);
+    },
+    fill() { out.push(`<path d="${this.path}" fill="${this.fillStyle}" opacity="${this.globalAlpha}"/>`); },
+    fillRect(x, y, width, height) {
+      out.push(`<rect x="${x}" y="${y}" width="${width}" height="${height}" fill="${this.fillStyle}"/>`);
+    },
+    fillText(text, x, y) { out.push(`<text x="${x}" y="${y}" fill="${this.fillStyle}">${safe(text)}</text>`); },
+  });
+  const safe = (text) => String(text).replace(/[&<>]/g, (c) => `&#${c.charCodeAt(0)};`);
+
+  // A plot as it is on the screen, as SVG: a printer draws lines and text as sharp as it can.
+  const drawing = (u, of) => {
+    const [left, top, width, height] = ["left", "top", "width", "height"].map((k) => u.bbox[k] / devicePixelRatio);
+    const out = [];
+    const at = (v, scale) => u.valToPos(v, scale) + (scale === "x" ? left : top);
+    u.axes.forEach(({ _splits: splits, _values: values }, axis) => splits.forEach((v, k) => {
+      const p = at(v, axis ? "y" : "x").toFixed(1), text = values[k] === null ? "" : safe(values[k]);
+      out.push(axis ? `<path d="M${left} ${p}h${width}" stroke="#ddd"/><text x="${left - 6}" y="${p}" dy=".35em" text-anchor="end">${text}</text>`
+        : `<path d="M${p} ${top}v${height}" stroke="#ddd"/><text x="${p}" y="${top + height + 14}" text-anchor="middle">${text}</text>`);
+    }));
+    out.push(`<text x="${left + width / 2}" y="${top + height + 28}" text-anchor="middle">${safe(of.over)}</text>`,
+      `<svg x="${left}" y="${top}" width="${width}" height="${height}" viewBox="${left} ${top} ${width} ${height}">`);
+    u.series.forEach(({ label, show, points }, k) => {
+      if (!k || !show || u.series[k].scale === "run") return;
+      const dots = of.dots || points.show === true;
+      let path = "", pen = "M";
+      u.data[k].forEach((y, j) => {
+        if (y === null) return void (pen = "M");
+        path += `${pen}${at(u.data[0][j], "x").toFixed(1)} ${at(y, "y").toFixed(1)}${dots ? "h0" : ""}`;
+        pen = dots ? "M" : "L";
+      });
+      const colour = of.colours[k - 1] ?? COLOURS[of.curves.length === 1 ? 1 : k - 1];
+      out.push(`<path d="${path}" fill="none" stroke="${colour}" stroke-width="${dots ? 4 : 1.2}" stroke-linecap="round"/>`);
+    });
+    mark(of)({
+      ctx: recorder(out), bbox: { left, top, width, height }, px: 1, valToPos: at,
+    });
+    const size = `${u.width} ${u.height}`;
+    return `<svg class="printed" viewBox="0 0 ${size}" font-size="10">${out.join("")}</svg></svg>`;
+  };
+
   const draw = (place) => {
     const of = plots[place.dataset.plot];
     const data = [abscissa(...of.x), ...of.curves.map(([, ...packed]) => curve(...packed))];
@@ -96,7 +147,8 @@
       const pad = Math.max(0.05 * (high - low), least / 2);
       return of.log[1] ? [low / 1.3, high * 1.3] : [low - pad, high + pad];
     };
-    const isMeasured = (label) => of.log[0] && label === "measured";
+    const isMeasured = (label) => of.dots || (of.log[0] && label === "measured");
+    const isNumber = (label) => of.dots && label === "run";
     const axis = (more) => ({ stroke: "#666", grid: { stroke: "#8884", width: 1 }, ...more });
     return new uPlot({
       width: place.clientWidth,
@@ -116,7 +168,8 @@
           label,
           stroke: of.colours[k] ?? COLOURS[of.curves.length === 1 ? 1 : k],
           width: 1.2,
-          points: { show: isMeasured(label), size: 5 },
+          scale: isNumber(label) ? "run" : "y",
+          points: { show: isMeasured(label) && !isNumber(label), size: 5, fill: of.dots ? of.colours[k] : undefined },
           paths: isMeasured(label) ? () => null : undefined,
           value: (u, v) => (v === null ? "–" : Number(v.toPrecision(4)).toString()),
         })),
@@ -176,9 +229,10 @@
 
   addEventListener("beforeprint", () => {
     rest.forEach(show);
-    drawn.forEach((plot) => plot.setSize({ width: 440, height: HEIGHT }));  // two in a row
+    drawn.forEach((plot, place) => {
+      plot.batch(() => {});  // one that was not in view has no ticks yet
+      plot.root.insertAdjacentHTML("afterbegin", drawing(plot, plots[place.dataset.plot]));
+    });
   });
-  addEventListener("afterprint", () => {
-    drawn.forEach((plot, place) => plot.setSize({ width: place.clientWidth, height: HEIGHT }));
-  });
+  addEventListener("afterprint", () => document.querySelectorAll(".printed").forEach((svg) => svg.remove()));
 })();

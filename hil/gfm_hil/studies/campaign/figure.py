@@ -16,7 +16,7 @@ from gfm_hil.studies.campaign.worker import Record
 
 Vector = NDArray[np.float64]
 
-_LOOKS = {  # colour, marker, size: told apart without colour too
+LOOKS = {  # colour, marker, size: told apart without colour too
     "stable": ("#0072B2", "o", 9),
     "oscillating": ("#E69F00", "D", 13),
     "tripped": ("#D55E00", "x", 17),
@@ -55,7 +55,7 @@ def fill_map(
         axes.set_ylabel(y.label if y else "run", fontsize=9.5)
     handles = [
         panels[0, 0].scatter([], [], c=c, marker=m, s=1.8 * s, lw=1.2, label=v.replace("-", " "))
-        for v, (c, m, s) in _LOOKS.items()
+        for v, (c, m, s) in LOOKS.items()
         if v in found
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
@@ -67,8 +67,8 @@ def _panel(
     axes: Axes, campaign: Campaign, law: str, records: Sequence[Record], x: Axis, y: Axis | None
 ) -> set[str]:
     """One law; returns the verdicts that were drawn."""
-    a = _spread(x, records, 1)
-    b = _spread(y, records, 2) if y else np.array([r["run"] for r in records], dtype=float)
+    a = spread(x, records, 1)
+    b = spread(y, records, 2) if y else np.array([r["run"] for r in records], dtype=float)
     verdicts = np.array([verdict(r) for r in records], dtype=object)
     dress(axes)
     axes.grid(False)
@@ -79,7 +79,7 @@ def _panel(
     if len(records) >= _LEAST and y is not None:
         _background(axes, a, b, verdicts == "stable", x.log, y.log)
     for name in VERDICTS:
-        colour, marker, size = _LOOKS[name]
+        colour, marker, size = LOOKS[name]
         here = verdicts == name
         edge, width = (None, 1.2) if marker == "x" else ("white", 0.4)
         axes.scatter(
@@ -94,7 +94,7 @@ def _panel(
     return set(verdicts)
 
 
-def _spread(axis: Axis, records: Sequence[Record], salt: int) -> Vector:
+def spread(axis: Axis, records: Sequence[Record], salt: int) -> Vector:
     """Values of an axis; those of a choice are shifted aside, always alike."""
     values = axis.values(records)
     aside = np.random.Philox(key=salt).random_raw(1 + max((r["run"] for r in records), default=0))

@@ -167,7 +167,7 @@ class CampaignResult:
         return fill_map(pyplot.figure(), self.campaign, self.records, *axes)
 
     def write(self, folder: Path) -> None:
-        """Write campaign.json and map.png into a folder that is there."""
+        """Write campaign.json, map.png and report.html into a folder that is there."""
         if self.records:
             from matplotlib.figure import Figure
 
@@ -176,6 +176,10 @@ class CampaignResult:
             figure = Figure()
             fill_map(figure, self.campaign, self.records, *self.axes)
             figure.savefig(folder / "map.png", dpi=130)
+
+            from gfm_hil.studies.campaign.page import write_report
+
+            write_report(self, folder)
         text = json.dumps(self.plain(), indent=2) + "\n"
         (folder / "campaign.json").write_text(text, "utf-8")
 

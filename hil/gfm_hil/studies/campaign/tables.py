@@ -26,16 +26,17 @@ def print_campaign(found: CampaignResult) -> None:
         + (f"{w} workers" if isinstance(w := found.workers, int) else escape(w)),
         highlight=False,
     )
-    for table in _counts(result["laws"]).fitting(console):
+    for table in counts_table(result["laws"]).fitting(console):
         console.print(table)
     for law, one in result["laws"].items():
-        console.print(_worst(law, one["worst"], [a for a in found.axes if a]))
+        console.print(worst_table(law, one["worst"], [a for a in found.axes if a]))
     if found.folder is not None:
         where = f"folder: {found.folder}, figure: {found.folder / 'map.png'}"
         console.print(escape(where), soft_wrap=True)
 
 
-def _counts(laws: dict[str, Any]) -> Table:
+def counts_table(laws: dict[str, Any]) -> Table:
+    """How many runs of each law had each verdict, and quantiles of the stable ones' metrics."""
     rows: list[list[Any]] = []
     for name in VERDICTS:
         counts = [found["counts"][name] for found in laws.values()]
@@ -63,7 +64,8 @@ def _marks(marks: dict[str, float]) -> str:
     return " / ".join(f"{v:.{digits}f}" for v in values)
 
 
-def _worst(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table:
+def worst_table(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table:
+    """The runs of a law to look at first."""
     rows = []
     for entry in runs:
         what = entry["verdict"]
