@@ -355,9 +355,9 @@ def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
         both = [one.get_legend_handles_labels() for one in panels]
         for one in filter(None, (axes.get_legend() for axes in panels)):
             one.remove()
-        handles, labels = ([x for pair in part for x in pair] for part in zip(*both, strict=True))
+        handles, names = ([x for pair in part for x in pair] for part in zip(*both, strict=True))
         figure_of(panels).legend(
-            handles, labels, loc="outside lower left", frameon=False, ncols=2, columnspacing=1.0
+            handles, names, loc="outside lower left", frameon=False, ncols=2, columnspacing=1.0
         )
     else:
         panels[0].legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")

@@ -118,9 +118,9 @@ def draw_panel(
 
 def _within(t: ColumnLike, x: ColumnLike) -> tuple[ColumnLike, ColumnLike]:
     """What a plot shows of a curve if someone has asked for a part of it, to a point beyond."""
-    if look().xlim is None:
+    if (ends := look().xlim) is None:
         return t, x
-    first, last = np.searchsorted(t[:], look().xlim)
+    first, last = np.searchsorted(t[:], ends)
     rows = slice(max(0, first - 1), last + 1)
     return t[rows], x[rows]
 

@@ -69,7 +69,8 @@ def rc(name: str, ours: Any) -> Any:
     """A value of ``rcParams`` if someone has set it, else ours."""
     from matplotlib import rcParams, rcParamsDefault
 
-    theirs, defaults = dict[str, Any](rcParams), dict[str, Any](rcParamsDefault)
+    both: Any = rcParams, rcParamsDefault  # whose keys are a type of their own
+    theirs, defaults = both
     return theirs[name] if theirs[name] != defaults[name] else ours
 
 

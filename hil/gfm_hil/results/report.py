@@ -97,7 +97,7 @@ class Chapter:
     """What a report tells of one run."""
 
     name: str  # of the converter or the law; empty if the report has no other run
-    summary: Mapping[str, Any]
+    summary: dict[str, Any]
     panels: Sequence[Panel]
     waves: Sequence[Panel]
     timing: Picture | None

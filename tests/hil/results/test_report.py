@@ -60,7 +60,7 @@ def test_a_comparison_has_a_report_which_the_command_names_and_opens(
 ):
     asked = list[str]()
     monkeypatch.setattr("webbrowser.open", lambda url: asked.append(url) or opened)
-    words = ["--laws", "vsg-2,droop-5", "--duration", "0.3", "--out", str(tmp_path / "c"), "--open"]
+    words = ["--laws", "vsg-2,droop-5", "--duration", "1.1", "--out", str(tmp_path / "c"), "--open"]
     main(["compare", "pref_step", *words])
     page = tmp_path / "c" / "report.html"
     said = capsys.readouterr()

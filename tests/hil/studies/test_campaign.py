@@ -30,6 +30,7 @@ from gfm_hil.studies.campaign.worker import Record, run_chunk
 from gfm_hil.studies.workers import WorkerLost, processes, run_tasks
 
 from ...support.files import text_of
+from ...support.page import unpacked
 
 TEXT = text_of("campaign.toml")
 
@@ -138,7 +139,7 @@ def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(whole, tm
     kept = tomllib.loads((tmp_path / "out" / "campaign.toml").read_text(encoding="utf-8"))
     assert kept == content | {"laws": ["mine", "vsg-2"], "runs": 2}
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "campaign.toml", "campaign.json", "runs.jsonl", "map.png",
+        "campaign.toml", "campaign.json", "runs.jsonl", "map.png", "report.html",
     }  # fmt: skip
     with pytest.raises(UserError, match="in use"):
         gfmhil.campaign(content, tmp_path / "out")
@@ -148,7 +149,10 @@ def test_from_python_it_has_the_same_records_in_memory_and_in_a_folder(whole, tm
 
 def test_folder_of_a_campaign(whole):
     names = {path.name for path in (whole / "two").iterdir()}
-    assert names == {"campaign.toml", "campaign.json", "runs.jsonl", "map.png"}
+    assert names == {"campaign.toml", "campaign.json", "runs.jsonl", "map.png", "report.html"}
+    plots = unpacked((whole / "two" / "report.html").read_text("utf-8"))
+    assert len(plots) == 2 and all(plot["dots"] for plot in plots)
+    assert sorted(plots[0]["curves"]["run"].round()) == [*range(10)]
     assert (whole / "two" / "campaign.toml").read_text(encoding="utf-8") == TEXT
     result = json.loads((whole / "two" / "campaign.json").read_text(encoding="utf-8"))
     assert result["done"] == 20
