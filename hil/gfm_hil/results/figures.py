@@ -469,14 +469,18 @@ def panels_of_all(
     """The quantities ``SHARED`` of several runs for a page, a curve a run."""
     t = max((columns["t"] for columns in runs.values()), key=len)
     happened = [(float(e["t"]), str(e["label"])) for e in events]
+    colours = {run: COLOURS[k % len(COLOURS)] for k, run in enumerate(runs)}
     for title, name in SHARED:
         shown = TABLE[name].shown(nominal_frequency(scenario))
-        each = {run: _Padded(columns[name], len(t)) for run, columns in runs.items()}
+        there = {run: columns for run, columns in runs.items() if name in columns}
+        if not there:
+            continue
+        each = {run: _Padded(columns[name], len(t)) for run, columns in there.items()}
         at = few_ticks([*each.values()], most)
         curves = {run: _at(column, at) * shown.factor for run, column in each.items()}
         yield Panel(
             f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
-            happened, colours=[COLOURS[k % len(COLOURS)] for k in range(len(each))],
+            happened, colours=[colours[run] for run in there],
         )  # fmt: skip
 
 

@@ -172,7 +172,9 @@ def write_together(
     known = {name: run for name, run in runs.items() if run.ticks and "true_p" in run.columns}
     most = min(POINTS, _OF_ALL // max(1, len(known)))
     columns = {name: run.columns for name, run in known.items()}
-    chapters = [_chapter(name, run, most) for name, run in known.items()]
+    # a recording that others made has curves, and nothing else to tell
+    ours = {name: run for name, run in known.items() if "machines" in run.summary}
+    chapters = [_chapter(name, run, most) for name, run in ours.items()]
     rows = [
         [Cell(c.name, "head", f"#{c.place}"), controlled_by(c.summary),
          c.summary["status"], c.summary["reason"], c.summary["misses"]]
@@ -186,7 +188,8 @@ def write_together(
     }
     ticks = max((run.ticks for run in known.values()), default=0)
     diagram = diagram or draw_diagram(folder, scenario)
-    source = folder if kind == "converter" else next(iter(runs.values())).folder
+    folders = (run.folder for run in runs.values() if run.folder is not None)
+    source = folder if kind == "converter" else next(folders, None)
     _write_page(folder, scenario, content, diagram, most, ticks, picture, source)
 
 
