@@ -18,6 +18,7 @@ from gfm_hil.api.studies import identify as identify
 from gfm_hil.api.studies import judge_recording as judge_recording
 from gfm_hil.api.studies import scan as scan
 from gfm_hil.core.errors import UserError as UserError
+from gfm_hil.recording.foreign import grid_profile as grid_profile
 from gfm_hil.scenario import Scenario as Scenario
 from gfm_hil.scenario import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult

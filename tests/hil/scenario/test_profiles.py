@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 import gfmhil
 from gfm_hil.api.runs import load_run
@@ -135,3 +136,28 @@ def test_a_finite_grid_takes_a_voltage_only(course, tmp_path):
     (tmp_path / "v.csv").write_text("t,V_g\n0,1.0\n0.02,0.98\n")
     run = gfmhil.run(content(tmp_path / "v.csv", plant=finite))
     assert run.signals["V_g"][-1] == 0.98
+
+
+def test_a_recorded_voltage_is_played_as_the_grid_that_made_it(tmp_path):
+    events = [
+        {"t": 0.1, "type": "grid-phase-jump", "degrees": 10.0},
+        {"t": 0.2, "type": "grid-voltage", "V_g": 0.8},
+        {"t": 0.3, "type": "grid-frequency", "f_hz": 49.0, "rate": 5.0},
+    ]
+    asked = {"title": "played", "duration": 0.6, "plant": {"grid": {"scr": 3.0, "x_over_r": 10.0}}}
+    run = gfmhil.run(asked | {"events": events}, "vsg-2")
+    t, omega_g = run.signals["t"], run.signals["omega_g"]
+    angle = 100 * np.pi * (np.cumsum(omega_g) - omega_g) * 1e-4
+    angle[t >= 0.09999] += np.radians(10.0)
+    turns = angle - 2 * np.pi / 3 * np.arange(3)[:, None]
+    columns = dict(zip(("va", "vb", "vc"), run.signals["V_g"] * np.cos(turns), strict=True))
+    savemat(tmp_path / "site.mat", {"t": t, **columns})
+    (tmp_path / "map.toml").write_text(
+        'S_n = 4e3\nV_n = 380.0\nv.phases = ["va", "vb", "vc"]\ni.phases = ["va", "vb", "vc"]\n'
+    )
+    file = gfmhil.grid_profile(tmp_path / "site.mat", tmp_path / "map.toml", tmp_path / "grid.csv")
+    played = [{"t": 0.0, "type": "grid-profile", "file": str(file)}]
+    again = gfmhil.run(asked | {"events": played}, "vsg-2")
+    for name in ("p", "q"):
+        off = np.abs(again.signals[name] - run.signals[name]).max()
+        assert off < 1e-3 and np.ptp(run.signals[name]) > 0.3, (name, off)

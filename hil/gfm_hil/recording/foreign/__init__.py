@@ -3,5 +3,6 @@ channels are, and what the sampling cannot show is told."""
 
 from gfm_hil.recording.foreign.files import FILES
 from gfm_hil.recording.foreign.opened import ABOUT, open_recording
+from gfm_hil.recording.foreign.played import grid_profile
 
-__all__ = ["ABOUT", "FILES", "open_recording"]
+__all__ = ["ABOUT", "FILES", "grid_profile", "open_recording"]

@@ -1,7 +1,8 @@
 """A course of the grid's frequency and voltage over time, from a CSV file.
 
-A file has the columns t [s] and f_hz [Hz] or omega_g [p.u.], V_g [p.u.], or both; lines that begin
-with # are for people. Between its lines a course is straight.
+A file has the column t [s], and f_hz [Hz] or omega_g [p.u.], V_g [p.u.], degrees, or several of
+them; lines that begin with # are for people. Between its lines a course is straight, and at a line
+the grid's angle jumps ahead by its degrees.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from gfm_runtime.errors import printable
 from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import SIGNALS
 
-_COLUMNS = ("t", "f_hz", "omega_g", "V_g")
+_COLUMNS = ("t", "f_hz", "omega_g", "V_g", "degrees")
 _RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
 _MOST = 100_000  # lines
 LARGEST_FILE = 64 << 20
@@ -32,7 +33,8 @@ LARGEST_FILE = 64 << 20
 
 class GridProfile(PlantEvent):
     """The grid's frequency and voltage follow a CSV file: t [s after the event], and f_hz [Hz] or
-    omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay."""
+    omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay. By
+    what a column degrees says, the grid's angle jumps ahead at each line."""
 
     type: Literal["grid-profile"] = Field(description="kind of event")
     file: str = Field(
@@ -68,10 +70,13 @@ class ProfilePoint(NamedTuple):
     omega_g: float | None
     V_g: float | None
     ticks: int  # how long that takes; 0: a step
+    degrees: float = 0.0  # by which the angle jumps ahead before
 
     def apply(self, plant: gfm_plant.Network) -> None:
         """Carry it out on the plant's records, between two ticks. Raises ValueError: the grid is
         finite and has its own frequency."""
+        if self.degrees:
+            gfm_plant.phase_jump(plant, self.degrees)
         if self.omega_g is not None:
             gfm_plant.grid_frequency(
                 plant, self.omega_g, self._rate(self.omega_g, plant, "omega_g")
@@ -93,20 +98,24 @@ class Profile:
     # omega_g, V_g: p.u., as many as of t; None without such a column
     omega_g: list[float] | None
     V_g: list[float] | None
+    degrees: list[float] | None = None
 
     def points(self, T_s: float) -> Iterator[tuple[int, ProfilePoint]]:
         """What the plant does, each with its tick after the event. Lines that fall on the same
         tick count as the last of them."""
         last = {round(t / T_s): k for k, t in enumerate(self.t)}
 
-        def to(k: int, ticks: int) -> ProfilePoint:
+        def to(k: int, ticks: int, jump: int | None) -> ProfilePoint:
             omega_g, V_g = (x[k] if x is not None else None for x in (self.omega_g, self.V_g))
-            return ProfilePoint(omega_g, V_g, ticks)
+            degrees = self.degrees[jump] if self.degrees is not None and jump is not None else 0.0
+            return ProfilePoint(omega_g, V_g, ticks, degrees)
 
-        first = next(iter(last))
-        yield first, to(last[first], 0)
-        for now, then in pairwise(last):
-            yield now, to(last[then], then - now)
+        ticks = [*last]
+        yield ticks[0], to(last[ticks[0]], 0, last[ticks[0]])
+        for now, then in pairwise(ticks):
+            yield now, to(last[then], then - now, last[now] if now != ticks[0] else None)
+        if self.degrees is not None and len(ticks) > 1:
+            yield ticks[-1], to(last[ticks[-1]], 0, last[ticks[-1]])
 
 
 def read_profile(file: str, f_n: float | None) -> Profile:
@@ -145,7 +154,7 @@ def read_profile(file: str, f_n: float | None) -> Profile:
     omega_g = columns.get("omega_g")
     if "f_hz" in columns and f_n is not None:
         omega_g = [f / f_n for f in columns["f_hz"]]
-    return Profile(t, omega_g, columns.get("V_g"))
+    return Profile(t, omega_g, columns.get("V_g"), columns.get("degrees"))
 
 
 def _lines(text: Any, file: str) -> Iterator[tuple[int, list[str]]]:
@@ -163,7 +172,7 @@ def _head(names: list[str], file: str) -> list[str]:
     if not ok or {*names} - {*_COLUMNS} or {"f_hz", "omega_g"} <= {*names}:
         raise UserError(
             printable(f"{file}: columns {','.join(names)}: must be t, then f_hz (Hz) or omega_g "
-                      "(p.u.), V_g (p.u.), or both")
+                      "(p.u.), V_g (p.u.), degrees, or several")
         )  # fmt: skip
     return names
 
@@ -173,7 +182,7 @@ def _value(name: str, cell: str, f_n: float | None, where: str) -> float:
         value = float(cell)
     except ValueError:
         raise UserError(printable(f"{where}: {name} = {cell!r:.80}: must be a number")) from None
-    low, high = _RANGE.get(name, (0.0, 86400.0))
+    low, high = (-360.0, 360.0) if name == "degrees" else _RANGE.get(name, (0.0, 86400.0))
     if name == "f_hz":
         low, high = (limit * f_n for limit in _RANGE["omega_g"]) if f_n else (0.0, math.inf)
     if not (math.isfinite(value) and low <= value <= high):
