@@ -189,7 +189,7 @@ def test_run_leaves_a_report_that_needs_nothing_else(call):
     call("run", scenario(**STEP, description="<b>bold</b>"), "--out", "run")
     report = Path("run/report.html").read_text()
     assert Path("run/signals.png").stat().st_size > 30_000
-    assert report.count('class="plot"') == 6
+    assert report.count('class="plot"') == 6 + 3  # signals, and the three of the waveforms
     assert "&lt;b&gt;bold&lt;/b&gt;" in report
     elsewhere = r"""(src|href)\s*=\s*["'](?!data:|#)|@import|\bfetch\(|url\((?!#)"""
     assert not re.search(elsewhere, report)
