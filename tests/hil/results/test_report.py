@@ -115,7 +115,7 @@ def test_the_diagram_is_the_entrance_to_the_curves(network, width, dark):
         page.driver.get(network.as_uri())
         page.click(".diagram a[href='#of-droop']")
         place = "return document.getElementById('of-droop').getBoundingClientRect().top"
-        wait_for(lambda: abs(page.js(place)) < 100)
+        wait_for(lambda: abs(page.js(place)) < 200)  # below the list of contents
         page.js("location.hash = '#only=dvoc,matching'")
         off = (
             "return [...document.querySelectorAll('#all ~ .panels .plot')][0]"
