@@ -182,7 +182,7 @@
   const touch = (u) => {
     for (const [from, to] of [["touchstart", "mousedown"], ["touchmove", "mousemove"], ["touchend", "mouseup"]]) {
       u.over.addEventListener(from, ({ changedTouches: [{ clientX, clientY }] }) => {
-        const at = { clientX, clientY, bubbles: true, detail: 1 };
+        const at = { clientX, clientY, bubbles: true, detail: 1, movementX: 1 };  // uPlot wants it to have moved
         if (to === "mousedown") u.over.dispatchEvent(new MouseEvent("mousemove", at));
         u.over.dispatchEvent(new MouseEvent(to, at));
       }, { passive: true });
