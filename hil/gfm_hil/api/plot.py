@@ -52,8 +52,8 @@ _LEAST = 0.005  # a part below this in every mode is left out
 @with_look
 def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     """Draw gain [dB] and phase [degrees] of L over Hz, see ``ClosedLoop.loop_gain``, with the
-    least margins of each loop: of the phase where |L| crosses 0 dB, of the gain where the phase
-    crosses an odd multiple of 180 degrees.
+    least margins of each loop: of the phase where the gain crosses 0 dB, of the gain where the
+    phase crosses an odd multiple of 180 degrees.
 
     Args:
         at: channels of u or y at which one loop is cut; each command that acts if none is given.

@@ -83,20 +83,15 @@ def own_colour(ours: str) -> str:
     return str(theirs[COLOURS.index(ours) % len(theirs)])
 
 
-_OPTIONS = {
-    "ax": "Axes | Sequence[Axes] | None", "xlim": "tuple[float, float] | None",
-    "size": "tuple[float, float] | None", "style": "str",
-}  # fmt: skip
+_OPTIONS = """\
+Every plot also takes ``ax``: axes to draw in, as many as there are panels; ``xlim``: from where to
+where the abscissa goes, in its unit; ``size``: width and height of a new figure, inches; and
+``style``: ``screen``, or ``paper``, 3.5 inches wide, panels below each other, symbols at the axes.
+``UserError``: one of them is none of these."""
 
 
 def with_look(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a plot the options of every plot:
-
-    ax: axes to draw in, as many as there are panels; a new figure if None.
-    xlim: from where to where the abscissa goes, in its unit.
-    size: width and height of a new figure, inches.
-    style: ``screen``, or ``paper``: 3.5 inches wide, panels below each other, symbols at the axes.
-    """
+    """Give a plot the options of every plot, and the words on them to its docstring."""
 
     @functools.wraps(draw)
     def drawn(
@@ -129,16 +124,7 @@ def with_look(draw: Callable[..., Any]) -> Callable[..., Any]:
                 axes.set_xlim(asked.xlim)
         return found
 
-    known = inspect.signature(draw)
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    options = [
-        inspect.Parameter(
-            name, keyword, annotation=type_, default=STYLES[0] if name == "style" else None
-        )
-        for name, type_ in _OPTIONS.items()
-    ]
-    given = [*known.parameters.values(), *options]
-    drawn.__signature__ = known.replace(parameters=given)  # type: ignore[attr-defined]
+    drawn.__doc__ = f"{inspect.cleandoc(draw.__doc__ or '')}\n\n{_OPTIONS}"
     return drawn
 
 
