@@ -221,6 +221,11 @@ def test_paper_gets_all_figures_two_in_a_row(report, browser):
     browser.driver.get((report / "report.html").as_uri())
     wait_for(lambda: browser.js("return document.querySelectorAll('.plot canvas').length") > 0)
     browser.js("dispatchEvent(new Event('beforeprint'))")
-    width = "return [...document.querySelectorAll('.plot .u-wrap')].map((x) => x.style.width)"
-    wait_for(lambda: browser.js(width) == ["440px"] * 4)
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    boxes = browser.js(
+        "return [...document.querySelectorAll('svg.printed')].map((x) => {"
+        "const box = x.getBoundingClientRect(); return [box.left, box.top, box.width] })"
+    )
+    assert len(boxes) == 4 and min(width for *_, width in boxes) > 200
+    assert len({left for left, *_ in boxes}) == len({top for _, top, _ in boxes}) == 2
     assert browser.complaints() == []
