@@ -25,10 +25,10 @@ from gfm_plant.sparse import (
     end_states,
     enter_sparse,
     find_nodes,
-    found_voltage,
     middle_state,
     series_half,
     turned,
+    voltage_at,
 )
 from gfm_runtime.compiled import compiled, inlined
 
@@ -246,7 +246,7 @@ def node_voltage(n: Any, now: Any, place: int, tick: float) -> complex:
             if field(n, "unbalanced")[c]:
                 now.upright = mirror_at(n, -0.5 * tick)
             find_nodes(n, now)
-        found: complex = found_voltage(n, now, place)
+        found: complex = voltage_at(n, now, place)
         return found
     v = _by(n, now, c, place, 0)
     if field(n, "unbalanced")[c]:

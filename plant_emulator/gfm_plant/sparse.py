@@ -782,7 +782,7 @@ def find_nodes(n: Any, now: Any) -> None:
 
 
 @compiled
-def found_voltage(n: Any, now: Any, place: int) -> complex:
+def voltage_at(n: Any, now: Any, place: int) -> complex:
     """Return that of a node, see ``node_column`` in `gfm_plant.layout`, after ``find_nodes``."""
     columns, axes = field(now, "columns"), _axes(n, now)
     parts = complex(0.0, 0.0)

@@ -40,7 +40,7 @@ class Channel(StrictSchema):
     )
 
 
-class Phases(StrictSchema):
+class PhaseChannels(StrictSchema):
     """Instantaneous values of three phases, to neutral, or a phasor of the positive sequence."""
 
     phases: tuple[str, str, str] | None = Field(
@@ -53,7 +53,7 @@ class Phases(StrictSchema):
     scale: float = Field(1.0, description="as of a channel")
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Phases:
+    def _one_of_both(self) -> PhaseChannels:
         if (self.phases is None) == (self.magnitude is None) or (
             (self.magnitude is None) != (self.angle is None)
         ):
@@ -79,8 +79,8 @@ class RecordingMap(StrictSchema):
         None, description="when the event is, by the recording's clock; found if not given"
     )
     meter: Meter = Field(Meter(), description="filter of the recorded values; none by default")
-    v: Phases | None = Field(None, description="voltages at the connection point")
-    i: Phases | None = Field(None, description="currents into the grid")
+    v: PhaseChannels | None = Field(None, description="voltages at the connection point")
+    i: PhaseChannels | None = Field(None, description="currents into the grid")
     channels: dict[str, Channel | str] = Field(
         {}, description=f"by signal, {', '.join(MEASURES)}, its channel"
     )
