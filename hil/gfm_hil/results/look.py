@@ -1,7 +1,7 @@
 """How a figure for a person is drawn: on a screen or for a paper, in axes of their own, saved.
 
-Sizes and colours are ours where matplotlib's ``rcParams`` have their defaults; one that is set, by a
-style sheet or by hand, counts.
+Sizes and colours are ours where matplotlib's ``rcParams`` have their defaults; one that is set,
+by a style sheet or by hand, counts.
 """
 
 from __future__ import annotations
