@@ -632,8 +632,8 @@ def _sum(
 def _slopes_of_others(
     n: Any, c: int, first: int, rows: int, x: Any, d: float, y: Any, at: int
 ) -> None:
-    """As ``_sum``, for rows of which the first ones are short: for each length a loop without a
-    branch."""
+    """Write d times some rows of sums to y from ``at`` on. Rows of two, three and four entries
+    come first, and each length has a loop without a branch."""
     begin, column, value = field(n, "sum_begin"), field(n, "sum_column"), field(n, "sum_value")
     few, col, val = field(n, "n_sums"), column[c], value[c]
     e = begin[c, first]
