@@ -18,6 +18,7 @@ from sunspec2.modbus.modbus import ModbusClientException
 
 from gfm_hil.cli import main
 from gfm_hil.ports.commands import Operator
+from gfm_hil.ports.modbus.grid_forming import NUMBER
 from gfm_hil.ports.modbus.image import VENDOR
 
 from ...support.modbus import MODELS, SCENARIO, SUNS, at, end, start
@@ -93,7 +94,8 @@ def settled(run: Path) -> list[dict]:
 
 
 def test_scan_and_read_all_models(device, run):
-    assert [m.model_id for m in device.model_list] == [1, 701, 702, 704, 705, 711, 714, 715, VENDOR]
+    there = [m.model_id for m in device.model_list]
+    assert there == [1, 701, 702, 704, 705, 711, 714, 715, NUMBER, VENDOR]
     for model in device.model_list:
         model.read()
         assert not model.error_info
@@ -114,6 +116,9 @@ def test_p_and_q(device, run):
     wait_for(lambda: (last(run)["ref_P_ref"], last(run)["ref_Q_ref"]) == (0.75, 0.1))
     wait_for(lambda: abs(read(device, 701, "W") - 3000) < 100)
     assert read(device, VENDOR, "PRef") == 0.75
+    assert read(device, NUMBER, "WSet") == 3000
+    write(device, NUMBER, WSet=2400)  # the draft's set-point acts at once
+    wait_for(lambda: last(run)["ref_P_ref"] == 0.6)
     write(device, 704, WSetEna=0)
     wait_for(lambda: (last(run)["ref_P_ref"], last(run)["ref_Q_ref"]) == (0.5, 0.1))
 
@@ -363,9 +368,10 @@ def test_wrong_options(run, options, words):
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_the_vendor_model_is_a_file_for_clients(capsys):
-    assert main(["modbus", "--vendor-model"]) == 0
-    assert json.loads(capsys.readouterr().out)["id"] == VENDOR
+@pytest.mark.parametrize(("number", "option"), [(VENDOR, []), (NUMBER, [str(NUMBER)])])
+def test_the_models_that_sunspec_lacks_are_files_for_clients(number, option, capsys):
+    assert main(["modbus", "--vendor-model", *option]) == 0
+    assert json.loads(capsys.readouterr().out)["id"] == number
 
 
 def test_stop_ends_the_run_and_the_server_with_it(tmp_path):

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import math
 
 import pytest
 from hypothesis import given, settings
@@ -9,15 +10,15 @@ from hypothesis import strategies as st
 from pymodbus.constants import ExcCodes
 
 from gfm_hil.ports.modbus.device import TICK_S
-from gfm_hil.ports.modbus.image import BASE, VENDOR, Image
-from gfm_hil.ports.modbus.measures import Measures
+from gfm_hil.ports.modbus.grid_forming import NUMBER
+from gfm_hil.ports.modbus.image import BASE, VENDOR
 from gfm_runtime.states import SAFE
 
-from ...support.modbus_device import LAWS, S_N, Bench
+from ...support.modbus_device import S_N, Bench
 
 
 def test_every_point_reads_back_what_was_put_into_it():
-    image = Image(Measures(Bench().scenario).models(LAWS))
+    image = Bench().device.image
     for point in image.points.values():
         if point.name in ("ID", "L") or point.type in ("sunssf", "pad"):
             continue
@@ -34,7 +35,8 @@ def test_what_clients_may_write_the_standard_lets_them_write():
     device = Bench().device
     ours = [p for p in device.image.points.values() if device.writable(p)]
     assert all(p.standard_access == "RW" for p in ours)
-    assert {p.path.partition(".")[0] for p in ours} == {"704", "705", "711", "715", str(VENDOR)}
+    written = {int(p.path.partition(".")[0]) for p in ours}
+    assert written == {704, 705, 711, 715, VENDOR, NUMBER}
 
 
 @pytest.mark.parametrize("before", [None, 1000.0, 3600.0])
@@ -163,6 +165,31 @@ def test_a_droop_control_is_D_p():
     assert bench.read("711.AdptCtlRslt") == 1
 
 
+def test_the_draft_for_grid_forming_commands_in_watts_volts_and_hertz():
+    bench = Bench()
+    bench.row |= {"true_delta": math.pi / 6, "u_E_u": 1.0, "ref_omega_g": 1.0}
+    for name, value in (("WSet", 3000), ("VarSet", -400), ("VRef", 224.0), ("HzRef", 50.1)):
+        assert bench.write((f"{NUMBER}.{name}", value)) is None
+    assert bench.write((f"{NUMBER}.DroopP", 0.02), (f"{NUMBER}.DroopQ", 0.08)) is None
+    told = {name: x for event in bench.told for name, x in event.items() if name != "type"}
+    gains = {name: pytest.approx(x) for name, x in told.pop("values").items()}
+    assert told == pytest.approx(
+        {"P_ref": 0.75, "Q_ref": -0.1, "V_ref": 224 * math.sqrt(3) / 380, "omega_g": 1.002}
+    )
+    assert gains == {"D_p": 0.02, "D_q": 0.08}
+    seen = {name: bench.read(f"{NUMBER}.{name}") for name in ("WSet", "PRef", "HzRef", "DroopQ")}
+    assert seen == pytest.approx({"WSet": 3000, "PRef": 3000, "HzRef": 50.1, "DroopQ": 0.08})
+    # vsg-2: phi_22 = D_p/(s/5.9801 + 1)
+    seen = {name: bench.read(f"{NUMBER}.{name}") for name in ("InertiaH", "ThetaInv", "EInv")}
+    expected = {"InertiaH": 1 / (2 * 0.02 * 5.9801), "ThetaInv": 30.0, "EInv": 380 / math.sqrt(3)}
+    assert seen == pytest.approx(expected, rel=1e-4)
+    assert bench.read(f"{NUMBER}.GridSt") == 7 and bench.read(f"{NUMBER}.BSEna") is None
+    bench.law, bench.gains = "mimo-gfm", {}  # where v_dc acts on omega_u too
+    assert bench.read(f"{NUMBER}.InertiaH") is None
+    bench.row["state"] = float(SAFE)
+    assert bench.read(f"{NUMBER}.GridSt") == 8
+
+
 @pytest.mark.parametrize(
     ("request_", "code"),
     [
@@ -177,6 +204,9 @@ def test_a_droop_control_is_D_p():
         ([(f"{VENDOR}.Dp", -0.01)], ExcCodes.ILLEGAL_VALUE),
         ([(f"{VENDOR}.Dp", float("inf"))], ExcCodes.ILLEGAL_VALUE),
         ([(f"{VENDOR}.HbTms", 5)], ExcCodes.ILLEGAL_VALUE),
+        ([(f"{NUMBER}.WSet", 1e5)], ExcCodes.ILLEGAL_VALUE),
+        ([(f"{NUMBER}.DroopP", -0.01)], ExcCodes.ILLEGAL_VALUE),
+        ([(f"{NUMBER}.InertiaH", 2.0)], ExcCodes.ILLEGAL_ADDRESS),
         ([("705.AdptCrvReq", 3)], ExcCodes.ILLEGAL_VALUE),
         ([("715.OpCtl", 2)], ExcCodes.ILLEGAL_VALUE),
         ([("715.AlarmReset", 7)], ExcCodes.ILLEGAL_VALUE),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from gfm_hil.ports.modbus.grid_forming import NUMBER
 from gfm_hil.ports.modbus.image import BASE, VENDOR
 from gfm_hil.ports.modbus.port import Server
 
@@ -22,7 +23,7 @@ def test_the_image_is_a_sunspec_map():
     while registers[at] != 0xFFFF:
         found.append(registers[at])
         at += 2 + registers[at + 1]
-    assert found == [1, 701, 702, 704, 705, 711, 714, 715, VENDOR]
+    assert found == [1, 701, 702, 704, 705, 711, 714, 715, NUMBER, VENDOR]
     assert at + 2 == len(registers)
 
 

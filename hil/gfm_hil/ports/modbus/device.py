@@ -16,9 +16,11 @@ from pymodbus.constants import ExcCodes
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
+from gfm_hil.ports.modbus.grid_forming import GridForming
 from gfm_hil.ports.modbus.image import VENDOR, Image, SunSpecPoint, Value
 from gfm_hil.ports.modbus.measures import Measures, RunState, Slack
 from gfm_hil.ports.modbus.points import (
+    ActiveLaw,
     Direct,
     Droop,
     Effect,
@@ -37,6 +39,10 @@ from gfm_plant import load_converter
 Command = Callable[[dict[str, Any]], object]
 
 READ, WRITE_ONE, WRITE_MANY = 3, 6, 16  # function codes
+
+_AT_ONCE = {
+    f"{VENDOR}.VRef": ("V_ref", 1.0), f"{VENDOR}.Dp": ("D_p", 1.0), f"{VENDOR}.Dq": ("D_q", 1.0),
+}  # fmt: skip
 
 TICK_S = 0.01
 """Of the device's clock: timers and heartbeats expire on its ticks."""
@@ -88,10 +94,13 @@ class Device:
         self._heart = Heartbeat(heartbeat_ms)
         self._groups: tuple[PointGroup, ...] = (
             *self._set_points, VoltVar(gains), Droop(gains), self._heart, Operation(),
-            Direct(laws, gains),
+            ActiveLaw(laws), Direct(gains, _AT_ONCE), GridForming(gains, scenario),
         )  # fmt: skip
         self._owner = {path: group for group in self._groups for path in group.writable}
-        self.image = Image(self._measures.models(laws))
+        models = dict(self._measures.models(laws))
+        for group in self._groups:
+            models |= group.layout
+        self.image = Image(dict(sorted(models.items())))
         self._show(self._measures.plate(laws))
         self._lock = asyncio.Lock()
         self._was_safe = False

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any
 
 import sunspec2.device as sunspec
@@ -152,18 +153,18 @@ class Image:
 
 
 def definition(number: int) -> dict[str, Any]:
-    """A model's definition, from pysunspec2 or, for the vendor model, from this package."""
-    if number != VENDOR:
+    """A model's definition, from this package if it has one, else from pysunspec2."""
+    if number not in own_models():
         return dict(sunspec.get_model_def(number))
-    found: dict[str, Any] = json.loads(vendor_model())
+    found: dict[str, Any] = json.loads(own_models()[number].read_text(encoding="utf-8"))
     sunspec.add_mappings(found["group"])
     return found
 
 
-def vendor_model() -> str:
-    """The text of the vendor model's file, for clients."""
-    name = f"model_{VENDOR}.json"
-    return files("gfm_hil.ports.modbus").joinpath("models", name).read_text(encoding="utf-8")
+def own_models() -> dict[int, Traversable]:
+    """The files of the models that pysunspec2 does not ship, by number, for clients."""
+    found = files("gfm_hil.ports.modbus").joinpath("models").iterdir()
+    return {int(f.name[len("model_") : -len(".json")]): f for f in found}
 
 
 def _walk(group: Any, path: str) -> Iterator[tuple[str, Any]]:

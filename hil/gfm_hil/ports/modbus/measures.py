@@ -125,10 +125,10 @@ class Measures:
     def models(self, laws: Sequence[str]) -> dict[int, Mapping[str, Any]]:
         """Every model of the device with the points that determine its layout, for ``Image``."""
         b = self._bases
-        power = _exponent(b.S_n * _top("p"), 16, signed=True)
-        volt = _exponent(b.V_n * _top("V"), 16)
-        amp = _exponent(b.base_of("I") * _top("p"), 16, signed=True)
-        set_point = _exponent(b.S_n * _top("P_ref"), 32, signed=True)
+        power = exponent(b.S_n * top("p"), 16, signed=True)
+        volt = exponent(b.V_n * top("V"), 16)
+        amp = exponent(b.base_of("I") * top("p"), 16, signed=True)
+        set_point = exponent(b.S_n * top("P_ref"), 32, signed=True)
         points: list[dict[str, Any]] = [{}, {}]
         return {
             1: {"ID": 1},
@@ -152,9 +152,9 @@ class Measures:
                 "ID": 711, "NCtl": 2, "Db_SF": -3, "K_SF": -5, "RspTms_SF": -3, "Ctl": [{}, {}],
             },
             714: {
-                "ID": 714, "NPrt": 1, "DCV_SF": _exponent(b.V_dcref * _top("v_dc"), 16),
-                "DCA_SF": _exponent(b.base_of("i_dc") * _top("i_u"), 16, signed=True),
-                "DCW_SF": _exponent(b.S_n * _top("i_u") * _top("v_dc"), 16, signed=True),
+                "ID": 714, "NPrt": 1, "DCV_SF": exponent(b.V_dcref * top("v_dc"), 16),
+                "DCA_SF": exponent(b.base_of("i_dc") * top("i_u"), 16, signed=True),
+                "DCW_SF": exponent(b.S_n * top("i_u") * top("v_dc"), 16, signed=True),
                 "Prt": [{}],
             },
             715: {"ID": 715},
@@ -245,15 +245,15 @@ class Measures:
         }
 
 
-def _top(name: str) -> float:
+def top(name: str) -> float:
     """The largest magnitude that the signal table allows, p.u."""
     return max(max(abs(s.low), abs(s.high)) for s in SIGNALS if s.name == name)
 
 
-def _exponent(top: float, bits: int, signed: bool = False) -> int:
-    """The finest scale factor with which ``top`` still fits."""
+def exponent(largest: float, bits: int, signed: bool = False) -> int:
+    """The finest scale factor with which ``largest`` still fits."""
     whole = 2 ** (bits - signed) - 2
-    return math.ceil(math.log10(top / whole))
+    return math.ceil(math.log10(largest / whole))
 
 
 def _alarms(trip: int, any_reason: bool) -> int:

@@ -16,8 +16,8 @@ In the steady state of a law with droops (p.u.; Table III)
 
     omega_u - omega_g = D_p (P_ref - p),        V - V_ref = D_q (Q_ref - q).
 
-A law has D_p if its file names it and phi_22(0) equals it; it has D_q if its file names it and
-phi_34(0)/phi_35(0), or its limit, equals it.
+A law has D_p if its file names it and phi_22(0) equals it, and H if nothing but p acts on its
+omega_u too; it has D_q if its file names it and phi_34(0)/phi_35(0), or its limit, equals it.
 """
 
 from __future__ import annotations
@@ -39,16 +39,19 @@ from gfm_runtime.states import RUNNING
 Event = dict[str, Any]
 Written = Mapping[str, Value]  # by path
 
+_DROOPS = ("D_p", "D_q")
 _NEARLY_DC = 1e-7j  # rad/s; integrators have no value at 0
+_SLOW = 1e-3j  # rad/s; far below every time constant of inertia
 _RTOL = 1e-3  # printed gains are rounded
 
 
 @dataclass(frozen=True)
 class Droops:
-    """D_p and D_q of a law in p.u.; None for one that it does not have."""
+    """D_p and D_q of a law in p.u. and its H in s; None for one that it does not have."""
 
     D_p: float | None
     D_q: float | None
+    H: float | None
 
 
 def droops(file: LawFile, changed: Mapping[str, float]) -> Droops:
@@ -60,9 +63,11 @@ def droops(file: LawFile, changed: Mapping[str, float]) -> Droops:
         value = law.parameters[name].value if name in law.parameters else None
         return None if value is None or abs(seen - value) > _RTOL * abs(value) else value
 
-    return Droops(
-        own("D_p", law.element("phi", (1, 1))(_NEARLY_DC)), own("D_q", _reactive_droop(law))
-    )
+    swing, D_p = law.element("phi", (1, 1)), own("D_p", law.element("phi", (1, 1))(_NEARLY_DC))
+    # 1/phi_22 = 1/D_p + 2 H s + ...; what else acts on omega_u would change it
+    alone = D_p is not None and {c for c in (*law.phi, *law.psi) if c[0] == 1} == {(1, 1)}
+    H = max(0.0, (1.0 / swing(_SLOW)).imag / (2 * _SLOW.imag)) if alone else None
+    return Droops(D_p, own("D_q", _reactive_droop(law)), H)
 
 
 def _reactive_droop(law: BuiltLaw) -> complex:
@@ -114,6 +119,7 @@ class PointGroup(ABC):
     """A group of points that clients write together and that have a common meaning."""
 
     writable: tuple[str, ...]  # paths of the points that clients may write
+    layout: Mapping[int, Mapping[str, Any]] = {}  # its own models, as of ``Measures.models``
 
     @abstractmethod
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
@@ -531,37 +537,51 @@ class Operation(PointGroup):
 
 
 class Direct(PointGroup):
-    """The vendor model's points that act at once: law, voltage reference and droops."""
+    """Points that act at once: references and droops.
 
-    writable = tuple(f"{VENDOR}.{name}" for name in ("Law", "VRef", "Dp", "Dq"))
+    Args:
+        points: by path, the name of the reference or droop, and its 1 p.u. in the point's unit.
+    """
 
-    def __init__(self, laws: Sequence[str], gains: LawDroops) -> None:
-        self._laws, self._gains = laws, gains
+    def __init__(self, gains: LawDroops, points: Mapping[str, tuple[str, float]]) -> None:
+        self._gains, self._points, self.writable = gains, points, tuple(points)
 
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
-        given = {
-            path.partition(".")[2]: float(value)
-            for path, value in written.items()
-            if isinstance(value, (int, float))
-        }
         events: list[Event] = []
-        if "Law" in given:
-            if not 1 <= given["Law"] <= len(self._laws):
-                raise ValueError(f"Law = {given['Law']:g}: must lie in [1, {len(self._laws)}]")
-            events.append({"type": "law", "law": self._laws[int(given["Law"]) - 1]})
-        if "VRef" in given:
-            check_reference("V_ref", given["VRef"])
-            events.append(_reference("V_ref", given["VRef"]))
-        wanted = {name: given[key] for key, name in (("Dp", "D_p"), ("Dq", "D_q")) if key in given}
+        wanted: dict[str, float] = {}
+        for path in written:
+            name, unit = self._points[path]
+            value = _number(written, path) / unit
+            if name in _DROOPS:
+                wanted[name] = value
+            else:
+                check_reference(name, value)
+                events.append(_reference(name, value))
         if wanted:
             events.append(self._gains.event(run.law, run.gains, wanted))
         return Effect(tuple(events))
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
-        droops = self._gains.droops(run.law, run.gains)
-        return {
-            f"{VENDOR}.Law": float(self._laws.index(run.law) + 1),
-            f"{VENDOR}.VRef": run.references["V_ref"],
-            f"{VENDOR}.Dp": droops.D_p,
-            f"{VENDOR}.Dq": droops.D_q,
-        }
+        there = run.references | vars(self._gains.droops(run.law, run.gains))
+        found: dict[str, Value] = {}
+        for path, (name, unit) in self._points.items():
+            found[path] = None if there[name] is None else there[name] * unit
+        return found
+
+
+class ActiveLaw(PointGroup):
+    """The law, as its number in the vendor model's list."""
+
+    writable = (f"{VENDOR}.Law",)
+
+    def __init__(self, laws: Sequence[str]) -> None:
+        self._laws = laws
+
+    def plan(self, written: Written, run: RunState, now: float) -> Effect:
+        number = _number(written, f"{VENDOR}.Law")
+        if not 1 <= number <= len(self._laws):
+            raise ValueError(f"Law = {number:g}: must lie in [1, {len(self._laws)}]")
+        return Effect(({"type": "law", "law": self._laws[int(number) - 1]},))
+
+    def show(self, run: RunState, now: float) -> dict[str, Value]:
+        return {f"{VENDOR}.Law": float(self._laws.index(run.law) + 1)}

@@ -28,7 +28,7 @@ from gfm_hil.core.rate import Rate
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.listener import Listener
 from gfm_hil.ports.modbus.device import CLIENT, READ, TICK_S, WRITE_MANY, WRITE_ONE, Client, Device
-from gfm_hil.ports.modbus.image import BASE, vendor_model
+from gfm_hil.ports.modbus.image import BASE, VENDOR, own_models
 from gfm_hil.ports.modbus.measures import Watcher
 from gfm_hil.ports.port import BesideRun, OperatorPort, make_tls, say
 from gfm_hil.scenario import load_scenario
@@ -81,12 +81,14 @@ class ModbusPort(OperatorPort):
             help="say whether clients may command, to the server of this run, and end",
         )  # fmt: skip
         command.add_argument(
-            "--vendor-model", action="store_true", help="print the vendor model's file, and end"
-        )
+            "--vendor-model", type=int, nargs="?", const=VENDOR, choices=sorted(own_models()),
+            metavar="NUMBER", help="print the file of a model that SunSpec's own lack (%(const)s), "
+            "and end",
+        )  # fmt: skip
 
     def instead(self, options: argparse.Namespace) -> bool:
-        if options.vendor_model:
-            print(vendor_model(), end="")
+        if options.vendor_model is not None:
+            print(own_models()[options.vendor_model].read_text(encoding="utf-8"), end="")
             return True
         if options.folder is None:
             raise UserError("RUN: missing; the run folder")
