@@ -11,7 +11,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -73,6 +73,54 @@ Factors = Annotated[
     list[ElementSpec],
     BeforeValidator(_listed, json_schema_input_type=list[ElementSpec] | ElementSpec),
     Field(min_length=1, max_length=8),
+]
+
+
+class SeveralCells(TomlTable):
+    """A state space over several cells, e.g. those of ``12x45``: rows 1 and 2, columns 4 and 5."""
+
+    type: Literal["SS"] = Field(description="type of element")
+    A: Annotated[list[Vector], Field(max_length=12)] = Field(description="n rows of n, 1/s")
+    B: list[Vector] = Field(description="n rows, a number a column")
+    C: list[Vector] = Field(description="a row of n numbers a row of cells")
+    D: list[Vector] = Field(description="a row a row of cells, a number a column")
+
+    def cells(self, key: str) -> dict[str, Any]:
+        """The SS of each cell. Raises ValueError: rows and columns that are none, other shapes."""
+        found = re.fullmatch("([123]+)x([12345]+)", key)
+        if found is None or any(len({*part}) < len(part) for part in found.groups()):
+            raise ValueError(f"{key}: must be rows x columns, each once, e.g. 12x45")
+        rows, columns = found.groups()
+        n, shape = len(self.A), (len(rows), len(columns))
+        for name, height, width in (("B", n, shape[1]), ("C", shape[0], n), ("D", *shape)):
+            if [len(row) for row in getattr(self, name)] != [width] * height:
+                raise ValueError(f"{key}.{name}: must be {height} x {width}, as A is {n} x {n}")
+        return {
+            i + j: {"type": "SS", "A": self.A, "B": [row[b] for row in self.B],
+                    "C": self.C[a], "D": self.D[a][b]}
+            for a, i in enumerate(rows) for b, j in enumerate(columns)
+        }  # fmt: skip
+
+
+def _by_cells(value: Any) -> Any:
+    """The tables phi and psi, with a state space over several cells as one a cell."""
+    if not isinstance(value, dict):
+        return value
+    single = {key: spec for key, spec in value.items() if not re.fullmatch(r"\d+x\d+", key)}
+    for key in value.keys() - single:
+        try:
+            cells = SeveralCells.model_validate(value[key]).cells(key)
+        except ValidationError as problem:
+            raise ValueError(f"{key}: {'; '.join(lines(problem, SeveralCells))}") from None
+        if twice := single.keys() & cells:
+            raise ValueError(f"{key}: has cell {min(twice)}, which stands beside it")
+        single |= cells
+    return single
+
+
+Cells = Annotated[
+    dict[str, Factors],
+    BeforeValidator(_by_cells, json_schema_input_type=dict[str, Factors | SeveralCells]),
 ]
 
 
@@ -212,10 +260,10 @@ class LawFile(TomlTable):
     parameters: dict[Name, Named] = Field(
         default_factory=dict, description="named numbers for the expressions"
     )
-    phi: dict[str, Factors] = Field(
-        description="elements by cell, ij = row and column of the matrix"
+    phi: Cells = Field(
+        description="elements by cell, ij = row and column of the matrix; 12x45: an SS of several"
     )
-    psi: dict[str, Factors] = Field(
+    psi: Cells = Field(
         default_factory=dict,
         description="the terms in braces of Table II, by cell: on the feedback only",
     )

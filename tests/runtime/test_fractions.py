@@ -103,6 +103,36 @@ def test_relative_degree_is_that_of_the_state_space():
     assert made(0.0) == pytest.approx(7 * 13 / (3 * 11 * 17), rel=1e-12)
 
 
+def test_a_state_space_over_several_cells_is_scipys_and_shares_its_states():
+    A, B = np.array([[0.0, 1], [-400, -30]]), np.array([[0.0, 1], [1, 0]])
+    C, D = np.array([[400.0, 0], [1, 2]]), np.array([[0.0, 0.1], [0, 0]])
+    parts = ", ".join(f"{k} = {v.tolist()}" for k, v in zip("ABCD", (A, B, C, D), strict=True))
+    law = build_law(parse_law(f'{HEAD}23x24 = {{ type = "SS", {parts} }}\n'))
+    for i, j in np.ndindex(2, 2):
+        theirs = [C[i] @ np.linalg.solve(1j * w * np.eye(2) - A, B[:, j]) + D[i, j] for w in W]
+        made = law.phi[1 + i, (1, 3)[j]]
+        np.testing.assert_allclose([made(1j * w) for w in W], theirs, rtol=1e-9)
+    assert realise(law).order == 1 + 2 + 2 + 1  # that of PI, two in each row, that of I
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("24x4 = 3", "phi: 24x4: must be an object with type, A, B, C, D, not 3"),
+        ("24x4 = {S, B = [[1]], C = [[1], [1]], D = [[0], [0]] }", "phi: 24x4: must be rows x "
+         "columns, each once, e.g. 12x45"),
+        ("12x4 = {S, B = [[1]], C = [[1]], D = [[0], [0]] }", "phi: 12x4.C: must be 2 x 1, as A "
+         "is 1 x 1"),
+        ("3x45 = {S, B = [[1, 1]], C = [[1]], D = [[0, 0]] }", "phi: 3x45: has cell 35, which "
+         "stands beside it"),
+    ],
+)  # fmt: skip
+def test_what_is_no_state_space_over_several_cells_has_one_line(line, message):
+    with pytest.raises(LawError) as problem:
+        parse_law(HEAD + line.replace("{S", '{ type = "SS", A = [[-1]]'))
+    assert str(problem.value) == f"law file: {message}"
+
+
 @pytest.mark.parametrize(
     ("cell", "message"),
     [
