@@ -251,7 +251,8 @@ def merge(first: str | Path, second: str | Path, folder: str | Path) -> Run:
 
 
 class Comparison(dict[str, Run]):
-    """Runs of one scenario by the name of their law."""
+    """Runs of one scenario by the name of their law; of a network by converter and law, as
+    ``A: vsg-2``."""
 
     @property
     def metrics(self) -> dict[str, dict[str, dict[str, Any]]]:
@@ -264,9 +265,22 @@ class Comparison(dict[str, Run]):
         return {law: one.summary for law, one in self.items()}
 
     @property
+    def converters(self) -> dict[str, Comparison]:
+        """The runs of each converter of a network by law; all under "" without a network."""
+        found: dict[str, Comparison] = {}
+        for name, one in self.items():
+            of = one.scenario.converter or ""
+            found.setdefault(of, Comparison())[name.removeprefix(f"{of}: ")] = one
+        return found
+
+    @property
     def events(self) -> list[dict[str, Any]]:
-        """Those of the summary of the run that came furthest."""
-        return max((one.summary["events"] for one in self.values()), key=len)
+        """Those of the summary of the run that came furthest, of each converter of a network."""
+        found: dict[tuple[float, str], dict[str, Any]] = {}
+        for runs in self.converters.values():
+            for event in max((one.summary["events"] for one in runs.values()), key=len):
+                found.setdefault((event["t"], event["label"]), event)
+        return [found[key] for key in sorted(found, key=lambda at: at[0])]
 
     def plot(self, *names: str, **look: Any) -> list[Axes]:
         """Draw signals of all laws, one a panel; p, frequency, q and v_dc without names.
@@ -279,11 +293,12 @@ class Comparison(dict[str, Run]):
     def write(self, folder: Path) -> None:
         """Write comparison.json, and comparison.png and report.html of the runs that recorded
         anything."""
-        first = next(iter(self.values()))
+        first = next(iter(self.values())).scenario
         signals = {law: one.columns for law, one in self.items() if "true_p" in one.columns}
         if signals:
-            draw_comparison(folder / "comparison.png", first.scenario, signals, self.events)
-            write_together(folder, first.scenario, self, self.events, "law", "comparison.png")
+            kind = "law" if first.network is None else "run"
+            draw_comparison(folder / "comparison.png", first, signals, self.events)
+            write_together(folder, first, self, self.events, kind, "comparison.png")
         write_text(folder / "comparison.json", json.dumps(self.summaries, indent=2) + "\n")
 
     def __repr__(self) -> str:
@@ -296,6 +311,7 @@ def compare(
     laws: Sequence[str | Path | Law],
     folder: str | Path | None = None,
     *,
+    converter: str | None = None,
     recording: str | Path | None = None,
     map: str | Path | None = None,
     watch: Watch = SILENT,
@@ -304,11 +320,13 @@ def compare(
     """Run a scenario under several laws.
 
     Args:
-        scenario, changes: as for ``run``.
+        scenario, changes: as for ``run``; or with a network, of which every converter is compared.
         laws: names, law files or ``Law``.
         folder: where to write a run folder for each law, report.html, comparison.png and
             comparison.json; the link and the mode are then those of the scenario. None keeps the
             runs in memory.
+        converter: of a network: the one that gets each law; all of them by default, if none has
+            its own.
         recording, map: a recording of the same that others made, which is laid beside the runs
             under the name of its file, and the file that says what its channels are.
         watch: of the runs with a folder.
@@ -324,14 +342,42 @@ def compare(
         if recording is None or map is None:
             raise UserError("recording, map: give both or none")
         done = _checked(scenario, changes, in_process=True)
+        if done.network is not None:
+            raise UserError("recording: is of one converter, the scenario has a network")
         beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}
     with law_files(laws) as files:
-        if folder is None:
-            names = [*files]
-            each = zip(names, laws, strict=True)
-            return Comparison(beside | {name: run(scenario, law, **changes) for name, law in each})
-        scenarios = {n: load_scenario(scenario, law=file, **changes) for n, file in files.items()}
-        return _compare_in(Path(folder), scenarios, beside, watch)
+        scenarios = {
+            name: load_scenario(
+                scenario, {"converter": "converter"}, folder is None, converter, law=file, **changes
+            )
+            for name, file in files.items()
+        }
+        if folder is not None:
+            return _compare_in(Path(folder), scenarios, beside, watch)
+        made = {}
+        for (name, one), law in zip(scenarios.items(), laws, strict=True):
+            runs = _of_converters(
+                runner.run_network_in_memory(one) if one.parts else runner.run_in_memory(one)
+            )
+            if isinstance(law, Law):
+                runs |= {n: _named(r, law) for n, r in runs.items() if converter in (None, n)}
+            made[name] = runs
+    return _comparison(made, beside)
+
+
+def _of_converters(made: Run | NetworkRun) -> dict[str, Run]:
+    """The runs by converter, "" without a network."""
+    return made.runs.copy() if isinstance(made, NetworkRun) else {"": made}
+
+
+def _comparison(made: Mapping[str, Mapping[str, Run]], beside: Mapping[str, Run]) -> Comparison:
+    """The runs by law and converter, as ``_of_converters`` has them, converter by converter;
+    ``beside`` come first."""
+    found = Comparison(beside)
+    for converter in dict.fromkeys(name for runs in made.values() for name in runs):
+        for law, runs in made.items():
+            found[f"{converter}: {law}" if converter else law] = runs[converter]
+    return found
 
 
 def _with_metrics(recorded: Run) -> Run:
@@ -354,20 +400,21 @@ def _compare_in(
     """Run scenarios of different laws, each in a folder; an interruption ends all. ``beside`` are
     those that are run already."""
     first = next(iter(scenarios.values()))
-    run_folder.check_free(
-        folder, first.ticks * len(scenarios), first.carries, first.optional_signals
-    )
-    runs: dict[str, Run] = {}
+    rows = first.ticks * len(scenarios) * max(1, len(first.parts))
+    run_folder.check_free(folder, rows, first.carries, first.optional_signals)
+    made: dict[str, dict[str, Run]] = {}
     for name, one in scenarios.items():
 
         def tell(ticks: int, misses: int, name: str = name, one: Scenario = one) -> None:
             late = f", {misses} misses" if misses else ""
             said = f"{name}: {ticks * one.T_s:.2f} s simulated{late}"
-            watch.progress(len(runs) * one.ticks + ticks, len(scenarios) * one.ticks, said)
+            watch.progress(len(made) * one.ticks + ticks, len(scenarios) * one.ticks, said)
 
-        runs[name] = runner.run_scenario(one, folder / name, tell, watch.notice, _explained)
-        if runs[name].status == "interrupted":
+        start = runner.run_network if one.parts else runner.run_scenario
+        whole = start(one, folder / name, tell, watch.notice, _explained)
+        made[name] = _of_converters(whole)
+        if whole.status == "interrupted":
             break
-    made = Comparison({**beside, **runs})
-    made.write(folder)
-    return made
+    found = _comparison(made, beside)
+    found.write(folder)
+    return found

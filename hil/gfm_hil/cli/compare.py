@@ -10,7 +10,6 @@ from gfm_hil.api.runs import compare
 from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
-from gfm_hil.engine.setup import ONE_CONVERTER
 from gfm_hil.results.report import PAGE, event_rows
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.scenario import find_scenario
@@ -23,6 +22,10 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     common.add_scenario_options(command)
     command.add_argument("--laws", help="names separated by commas; the scenario's by default")
+    command.add_argument(
+        "--converter", metavar="NAME",
+        help="of a network: the one that gets each law; by default all, if none has its own",
+    )  # fmt: skip
     command.add_argument(
         "--recording", metavar="FILE",
         help="lay a recording of the same beside the runs: CSV, COMTRADE, Parquet, MF4 or MAT",
@@ -37,27 +40,29 @@ def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
     asked = options.link or options.endpoint or options.option or options.mode == "realtime"
     base = common.resolve(options, in_process=not asked)
-    if base.network is not None:
-        raise UserError(f"{options.scenario}: {ONE_CONVERTER}")
     laws = common.split_laws(options.laws) if options.laws else base.compare
     if not laws:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
     folder = common.new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
     with common.watching("compare", options.quiet) as watch:
         found = compare(
-            base, laws, folder, recording=options.recording, map=options.map, watch=watch
-        )
+            base, laws, folder, converter=options.converter, recording=options.recording,
+            map=options.map, watch=watch,
+        )  # fmt: skip
     if options.json:
         print(json.dumps(found.summaries, indent=2))
     else:
-        _print(found.summaries, found.events)
+        for converter, of in found.converters.items():
+            _print(of.summaries, of.events, converter)
         for why in filter(None, (s.get("unstable_mode") for s in found.summaries.values())):
             terminal().print(escape(why), highlight=False, soft_wrap=True)
     common.show_page(options, folder / PAGE)
     return max(common.exit_code(run) for run in found.values())
 
 
-def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -> None:
+def _print(
+    summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]], converter: str
+) -> None:
     rows: list[list[Any]] = [["status", *(s["status"] for s in summaries.values())]]
     for k, event in enumerate(events):
         rows.append([Cell(f"{event['label']} @ {event['t']:g} s", "head")])
@@ -66,5 +71,5 @@ def _print(summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]]) -
             if key not in ("label", "t"):
                 rows.append(["  " + title, *(e.get(key) for e in same)])
     console = terminal()
-    for table in Table(["", *summaries], rows).fitting(console):
+    for table in Table([converter, *summaries], rows).fitting(console):
         console.print(table)

@@ -39,14 +39,16 @@ class _Bar:
     rows: list[int] = field(default_factory=list)
 
 
-def draw_diagram(folder: Path, scenario: Scenario, report: str | None = None) -> str:
+def draw_diagram(
+    folder: Path, scenario: Scenario, report: str | None = None, leads_to: str = OF
+) -> str:
     """Draw the diagram into network.svg of a run folder; returns it as an element of a page.
 
     Args:
-        report: as for ``fill_diagram``; the links of the element are within its own page.
+        report, leads_to: as for ``fill_diagram``; the links of the element are within its own page.
     """
     figure = Figure()
-    fill_diagram(figure, scenario, report)
+    fill_diagram(figure, scenario, report, leads_to)
     drawn = as_svg(figure)
     with replacing(folder / "network.svg") as part:
         part.write_bytes(drawn)
@@ -58,12 +60,16 @@ def draw_diagram(folder: Path, scenario: Scenario, report: str | None = None) ->
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def fill_diagram(figure: Figure, scenario: Scenario, report: str | None = None) -> Axes:
+def fill_diagram(
+    figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
+) -> Axes:
     """Fill a figure, whose size it sets, with the diagram; events that make faults are marked.
 
     Args:
         report: address of the page on whose curves converters and lines are links, a line on those
             of the converters at its ends; None for no links.
+        leads_to: what the link of a converter has before its name: its chapter, or ``ONLY`` its
+            curves among those of all.
     """
     plants, laws, nodes = _converters(scenario)
     bars, lines = _bars(scenario, nodes)
@@ -86,7 +92,7 @@ def fill_diagram(figure: Figure, scenario: Scenario, report: str | None = None) 
             behind = not converter and plants[converter].lcl is not None
             spots[converter] = -_ROW * row, _LINE + 1.1 if behind else _TERMINAL, x
             if report is not None:
-                _area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{OF}{converter}")
+                _area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{leads_to}{converter}")
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
             _hang(axes, x, -_ROW * row, symbol, text, closed)
         ys = [-_ROW * row for row in bar.rows]

@@ -163,10 +163,11 @@ def write_together(
         scenario: of the network, or of the first run.
         runs: by name; those that recorded the plant are shown.
         events: that all figures of all runs mark.
-        kind: what the names are of, ``converter`` or ``law``.
+        kind: what the names are of, ``converter``, ``law``, or ``run`` of a network's converter
+            under a law.
         diagram: of the network; drawn if there is none.
     """
-    from gfm_hil.results.diagram import draw_diagram
+    from gfm_hil.results.diagram import ONLY, draw_diagram
     from gfm_hil.results.figures import panels_of_all
 
     known = {name: run for name, run in runs.items() if run.ticks and "true_p" in run.columns}
@@ -187,7 +188,8 @@ def write_together(
         "shared": [*panels_of_all(scenario, columns, events, most)] if columns else [],
     }
     ticks = max((run.ticks for run in known.values()), default=0)
-    diagram = diagram or draw_diagram(folder, scenario)
+    if not diagram:
+        diagram = draw_diagram(folder, scenario, PAGE if kind == "run" else None, ONLY)
     folders = (run.folder for run in runs.values() if run.folder is not None)
     source = folder if kind == "converter" else next(folders, None)
     _write_page(folder, scenario, content, diagram, most, ticks, picture, source)

@@ -18,7 +18,9 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.recording.log import read_log
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import run_network
-from gfm_hil.scenario import find_scenario, load_scenario, scenario_toml
+from gfm_hil.scenario import find_scenario, load_scenario, scenario_toml, toml_text
+
+from ...support.page import unpacked
 
 pytestmark = pytest.mark.full  # compiles the loop of several converters
 
@@ -303,6 +305,29 @@ def test_a_law_for_all_reaches_those_that_name_none():
     with pytest.raises(UserError, match="does not replace the own inner of A"):
         given["network"]["converters"]["A"]["inner"] = "none"
         load_scenario(given, inner="virtual-stator")
+
+
+def test_laws_are_compared_in_a_network_converter_by_converter(tmp_path, capsys):
+    (tmp_path / "two.toml").write_text(toml_text(content(duration=0.4)))
+    words = ["compare", str(tmp_path / "two.toml"), "--laws", "droop-3,vsg-2", "--converter", "A"]
+    assert main([*words, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    out = capsys.readouterr().out
+    assert [line.split() for line in out.splitlines() if "vsg-2" in line] == [
+        ["A", "droop-3", "vsg-2"], ["B", "droop-3", "vsg-2"]
+    ]  # fmt: skip
+    both = gfmhil.compare(content(duration=0.4), ["droop-3", gfmhil.Law.load("vsg-2")],
+                          converter="A")  # fmt: skip
+    assert [*both] == ["A: droop-3", "A: vsg-2", "B: droop-3", "B: vsg-2"]
+    assert [*both.converters["B"]] == ["droop-3", "vsg-2"]
+    assert [run.scenario.law for run in both.values()] == ["droop-3", "vsg-2", *["droop-3"] * 2]
+    kept = gfmhil.load_run(tmp_path / "out" / "vsg-2" / "B")
+    assert np.array_equal(kept.signals["p"], both["B: vsg-2"].signals["p"])
+    found = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert [*found] == [*both]
+    plots = unpacked((tmp_path / "out" / "report.html").read_text("utf-8"))
+    assert [*plots[0]["curves"]] == [*both] and len(plots) == 6 + 4 * 9
+    with pytest.raises(UserError, match="recording: is of one converter"):
+        gfmhil.compare(content(), ["vsg-2"], recording="x.csv", map="x.toml")
 
 
 def test_what_takes_one_converter_says_so():

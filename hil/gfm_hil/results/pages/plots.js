@@ -203,14 +203,14 @@
   }, { rootMargin: "600px" });
   rest.forEach((place) => seen.observe(place));
 
-  // #only=A,B shows the curves of some runs of all, #only= those of all of them.
+  // #only=A,B shows the curves of some runs of all, or those that begin with "A: "; #only= all.
   let only = [];
   const ofAll = [...document.querySelectorAll("#all ~ .panels")].slice(0, 1).flatMap((row) => [...row.querySelectorAll(".plot")]);
   const choose = (place) => {
     const plot = drawn.get(place);
     if (!plot || !ofAll.includes(place)) return;
     plot.series.forEach(({ label }, k) => {
-      const wanted = !only.length || only.includes(label);
+      const wanted = !only.length || only.some((name) => label === name || label.startsWith(`${name}: `));
       if (k && plot.series[k].show !== wanted) plot.setSeries(k, { show: wanted });
     });
   };
