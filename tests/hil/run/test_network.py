@@ -330,14 +330,45 @@ def test_laws_are_compared_in_a_network_converter_by_converter(tmp_path, capsys)
         gfmhil.compare(content(), ["vsg-2"], recording="x.csv", map="x.toml")
 
 
+def test_a_campaign_in_a_network_tests_one_of_its_converters(tmp_path):
+    """A trips where it may carry little; B, under the laws, has the load then."""
+    given = content(duration=0.6)
+    limits = {"over_current": {"threshold": 0.45, "delay_s": 0.0}}
+    given["network"]["converters"]["A"] |= {"law": "droop-5", "plant": {"protection": limits}}
+    (tmp_path / "two.toml").write_text(toml_text(given))
+    path = "network.converters.A.plant.protection.over_current.threshold"
+    campaign = {
+        "title": "c", "scenario": str(tmp_path / "two.toml"), "laws": ["droop-3", "vsg-2"],
+        "converter": "B", "runs": 2, "seed": 1,
+        "draw": [{"path": path, "type": "choice", "values": [0.45, 3.0]}],
+    }  # fmt: skip
+    found = gfmhil.campaign(campaign, runs=4)
+    for record in found.records:
+        given["network"]["converters"]["A"]["plant"]["protection"]["over_current"] |= {
+            "threshold": record["drawn"][path]
+        }
+        given["network"]["converters"]["B"]["law"] = record["law"]
+        run = gfmhil.run_network(given)
+        assert run["B"].scenario.law == record["law"] and run["A"].scenario.law == "droop-5"
+        trips = record["drawn"][path] < 1.0
+        assert (record["status"] == "tripped") is trips is (run["A"].status == "tripped")
+        assert record["reason"].startswith("A: over-current") is trips
+        assert (record["end_s"] is not None) is trips
+        if trips:
+            assert 0.2 < record["end_s"] < 0.3
+        p_peak = run["B"].summary["events"][0]["p_peak"]
+        assert record["events"][0]["p_peak"] == pytest.approx(p_peak, rel=1e-9)
+    assert len({r["drawn"][path] for r in found.records}) == 2
+    for wrong, says in (("C", r"must be one of \['A', 'B'\]"), (None, "must be one of")):
+        with pytest.raises(UserError, match=f"converter = {wrong!r}: {says}"):
+            gfmhil.campaign({k: v for k, v in (campaign | {"converter": wrong}).items() if v})
+    with pytest.raises(UserError, match=r"'network\.converters\.B\.law' is the campaign's own"):
+        gfmhil.campaign(campaign | {"set": {"network.converters.B.law": "vsg-2"}})
+
+
 def test_what_takes_one_converter_says_so():
     with pytest.raises(UserError, match="network: this takes one converter"):
         gfmhil.run(content())
-    with pytest.raises(UserError, match="'three_share_a_load': has a network; this takes one"):
-        gfmhil.campaign({
-            "title": "c", "scenario": "three_share_a_load", "laws": ["vsg-2"], "runs": 2, "seed": 1,
-            "draw": [{"path": "references.P_ref", "type": "uniform", "low": 0.2, "high": 0.4}],
-        })  # fmt: skip
     with pytest.raises(UserError, match="network: the scenario has none"):
         gfmhil.run_network("pref_step")
     with pytest.raises(KeyError, match="'C': must be one of A, B"):

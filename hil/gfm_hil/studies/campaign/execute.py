@@ -12,16 +12,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.results.report import write_report
-from gfm_hil.run.runner import run_scenario
+from gfm_hil.run.runner import run_network, run_scenario
 from gfm_hil.studies.campaign.loading import Tell, load_campaign
 from gfm_hil.studies.campaign.result import CampaignResult, find_axes, verdict
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.worker import Job, Record, compile_once, record, run_chunk
+from gfm_hil.studies.campaign.worker import (
+    Job,
+    Record,
+    compile_once,
+    no_steady_state,
+    of_network,
+    record,
+    run_chunk,
+)
 from gfm_hil.studies.workers import SILENT, Watch, WorkerLost, check_workers, pool_of, run_tasks
 
 CHUNK = 8  # runs a task: a quarter of a second, so that little is lost and little is waited for
@@ -224,12 +230,15 @@ def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:
     scenario = scenario.model_copy(update={"title": f"{campaign.file.title}: run {run}"})
     check_empty(folder)
     try:
-        whole = run_scenario(scenario, folder, report=write_report)
-        summary, p = whole.summary, whole.signals["true_p"]
+        if scenario.parts:
+            network = run_network(scenario, folder, report=write_report)
+            summary, ticks = of_network(network, campaign.file.converter)
+        else:
+            whole = run_scenario(scenario, folder, report=write_report)
+            summary, ticks = whole.summary, len(whole.signals["true_p"])
     except UserError as problem:
-        summary = {"status": "no-steady-state", "reason": str(problem), "events": []}
-        p = np.empty(0)
-    kept = record(run, law, scenario, drawn, summary, p)
+        summary, ticks = no_steady_state(problem), 0
+    kept = record(run, law, scenario, drawn, summary, ticks)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "record.json").write_text(json.dumps(kept, indent=2) + "\n", "utf-8")
     return kept

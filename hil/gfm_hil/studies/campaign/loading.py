@@ -11,9 +11,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from gfm_hil.core.errors import UserError, lines
-from gfm_hil.scenario import check_scenario, find_file, load_scenario, toml_text
+from gfm_hil.scenario import check_scenario, find_file, load_scenario, plant_of, toml_text
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
-from gfm_plant import make_plant
 from gfm_runtime import law_titles
 from gfm_runtime.errors import printable
 from gfm_runtime.toml_file import parse_toml, read_text
@@ -68,10 +67,10 @@ def load_campaign(
     if text is None:
         text = toml_text(content)
     base = load_scenario(_beside(path, file.scenario), in_process=True)
-    if base.network is not None:
-        raise UserError(
-            f"{path}: scenario = {file.scenario!r}: has a network; this takes one converter"
-        )
+    known = base.converters
+    if (file.converter not in known) if known else (file.converter is not None):
+        must = f"must be one of {known}" if known else "the scenario has no network"
+        raise UserError(f"{path}: converter = {file.converter!r}: {must}")
     content = base.model_dump(mode="json")
     content.update(compare=[], expect="completed", expect_reason=None, expect_after=None)
     _check_paths(path, file, content)
@@ -80,9 +79,10 @@ def load_campaign(
     files = {law: laws.get(law) or _beside(path, law) for law in file.laws}
     titles = law_titles(files.values())
     file = file.model_copy(update={"laws": [titles[law] for law in files.values()]})
-    for label, law in files.items():
-        check_scenario({**content, "law": law}, f"{path}: law {label} on {file.scenario}")
     campaign = Campaign(path.stem, text, file, content, {titles[f]: f for f in files.values()})
+    for label, law in files.items():
+        under = campaign.under(content, titles[law])
+        check_scenario(under, f"{path}: law {label} on {file.scenario}")
     ends = [(k, d, end) for k, d in enumerate(campaign.file.draw) for end in d.ends()]
     runs = range(min(campaign.file.runs, _TRIED))
     for done, (k, d, end) in enumerate(ends):
@@ -113,6 +113,8 @@ def _check_paths(path: Path, file: CampaignFile, content: dict[str, Any]) -> Non
     problems, seen = [], set()
     for entry, target in where:
         own = target.split(".")[0]
+        if target == f"network.converters.{file.converter}.law":
+            own = "law"
         if own in _OWN and not (entry.startswith("set.") and own in _SETTABLE):
             problems.append(f"{entry}: {target!r} is the campaign's own and cannot be set here")
         elif target in seen:
@@ -134,7 +136,7 @@ def _check_run(path: Path, campaign: Campaign, run: int) -> None:
     law = campaign.file.laws[0]
     try:
         scenario, _ = campaign.scenario(run, law)
-        make_plant(scenario.plant, scenario.T_s)
+        plant_of(scenario)
     except ValueError:
         check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
         raise

@@ -187,6 +187,9 @@ class CampaignFile(StrictSchema):
     description: str = Field("", description="for people")
     scenario: str = Field(description="scenario file, or the name of a shipped one")
     laws: list[str] = Field(min_length=1, description="each runs on the same draws")
+    converter: str | None = Field(
+        None, description="of a network: the one that gets the laws and whose events are kept"
+    )
     runs: int = Field(gt=0, le=10**7, description="number of draws")
     seed: int = Field(0, ge=0, lt=2**63, description="of all draws")
     figure: Axes = Field(Axes(), description="what the figure is drawn over")
@@ -209,12 +212,21 @@ class Campaign:
         """``base`` in a form of which a copy is made quickly."""
         return pickle.dumps(self.base)
 
+    def under(self, content: dict[str, Any], law: str) -> dict[str, Any]:
+        """A scenario as plain data under a law of the campaign; of a network its converter is."""
+        if self.file.converter is None:
+            return {**content, "law": self.laws[law]}
+        network = content["network"]
+        members = network["converters"]
+        own = {**members[self.file.converter], "law": self.laws[law]}
+        converters = {**members, self.file.converter: own}
+        return {**content, "network": {**network, "converters": converters}}
+
     def digest(self) -> str:
         """Hash over all that decides a record: draws, scenario, contents of laws, version."""
         decides = self.file.model_dump(include={"seed", "set", "draw", "laws"})
         scenarios = [
-            Scenario.model_validate({**self.base, "law": law}).digest()
-            for law in self.laws.values()
+            Scenario.model_validate(self.under(self.base, law)).digest() for law in self.laws
         ]
         limit = self.base["expect_ripple"]  # which the digests of scenarios leave out
         text = json.dumps([decides, limit, scenarios, version("gfmhil")], sort_keys=True)
@@ -224,7 +236,7 @@ class Campaign:
         """Scenario of a run as plain data, and the values drawn for it by their paths."""
         seed, values = draw(self.file.seed, run, self.file.draw)
         content = pickle.loads(self._packed)
-        content["law"], content["seed"] = self.laws[law], seed
+        content = self.under(content, law) | {"seed": seed}
         for d, value in zip(self.file.draw, values, strict=True):
             for path in d.paths():
                 put(content, path, value)

@@ -11,7 +11,8 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_benches
 from gfm_hil.recording.parts import Kept
 from gfm_hil.results.report import finite
-from gfm_hil.run.runner import run_in_memory
+from gfm_hil.run.network_run import NetworkRun
+from gfm_hil.run.runner import run_in_memory, run_network_in_memory
 from gfm_hil.run.summary import READ
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
@@ -20,6 +21,7 @@ from gfm_hil.studies.workers import RunFailed
 Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
 
+_WORSE = ("completed", "interrupted", "oscillating", "safe", "tripped")  # the better first
 _EVENT_KEYS = ("t", "tick", "label", "cut_short")  # of a summary's event; the scenario has them
 
 
@@ -40,13 +42,17 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
         try:
             scenario, drawn = campaign.scenario(run, law)
             inner = scenario.carries
-            if inner not in room:
+            if inner not in room and not scenario.parts:
                 room[inner] = kept(scenario)
-            summary, columns = simulate(scenario, room[inner])
+            if scenario.parts:
+                summary, lasted = simulate_network(scenario, campaign.file.converter)
+            else:
+                summary, columns = simulate(scenario, room[inner])
+                lasted = len(columns["true_p"])
         except Exception as problem:
             words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
             raise RunFailed(words) from problem
-        records.append(record(run, law, scenario, drawn, summary, columns["true_p"]))
+        records.append(record(run, law, scenario, drawn, summary, lasted))
     return records
 
 
@@ -65,9 +71,41 @@ def simulate(
     try:
         run = run_in_memory(scenario, room)
     except UserError as problem:
-        summary = {"status": "no-steady-state", "reason": str(problem), "events": []}
-        return summary, dict.fromkeys(READ, np.empty(0))
+        return no_steady_state(problem), dict.fromkeys(READ, np.empty(0))
     return run.summary, {name: np.asarray(run.columns[name]) for name in READ}
+
+
+def no_steady_state(problem: UserError) -> dict[str, Any]:
+    """What is told of a run that cannot begin."""
+    return {"status": "no-steady-state", "reason": str(problem), "events": []}
+
+
+def simulate_network(scenario: Scenario, converter: str | None) -> tuple[dict[str, Any], int]:
+    """As ``of_network``, of a run of the scenario."""
+    try:
+        return of_network(run_network_in_memory(scenario), converter)
+    except UserError as problem:
+        return no_steady_state(problem), 0
+
+
+def of_network(run: NetworkRun, converter: str | None) -> tuple[dict[str, Any], int]:
+    """What a record tells of a network, and how many ticks that lasted: the end of the converter
+    that came off worst, the largest ripple of any, and the events of ``converter``."""
+
+    def came_off(name: str) -> tuple[int, bool]:
+        return _WORSE.index(run[name].status), name == converter
+
+    worst = max(run, key=came_off)
+    ended = run[worst].summary
+    ripple = [r for one in run.values() if (r := one.summary["ripple_pu"])]
+    summary = {
+        "status": ended["status"],
+        "reason": f"{worst}: {ended['reason']}" if ended["reason"] else "",
+        "ripple_pu": {"": max(x for r in ripple for x in r.values())} if ripple else None,
+        "events": run.runs[converter or worst].summary["events"],
+    }
+    trips = ended["trips"]
+    return summary, trips[-1]["tick"] if trips else ended["ticks"]
 
 
 def record(
@@ -76,16 +114,16 @@ def record(
     scenario: Scenario,
     drawn: dict[str, Any],
     summary: dict[str, Any],
-    p: NDArray[np.float64],
+    ticks: int,
 ) -> Record:
-    """What is kept of a run; ``docs/campaigns.md`` lists the keys."""
+    """What is kept of a run that lasted so many ticks; ``docs/campaigns.md`` lists the keys."""
     lasted = summary["status"] in ("completed", "oscillating")
     ripple = summary.get("ripple_pu")
     events = [{k: v for k, v in e.items() if k not in _EVENT_KEYS} for e in summary["events"]]
     made = {
         "run": run, "law": law, "seed": scenario.seed, "drawn": drawn,
         "status": summary["status"], "reason": summary["reason"],
-        "end_s": None if lasted or not len(p) else len(p) * scenario.T_s,
+        "end_s": None if lasted or not ticks else ticks * scenario.T_s,
         "ripple_pu": max(ripple.values()) if ripple else None,
         "growth_1_s": max((g for e in events if (g := _growth(e)) is not None), default=None),
         "events": events,
