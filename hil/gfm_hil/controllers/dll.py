@@ -19,6 +19,7 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
+from gfm_hil.controllers.phases import Frame
 from gfm_hil.controllers.ports import PortMap, Vector, wire
 from gfm_hil.core.errors import UserError
 
@@ -143,7 +144,7 @@ class DllController(MappedController):
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
         self._names = self._out.names
-        self._wiring = wire(where, ports, self._in.names, self._names, context.inner)
+        self._wiring = wire(where, ports, self._in.names, self._names, context.inner, context.bases)
         self._parameters = _parameters(where, info, ports)
         declared = info.FixedStepBaseSampleTime
         if ports.step_s and declared and abs(ports.step_s - declared) > 1e-6 * declared:
@@ -153,6 +154,7 @@ class DllController(MappedController):
             )
         step_s, self._T_s = declared or ports.step_s or context.T_s, context.T_s
         self._every = ticks_a_step(where, step_s, context.T_s)
+        self._frame = Frame(context, self._every)
         self._states = (
             np.zeros(max(info.NumIntStates, 1), np.int32),
             np.zeros(max(info.NumFloatStates, 1), np.float32),
@@ -164,18 +166,27 @@ class DllController(MappedController):
         )  # fmt: skip
 
     def start(self, u: Vector) -> None:
-        self._ticks = 0
+        super().start(u)
         for states in self._states:
             states[:] = 0
         for name in ("Model_FirstCall", "Model_CheckParameters"):
             if hasattr(self._of, name):
                 self._call(name)
-        self._out.write(self._wiring.outputs(u, len(self._names)))
+        if not self._wiring.waits:
+            self._initialize(np.zeros(0))
+
+    def _first(self, known: Vector) -> None:
+        if self._wiring.waits:
+            self._in.write(self._wiring.inputs(known))
+            self._initialize(known)
+
+    def _initialize(self, known: Vector) -> None:
+        self._out.write(self._wiring.outputs(self._u, known))
         self._call("Model_Initialize")
 
     def _step(self, inputs: Vector) -> Vector:
         self._in.write(inputs)
-        self._now.Time = self._ticks * self._T_s
+        self._now.Time = self._time
         self._call("Model_Outputs")
         return self._out.read()
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.controllers.ports import PortWiring, Vector
+from gfm_hil.controllers.phases import Frame
+from gfm_hil.controllers.ports import MODULATION, PortWiring, Vector
 from gfm_hil.core.errors import UserError
 from gfm_plant import Bases
+from gfm_runtime.signals import NU_INNER, Y_V_D, Y_V_DC, Y_V_Q
 
 if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
@@ -74,21 +78,76 @@ class ExternalController:
 
 class MappedController(ExternalController):
     """A controller whose ports a map wires to the signals, and which steps every so many ticks;
-    each kind sets the wiring, the outputs' names and how many ticks."""
+    each kind sets the wiring, the outputs' names, how many ticks and the frame of the phases."""
 
     _wiring: PortWiring
     _names: list[str]
     _every: int
+    _frame: Frame
+    _T_s: float
     _ticks = 0
 
+    def start(self, u: Vector) -> None:
+        self._ticks = self._before = 0
+        self._frame.start(float(u[1]))
+        phases = self._frame.phases(complex(u[2], u[3])) if self._wiring.bridge else ()
+        self._u = np.concatenate((u, phases))
+
     def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
+        wiring = self._wiring
+        if self._ticks == 0:
+            self._watch(ref, y)
         if self._ticks % self._every == 0:
-            outputs, blocks = self._step(self._wiring.inputs(ref, y)), self._wiring.blocks
-            if blocks >= 0 and outputs[blocks] != 0:
-                what = f"{self._names[blocks]} = {outputs[blocks]:g}"
-                raise ControllerError(f"{self.name}: blocks the bridge: {what}")
-            self._wiring.take(outputs, u)
+            outputs = self._step(wiring.inputs(self._known(ref, y)))
+            for place, good in ((wiring.blocks, False), (wiring.enables, True)):
+                if place >= 0 and bool(outputs[place]) is not good:
+                    what = f"{self._names[place]} = {outputs[place]:g}"
+                    raise ControllerError(f"{self.name}: blocks the bridge: {what}")
+            wiring.take(outputs, self._u)
+            if wiring.bridge == MODULATION:
+                self._u[-3:] *= y[Y_V_DC]
+        u[:] = self._u[: len(u)]
+        if wiring.bridge:
+            e = self._frame.acting(self._u[-3:], self._ticks)
+            u[1:NU_INNER] = self._frame.speed, e.real, e.imag
         self._ticks += 1
+
+    @property
+    def _time(self) -> float:
+        """Since the controller's first step, s."""
+        return (self._ticks + self._before) * self._T_s
+
+    def _known(self, ref: Vector, y: Vector) -> Vector:
+        if not self._wiring.phases:
+            return np.concatenate((ref, y))
+        return np.concatenate((ref, y, self._frame.measured(y, self._ticks).ravel()))
+
+    def _watch(self, ref: Vector, y: Vector) -> None:
+        """Let it see, before tick 0, what is measured there: rising from zero, and then held."""
+        wiring = self._wiring
+        rising, held = (
+            round(s / (self._T_s * self._every)) * self._every
+            for s in (wiring.ramp_s, wiring.hold_s)
+        )
+        self._before = rising + held
+        self._ticks = -self._before
+        if wiring.angle is not None:
+            now = self._frame.angle(self._ticks) + math.atan2(y[Y_V_Q], y[Y_V_D])
+            self._frame.origin = wiring.angle - now
+        steps = range(self._ticks, 0, self._every)
+        for k in steps:
+            self._ticks = k
+            share = min(1.0, (k + self._before) / rising) if rising else 1.0
+            known = self._known(ref, y) * (1.0 + (share - 1.0) * wiring.rises)
+            if k == steps[0]:
+                self._first(known)
+            self._step(wiring.inputs(known))
+        self._ticks = 0
+        if not steps:
+            self._first(self._known(ref, y))
+
+    def _first(self, known: Vector) -> None:
+        """Get ready for the first step, knowing references, measurements and phases."""
 
     def _step(self, inputs: Vector) -> Vector:
         raise NotImplementedError

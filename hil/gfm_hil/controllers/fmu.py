@@ -14,6 +14,7 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
+from gfm_hil.controllers.phases import Frame
 from gfm_hil.controllers.ports import PortMap, Vector, wire
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError, need
@@ -62,7 +63,13 @@ class FmuController(MappedController):
         inputs = [v for v in variables.values() if v.causality == "input"]
         outputs = [v for v in variables.values() if v.causality == "output"]
         self._names = [v.name for v in outputs]
-        self._wiring = wire(where, ports, [v.name for v in inputs], self._names, context.inner)
+        if ports.initial:
+            raise UserError(
+                f"{where}: initial in its map: an FMU's outputs begin as it says itself"
+            )
+        self._wiring = wire(
+            where, ports, [v.name for v in inputs], self._names, context.inner, context.bases
+        )
         self._in, self._out = _by_type(inputs), _by_type(outputs)
         self._fixed: list[tuple[Any, float]] = []
         for name, value in ports.parameters.items():
@@ -73,6 +80,7 @@ class FmuController(MappedController):
         self._begins = [variables.get(f"start.{s.name}") for s in command_rows(context.inner)]
         self._T_s = context.T_s
         self._every = ticks_a_step(where, ports.step_s or self._T_s, self._T_s)
+        self._frame = Frame(context, self._every)
         try:
             self._it = fmpy.instantiate_fmu(unpacked, of, "CoSimulation", logger=self._log)
         except Exception as problem:
@@ -84,7 +92,7 @@ class FmuController(MappedController):
         self._said = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
     def start(self, u: Vector) -> None:
-        self._ticks = 0
+        super().start(u)
         try:
             if not self._fresh:
                 self._it.reset()
@@ -104,7 +112,7 @@ class FmuController(MappedController):
         try:
             for kind, places, references in self._in:
                 self._set(kind, references, inputs[places])
-            self._it.doStep(self._ticks * self._T_s, self._every * self._T_s)
+            self._it.doStep(self._time, self._every * self._T_s)
             for kind, places, references in self._out:
                 outputs[places] = getattr(self._it, f"get{kind}")(references)
         except self._failed as problem:

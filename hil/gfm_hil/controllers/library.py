@@ -1,18 +1,16 @@
 """A controller in a shared library with the interface of ``gfmhil_controller.h``.
 
-It measures and commands three-phase voltages and currents in V and A, as firmware does. The plant
-works in a dq frame whose speed omega_u the controller commands. This adapter commands the speed of
-the start for ever, so that the frame's angle is known, and turns everything into that frame and out
-of it. The bridge's voltage stays where it is in space until the next call, as that of a modulator
-does: each tick it is turned back in the frame by what the frame turns. In a run with counts it gets
-those of the A/D and gives compare counts, which have no frame.
+It measures and commands three-phase voltages and currents in V and A, as firmware does; ``phases``
+turns them into the plant's frame and out of it. In a run with counts it gets those of the A/D and
+gives compare counts, which have no frame.
 """
 
-import cmath
 import ctypes as c
 import math
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gfm_hil.controllers.external import (
     BenchContext,
@@ -22,15 +20,15 @@ from gfm_hil.controllers.external import (
     run_name,
     ticks_a_step,
 )
+from gfm_hil.controllers.phases import MEASURED, Frame
 from gfm_hil.controllers.ports import PortMap, Vector
 from gfm_hil.core.errors import UserError
-from gfm_runtime.signals import COUNTS, N_ADC, N_LEGS, NU_INNER, carried, names
+from gfm_runtime.signals import COUNTS, N_ADC, N_LEGS, NU_INNER, Y_V_DC, names
 
 VERSION = 1
 _NEEDED = ("version", "name", "new", "start", "free")
 _Phases = c.c_double * 3
 _Adc, _Compare = c.c_uint16 * N_ADC, c.c_uint16 * N_LEGS
-_A = cmath.exp(2j * math.pi / 3)
 
 
 class _Setup(c.Structure):
@@ -77,14 +75,10 @@ class LibraryController(ExternalController):
         self._context, self._counts = context, context.inner == COUNTS
         _check_step(self._of, path, self._counts)
         self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
-        bases = context.bases
-        self._phase_V = bases.V_n * math.sqrt(2.0 / 3.0)
-        self._phase_A = bases.S_n / (1.5 * self._phase_V)
+        bases, self._frame = context.bases, Frame(context, self._every)
         self._dc_A = bases.S_n / bases.V_dcref
-        # a voltage that is held for several ticks acts on average half of them later
-        self._delay_s = (context.delay + self._every / 2) * context.T_s
         setup = _Setup(
-            self._every * context.T_s, self._delay_s,
+            self._every * context.T_s, self._frame.delay * context.T_s,
             bases.S_n, bases.V_n, bases.omega_b, bases.V_dcref,
         )  # fmt: skip
         self._self = self._of.gfmhil_new(c.byref(setup))
@@ -96,19 +90,17 @@ class LibraryController(ExternalController):
             )
         self._in, self._out = _ControllerInput(), _ControllerOutput()
         self._adc, self._compare = _Adc(), _Compare()
-        self._ticks, self._speed = 0, 1.0
-        y = {name: k for k, name in enumerate(carried("y", True))}
-        self._pairs = {
-            "v": (y["v_d"], y["v_q"]), "i": (y["i_d"], y["i_q"]), "i_o": (y["i_od"], y["i_oq"]),
-        }  # fmt: skip
-        self._v_dc = y["v_dc"]
+        self._ticks = 0
         self._ref = {name: k for k, name in enumerate(names("ref"))}
 
     def start(self, u: Vector) -> None:
         # the library starts at the first tick, with measurements
-        self._ticks, self._speed = 0, float(u[1])
+        self._ticks = 0
+        self._frame.start(float(u[1]))
         self._rests = u[:NU_INNER].copy()
-        self._now(complex(u[2], u[3]), float(u[0]))
+        # the output begins at what the plant rests under
+        self._out.e[:] = self._frame.phases(complex(u[2], u[3])) * self._frame.peak_V
+        self._out.i_dc = float(u[0]) * self._dc_A
 
     def tick(self, ref: Vector, y: Vector, u: Vector, changed: int = -1) -> None:
         if self._ticks % self._every == 0:
@@ -120,41 +112,26 @@ class LibraryController(ExternalController):
                 self._call("gfmhil_isr", self._in, self._adc, self._out, self._compare)
             else:
                 self._call("gfmhil_step", self._in, self._out)
-        self._ticks += 1
         if self._counts:
             u[:NU_INNER], u[NU_INNER:] = self._rests, self._compare
             u[0] = self._out.i_dc / self._dc_A
-            return
-        held = sum(e * turn for e, turn in zip(self._out.e, (1.0, _A, _A**2), strict=True)) * 2 / 3
-        # middle of this tick's share of the time for which e acts
-        acts = self._angle(self._ticks + self._context.delay - 0.5)
-        e = held * cmath.exp(-1j * acts) / self._phase_V
-        u[:] = self._out.i_dc / self._dc_A, self._speed, e.real, e.imag
+        else:
+            e = self._frame.acting(np.array(self._out.e) / self._frame.peak_V, self._ticks)
+            u[:] = self._out.i_dc / self._dc_A, self._frame.speed, e.real, e.imag
+        self._ticks += 1
 
     def close(self) -> None:
         self._of.gfmhil_free(self._self)
 
-    def _angle(self, ticks: float) -> float:
-        """Angle of the plant's frame that many ticks after the start, rad."""
-        cycles = (
-            self._speed * self._context.bases.omega_b * self._context.T_s / (2 * math.pi) * ticks
-        )
-        return 2 * math.pi * math.fmod(cycles, 1.0)
-
-    def _now(self, e: complex, i_u: float) -> None:
-        """Let the output begin at what the plant rests under, p.u. in its frame."""
-        turned = e * self._phase_V * cmath.exp(1j * self._angle(self._delay_s / self._context.T_s))
-        self._out.e[:] = _phases(turned)
-        self._out.i_dc = i_u * self._dc_A
-
     def _measure(self, ref: Vector, y: Vector) -> None:
-        bases, turn = self._context.bases, cmath.exp(1j * self._angle(self._ticks))
+        bases = self._context.bases
         self._in.t = self._ticks * self._context.T_s
         if not self._counts:
-            for name, (d, q) in self._pairs.items():
-                base = self._phase_V if name == "v" else self._phase_A
-                getattr(self._in, name)[:] = _phases(complex(y[d], y[q]) * turn * base)
-            self._in.v_dc = y[self._v_dc] * bases.V_dcref
+            measured = self._frame.measured(y, self._ticks)
+            for name, phases in zip(MEASURED, measured, strict=True):
+                base = self._frame.peak_V if name == "v" else self._frame.peak_A
+                getattr(self._in, name)[:] = phases * base
+            self._in.v_dc = y[Y_V_DC] * bases.V_dcref
         for field, name, base in (
             ("P_ref", "P_ref", bases.S_n),
             ("Q_ref", "Q_ref", bases.S_n),
@@ -190,11 +167,6 @@ def _check_step(of: c.CDLL, path: Path, counts: bool) -> None:
     if not counts and not hasattr(of, "gfmhil_step"):
         other = "; for its gfmhil_isr set counts = 'rig'" if hasattr(of, "gfmhil_isr") else ""
         raise UserError(f"{path}: has no function gfmhil_step; see gfmhil_controller.h{other}")
-
-
-def _phases(space: complex) -> tuple[float, float, float]:
-    """The three phases of a space vector."""
-    return space.real, (space * _A**2).real, (space * _A).real
 
 
 def _loaded(path: Path) -> c.CDLL:

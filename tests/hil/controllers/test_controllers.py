@@ -16,7 +16,7 @@ from gfm_hil.engine import setup
 from gfm_hil.recording.run import Run
 from gfm_hil.run import runner
 from gfm_hil.scenario import load_scenario
-from gfm_plant import plant_sample
+from gfm_plant import Bases, plant_sample
 from gfm_runtime.inner import settle
 from gfm_runtime.states import RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
@@ -222,12 +222,12 @@ def test_ports_are_found_by_name_and_by_map():
         }
     )
     inputs, outputs = ["ref.P_ref", "power", "mode", "V"], ["i_u", "w", "spare", "reason"]
-    wiring = wire("model", ports, inputs, outputs, inner=False)
-    assert wiring.inputs(ref, y).tolist() == [2.0, 12.0 * 4000.0, 7.0, 15.0]
+    wiring = wire("model", ports, inputs, outputs, False, Bases())
+    assert wiring.inputs(np.concatenate((ref, y))).tolist() == [2.0, 12.0 * 4000.0, 7.0, 15.0]
     u = np.zeros(3)
     wiring.take(np.array([0.25, 1.0625, 9.0, 0.0]), u)
     assert u.tolist() == [0.25, 1.0625, 1.5]
-    assert wiring.outputs(u, 4).tolist() == [0.25, 1.0625, 0.0, 0.0]
+    assert wiring.outputs(u, ref).tolist() == [0.25, 1.0625, 0.0, 0.0]
     assert wiring.blocks == 3
 
 
@@ -249,7 +249,7 @@ def test_ports_are_found_by_name_and_by_map():
 )  # fmt: skip
 def test_ports_that_do_not_fit_are_refused(ports, outputs, message):
     with pytest.raises(UserError) as refused:
-        wire("model", PortMap.model_validate(ports), ["p"], outputs, inner=False)
+        wire("model", PortMap.model_validate(ports), ["p"], outputs, False, Bases())
     assert message in str(refused.value) and str(refused.value).startswith("model: ")
 
 
