@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from gfm_hil.api.law import Law, law_files
@@ -161,6 +162,8 @@ def run_network(
     scenario: str | Path | Scenario | dict[str, Any],
     folder: str | Path | None = None,
     *,
+    controllers: Mapping[str, str] = MappingProxyType({}),
+    ports: Mapping[str, str | Path] = MappingProxyType({}),
     figures: bool = True,
     progress: Progress = _silent,
     notice: Notice = _silent,
@@ -168,16 +171,34 @@ def run_network(
 ) -> NetworkRun:
     """Run a scenario with several converters; arguments as for ``run``.
 
+    Args:
+        controllers, ports: by converter, what computes its u in place of its law, and the map of
+            that. They take a folder and a link.
+
     Raises:
         UserError: one line a mistake; it has no network; or no operating point.
     """
     checked = _checked(scenario, changes, in_process=folder is None)
     if checked.network is None:
         raise UserError("network: the scenario has none; use gfmhil.run")
+    for name in (*controllers, *ports):
+        if name not in checked.parts:
+            raise UserError(
+                f"controller of {name}: the network has no such converter; it has"
+                f" {', '.join(checked.parts)}"
+            )
+        if name not in controllers:
+            raise UserError(f"map of {name}: is of a controller; name it too")
     if folder is None:
+        if controllers:
+            raise UserError("controllers: take a folder")
         return runner.run_network_in_memory(checked)
+    commands = {
+        name: runner.controller_program(checked.of(name), controller, ports.get(name), notice)
+        for name, controller in controllers.items()
+    }
     report = write_report if figures else None
-    return runner.run_network(checked, Path(folder), progress, notice, report)
+    return runner.run_network(checked, Path(folder), progress, notice, report, commands)
 
 
 def _checked(

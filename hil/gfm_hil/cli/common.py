@@ -5,7 +5,7 @@ import re
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -80,12 +80,27 @@ def add_counts(command: argparse.ArgumentParser) -> None:
     command.add_argument("--counts", metavar="NAME", help=said)
 
 
-def add_map(command: argparse.ArgumentParser, option: str) -> None:
+def add_map(command: argparse.ArgumentParser, option: str, **more: Any) -> None:
     """The option that goes with a model, which ``option`` gives."""
     command.add_argument(
         "--map", type=Path, metavar="FILE",
         help=f"of {option}: which signals its ports are, as TOML, where names differ from ours",
+        **more,
     )  # fmt: skip
+
+
+def by_converter(option: str, given: Sequence[str], parts: Sequence[str]) -> dict[str, str]:
+    """What an option that may come again gives each converter of a network, as NAME=VALUE; without
+    a network its one value, by "". Raises UserError: a value for no converter, or a second one."""
+    found: dict[str, str] = {}
+    for text in given:
+        name, equals, value = text.partition("=") if parts else ("", "=", text)
+        if not equals or name not in (parts or [""]):
+            raise UserError(f"{option} {text}: must be NAME=VALUE with NAME one of {parts}")
+        if name in found:
+            raise UserError(f"{option} {text}: a second one" + f" of {name}" * bool(name))
+        found[name] = value
+    return found
 
 
 def link_option(text: str) -> tuple[str, Any]:

@@ -30,12 +30,12 @@ def add(command: argparse.ArgumentParser) -> None:
         " has its own",
     )  # fmt: skip
     command.add_argument(
-        "--controller", metavar="KIND:NAME",
+        "--controller", metavar="[NAME=]KIND:NAME", action="append", default=[],
         help="dll:FILE (IEEE/CIGRE), fmu:FILE or c:FILE: the controller, in place of a law of ours;"
         " or pil:TARGET, the law on a processor in QEMU, see gfmhil firmware check, or"
-        " pil:TARGET:FOLDER with a firmware around it",
+        " pil:TARGET:FOLDER with a firmware around it; of a network NAME=KIND:NAME, again for each",
     )  # fmt: skip
-    common.add_map(command, "--controller")
+    common.add_map(command, "--controller", action="append", default=[])
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -53,11 +53,14 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    if options.controller is not None and options.controller.startswith(PIL) and not options.mode:
+    pil = any(text.rpartition("=")[2].startswith(PIL) for text in options.controller)
+    if pil and not options.mode:
         options.mode = "lockstep"  # QEMU keeps no time
     scenario = common.resolve(options, law=options.law, waveforms=options.waveforms)
     folder = common.new_folder(options.out, find_scenario(options.scenario).stem)
     figures = not options.no_figures
+    controllers = common.by_converter("--controller", options.controller, scenario.parts)
+    maps = common.by_converter("--map", list(map(str, options.map)), scenario.parts)
     with contextlib.ExitStack() as stack:
         run: Run | NetworkRun
         stay: dict[str, subprocess.Popen[str]] = {}
@@ -65,8 +68,9 @@ def call(options: argparse.Namespace) -> int:
             _check_network(options)
             with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_network(
-                    scenario, folder, figures=figures, progress=progress, notice=notice
-                )
+                    scenario, folder, controllers=controllers, ports=maps,
+                    figures=figures, progress=progress, notice=notice,
+                )  # fmt: skip
         else:
             for name, number in _ports(options).items():
                 beside = companion(name, folder, number, scenario.link.type == INPROC)
@@ -74,7 +78,7 @@ def call(options: argparse.Namespace) -> int:
                     stay[name] = process
             with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_one(
-                    scenario, folder=folder, controller=options.controller, ports=options.map,
+                    scenario, folder=folder, controller=controllers.get(""), ports=maps.get(""),
                     figures=figures, progress=progress, notice=notice,
                 )  # fmt: skip
         if options.json:
@@ -98,8 +102,6 @@ def _ports(options: argparse.Namespace) -> dict[str, int]:
 
 def _check_network(options: argparse.Namespace) -> None:
     """Refuse what is of one converter."""
-    if options.controller is not None:
-        raise UserError("--controller: controls one converter; a network runs without it")
     for name in _ports(options):
         raise UserError(
             f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"

@@ -117,13 +117,15 @@ def compile_external(
     """Compile what the controller's side calls to step an external controller.
 
     Args:
-        scenario, notice: as for ``compiled_benches``.
+        scenario: of one converter, or of a network as the controller of one sees it.
+        notice: as for ``compiled_benches``.
         real: of its laws.
 
     Raises:
-        UserError: as ``make_bench``.
+        UserError: as ``make_benches``.
     """
-    bench, nothing = make_bench(scenario, real), ExternalController()
+    (bench,) = make_benches(scenario, real)
+    nothing = ExternalController()
     nothing.name = "nothing"
     bench.external = SteppedController(nothing, bench.controller, bench.u)
     compile_sets([_role("controller", [bench], " of an external controller")], notice)

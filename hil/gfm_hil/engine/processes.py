@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,9 +81,10 @@ class Processes:
         folder: where they record.
         progress, notice: as for ``run_scenario``.
         interrupt: set when the operator wants it to end.
-        controller_command: program and arguments to start as the controller; ours if empty.
-            ``{endpoint}`` and ``{scenario}`` in an argument become the endpoint and the path of
-            the resolved scenario.
+        controller_commands: program and arguments to start as the controller, by converter ("" for
+            that of a scenario without a network); ours if empty or not there. ``{endpoint}``,
+            ``{scenario}`` and ``{folder}`` in an argument become the endpoint, the path of the
+            resolved scenario and the run folder of the converter.
     """
 
     scenario: Scenario
@@ -91,7 +92,7 @@ class Processes:
     progress: Progress
     notice: Callable[[str], None]
     interrupt: Interrupt
-    controller_command: tuple[str, ...] = ()
+    controller_commands: Mapping[str, Sequence[str]]
 
     def run(self) -> tuple[float, dict[str, Outcome]]:
         """Start all, watch them to their end.
@@ -121,7 +122,7 @@ class Processes:
             self._controllers = {
                 name: _Process(
                     "controller", f"controller of {name}" if name else "controller", place,
-                    self._controller_command(place, endpoints[name]),
+                    self._controller_command(name, place, endpoints[name]),
                 )
                 for name, place in self._places.items()
             }  # fmt: skip
@@ -166,13 +167,15 @@ class Processes:
             command += ["--endpoint", f"{name}={endpoint}" if name else endpoint]
         return command
 
-    def _controller_command(self, folder: Path, endpoint: str) -> list[str]:
-        scenario = str(folder.absolute() / "scenario.toml")
-        if not self.controller_command:
+    def _controller_command(self, name: str, folder: Path, endpoint: str) -> list[str]:
+        own = str(folder.absolute())
+        if not (command := self.controller_commands.get(name)):
             return [*self._ours("controller", folder), "--endpoint", endpoint]
         return [
-            argument.replace("{endpoint}", endpoint).replace("{scenario}", scenario)
-            for argument in self.controller_command
+            word.replace("{endpoint}", endpoint)
+            .replace("{scenario}", f"{own}/scenario.toml")
+            .replace("{folder}", own)
+            for word in command
         ]
 
     def _watch(self) -> float:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -58,8 +59,7 @@ def run_scenario(
         report: draws the figures and writes report.html, as ``results.report.write_report``
             does; None for a folder without them.
         controller_command: program and arguments of another controller instead of ours, for a
-            link that is none of ``inproc``; see ``Processes``. Here ``{folder}`` becomes the run
-            folder.
+            link that is none of ``inproc``; see ``Processes``.
 
     Raises:
         UserError: the folder is in use, no operating point, an endpoint that is occupied. The
@@ -67,9 +67,8 @@ def run_scenario(
     """
     if scenario.parts:
         raise UserError(ONE_CONVERTER)
-    own = str(folder.absolute())
-    command = tuple(word.replace("{folder}", own) for word in controller_command)
-    return _run(scenario, folder, progress, notice, report, command)[""]
+    commands = {"": controller_command} if controller_command else {}
+    return _run(scenario, folder, progress, notice, report, commands)[""]
 
 
 def controller_program(
@@ -125,16 +124,18 @@ def run_network(
     progress: Progress = lambda ticks, misses: None,
     notice: Notice = lambda text: None,
     report: Report | None = None,
+    controller_commands: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> NetworkRun:
     """Run a scenario with a network and leave a folder with a run folder for each converter.
 
     Args:
         scenario, folder, progress, notice, report: as for ``run_scenario``.
+        controller_commands: by converter, as ``controller_command`` there.
 
     Raises:
         UserError: the folder is in use, or there is no operating point.
     """
-    runs = _run(scenario, folder, progress, notice, report)
+    runs = _run(scenario, folder, progress, notice, report, controller_commands)
     return _network(scenario, runs, folder, report)
 
 
@@ -144,7 +145,7 @@ def _run(
     progress: Progress,
     notice: Notice,
     report: Report | None,
-    controller_command: tuple[str, ...] = (),
+    controller_commands: Mapping[str, Sequence[str]],
 ) -> dict[str, Run]:
     """Run both sides of each converter, and complete their run folders."""
 
@@ -161,7 +162,7 @@ def _run(
                 if scenario.in_process:
                     return _run_here(benches, [*places.values()], progress, interrupt), {}
                 return Processes(
-                    scenario, folder, progress, notice, interrupt, controller_command
+                    scenario, folder, progress, notice, interrupt, controller_commands
                 ).run()
         except UserError:
             for place in places.values():
@@ -169,7 +170,8 @@ def _run(
             shutil.rmtree(folder)
             raise
 
-    roles: Sequence[Role] = ("plant",) if controller_command else ROLES
+    ours = len(controller_commands) < max(1, len(scenario.parts))
+    roles: Sequence[Role] = ROLES if ours else ("plant",)
     return _recorded(scenario, folder, roles, notice, report, work)
 
 
