@@ -65,7 +65,10 @@ class PortMap(StrictSchema):
     # and then held, s
     ramp_s: float = Field(0.0, ge=0, le=60)
     hold_s: float = Field(0.0, ge=0, le=60)
-    # time between two steps of the controller, s; by default what it says itself
+    # what a published test leaves it to settle in its loop before the test begins, s
+    settle_s: float = Field(0.0, ge=0, le=60)
+    # time between two steps of the controller, s; by default what it says itself; a published test
+    # runs at a T_s that is no longer
     step_s: float | None = Field(None, gt=0)
 
 
@@ -256,7 +259,7 @@ def _units(name: str, bases: Bases) -> dict[str, float]:
     if name in (*PHASES, *BRIDGE):
         base, units = ("peak V", "V") if name[0] in "ve" else ("peak A", "A")
     else:
-        base = next(s.base for s in SIGNALS if s.name == name)
+        base = next(s.base for s in (*SIGNALS, *command_rows(True)) if s.name == name)
         units = _SI.get(base, "")
     one = {
         "peak V": peak_V, "peak A": bases.S_n / (1.5 * peak_V), "S_n": bases.S_n, "V_n": bases.V_n,

@@ -10,6 +10,8 @@ import pytest
 
 from gfm_hil.cli import main
 from gfm_hil.controllers import BenchContext, open_controller, read_map
+from gfm_hil.controllers.external import MappedController, ticks_a_step
+from gfm_hil.controllers.phases import Frame
 from gfm_hil.controllers.ports import PortMap, wire
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine import setup
@@ -18,6 +20,7 @@ from gfm_hil.run import runner
 from gfm_hil.scenario import load_scenario
 from gfm_plant import Bases, plant_sample
 from gfm_runtime.inner import settle
+from gfm_runtime.signals import INNER, PLAIN, Y_I_D, Y_I_Q, Y_V_D, Y_V_DC, Y_V_Q
 from gfm_runtime.states import RUNNING, SAFE
 from gfm_runtime.switchover import settle_into
 
@@ -229,6 +232,93 @@ def test_ports_are_found_by_name_and_by_map():
     assert u.tolist() == [0.25, 1.0625, 1.5]
     assert wiring.outputs(u, ref).tolist() == [0.25, 1.0625, 0.0, 0.0]
     assert wiring.blocks == 3
+
+
+class Waves(MappedController):
+    """A controller in Python that keeps what it measures, and gives phases by a function of t."""
+
+    def __init__(self, ports: PortMap, rig: BenchContext, e: Any) -> None:
+        self._names, self._e, self.seen, self._T_s = ["a", "b", "c"], e, [], rig.T_s
+        self._every = ticks_a_step("waves", ports.step_s or rig.T_s, rig.T_s)
+        inputs = [*"ABC", *"IJK", "P"]
+        self._wiring = wire("waves", ports, inputs, self._names, rig.inner, rig.bases)
+        self._frame = Frame(rig, self._every)
+
+    def _step(self, inputs: Any) -> Any:
+        self.seen.append([self._time, *inputs])
+        return np.array(self._e(self._time))
+
+
+def phases(peak: float, angle: float) -> Any:
+    return peak * np.cos(angle - 2 * np.pi / 3 * np.arange(3))
+
+
+@pytest.mark.parametrize(("step", "delay", "e_unit"), [(1, 0.0, "kV"), (4, 1.3, "v_dc/2")])
+def test_phases_in_the_units_of_their_ports(step, delay, e_unit):
+    """It sees the start rise before tick 0, its voltage's phase a at a maximum at its first step;
+    what it commands with the delay made up is a constant in the plant's frame."""
+    rig, speed, before = BenchContext(1e-4, True, Bases(), delay), 1.01, 40
+    w, V = speed * 100 * np.pi, 380.0 * np.sqrt(2 / 3)
+    A = 4000.0 / (1.5 * V)
+    ports = PortMap.model_validate(
+        {
+            "step_s": step * 1e-4, "angle_deg": 0.0, "ramp_s": 0.002, "hold_s": 0.002,
+            "inputs": {
+                **{"ABC"[k]: {"signal": f"v_{x}", "unit": "kV"} for k, x in enumerate("abc")},
+                **{"IJK"[k]: {"signal": f"i_{x}", "unit": "A"} for k, x in enumerate("abc")},
+                "P": {"signal": "P_ref", "unit": "kW"},
+            },
+            "outputs": {x: {"signal": f"e_{x}", "unit": e_unit} for x in "abc"},
+            "fixed": {"i_u": 0.5},
+        }
+    )  # fmt: skip
+    unit, lead = 1000.0 if e_unit == "kV" else 700.0 * 1.1 / 2, (delay + step / 2) * 1e-4
+    model = Waves(ports, rig, lambda t: phases(0.9 * V / unit, w * (t + lead) + 0.3))
+    y, u, ref = np.zeros(11), np.array([0.5, speed, 0.8, 0.1]), np.full(5, 0.6)
+    y[Y_V_DC], y[Y_V_D], y[Y_V_Q], y[Y_I_D], y[Y_I_Q] = 1.1, 0.8, -0.2, 0.5, 0.1
+    model.start(u)
+    e = []
+    for _ in range(100):
+        model.tick(ref, y, u)
+        assert u[:2].tolist() == [0.5, speed]
+        e.append(complex(u[2], u[3]))
+    shift = np.angle(0.5 + 0.1j) - np.angle(0.8 - 0.2j)
+    for k, (t, *given) in enumerate(model.seen):
+        share = min(1.0, k * step / 20)
+        assert t == pytest.approx(k * step * 1e-4)
+        wanted = [
+            *phases(V * abs(0.8 - 0.2j) / 1000, w * t),
+            *phases(A * abs(0.5 + 0.1j), w * t + shift),
+        ]
+        assert given == pytest.approx([share * x for x in (*wanted, 0.6 * 4.0)])
+    assert len(model.seen) == (before + 100) / step
+    # its angle 0 is that of the voltage, and it stands still in space while the frame turns on
+    turn = np.exp(1j * (0.3 + np.angle(0.8 - 0.2j)))
+    back = np.exp(-1j * w * 1e-4 * (np.arange(step) - (step - 1) / 2))
+    np.testing.assert_allclose(e, np.tile(0.9 * turn * back, 100 // step))
+
+
+@pytest.mark.parametrize(
+    ("ports", "message"),
+    [
+        ({"e_a": "V", "e_b": "V"}, "e_c comes from no output"),
+        ({"e_a": "V", "e_b": "V", "e_c": "v_dc/2"}, "must all have the unit v_dc/2, or none"),
+        ({"e_a": "A", "e_b": "V", "e_c": "V"},
+         "unit = 'A' of e_a: must be one of p.u., V, kV, MV, v_dc/2, and no scale beside it"),
+        ({"omega_u": "Hz", "E_d": "V", "E_q": "V"}, "measures phases, so its outputs must be e_a"),
+        ({"e_a": "V", "e_b": "V", "e_c": "V", "omega_u": "Hz"}, "omega_u comes twice: e_a, e_b"),
+    ],
+)  # fmt: skip
+def test_phases_that_do_not_fit_are_refused(ports, message):
+    outputs = {name: {"signal": name, "unit": unit} for name, unit in ports.items()}
+    given = PortMap.model_validate(
+        {"inputs": {"v": "v_a"}, "outputs": outputs, "fixed": {"i_u": 0.0}}
+    )
+    with pytest.raises(UserError) as refused:
+        wire("model", given, ["v"], list(outputs), INNER, Bases())
+    assert message in str(refused.value)
+    with pytest.raises(UserError, match="input v: only a run with an inner stage"):
+        wire("model", given, ["v"], list(outputs), PLAIN, Bases())
 
 
 @pytest.mark.parametrize(

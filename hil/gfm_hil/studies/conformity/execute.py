@@ -4,11 +4,19 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.controllers import FORMS, PIL, check_currents, controller_file, precision, read_map
+from gfm_hil.controllers import (
+    FORMS,
+    PIL,
+    PortMap,
+    check_currents,
+    controller_file,
+    precision,
+    read_map,
+)
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_external, compiled_benches
@@ -46,6 +54,11 @@ class ControllerUnderTest:
     def command(self) -> list[str]:
         """The program that steps it."""
         return external_command(self.model, self.ports)
+
+    @property
+    def map(self) -> PortMap:
+        """The map of its ports."""
+        return read_map(self.ports)
 
     @property
     def name(self) -> str:
@@ -249,7 +262,51 @@ def _scenario(job: Job) -> Scenario:
         return found
     if found.network is not None:
         raise UserError(f"{job.law} is one controller, and the test's network has several")
-    return found.model_copy(update={"link": LinkSettings(type="shm")})
+    asked = job.external.map
+    changes: dict[str, Any] = {
+        "link": LinkSettings(type="shm"), "T_s": min(found.T_s, asked.step_s or found.T_s),
+    }  # fmt: skip
+    if asked.settle_s:
+        changes["duration"] = found.duration + asked.settle_s
+        changes["events"] = [
+            event.model_copy(
+                update={"t": event.at(found.T_s) * found.T_s + asked.settle_s, "tick": None}
+            )
+            for event in found.events
+        ]
+    return found.model_copy(update=changes)
+
+
+def _settled(run: Run, settle_s: float) -> Run:
+    """The part of a run after the first ``settle_s``, as a run of its own. Raises UserError: it did
+    not last so long."""
+    first = round(settle_s / run.scenario.T_s)
+    if run.ticks <= first:
+        reason = f"{run.status}: {run.summary['reason']}"
+        raise UserError(
+            f"the controller does not settle in {settle_s:g} s; the run ended as {reason}"
+        )
+    columns: dict[str, Any] = {name: column[first:] for name, column in run.columns.items()}
+    columns["tick"], columns["t"] = columns["tick"] - first, columns["t"] - settle_s
+    scenario = run.scenario.model_copy(
+        update={
+            "duration": run.scenario.duration - settle_s,
+            "events": [
+                event.model_copy(update={"t": (event.t or 0.0) - settle_s})
+                for event in run.scenario.events
+            ],
+        }
+    )
+    events = [
+        {
+            **line,
+            "tick": line["tick"] - first,
+            **({"t": line["t"] - settle_s} if "t" in line else {}),
+        }
+        for line in run.events
+        if line["tick"] >= first
+    ]
+    return replace(run, scenario=scenario, columns=columns, events=events)
 
 
 def run_part(job: Job) -> PartResult:
@@ -330,7 +387,8 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
         run = run_scenario(scenario, folder, controller_command=job.external.command)
         if run.status == "interrupted":
             raise KeyboardInterrupt
-        return run, {}
+        settle_s = job.external.map.settle_s
+        return (_settled(run, settle_s) if settle_s else run), {}
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)
