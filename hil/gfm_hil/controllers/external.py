@@ -118,9 +118,8 @@ class MappedController(ExternalController):
         return (self._ticks + self._before) * self._T_s
 
     def _known(self, ref: Vector, y: Vector) -> Vector:
-        if not self._wiring.phases:
-            return np.concatenate((ref, y))
-        return np.concatenate((ref, y, self._frame.measured(y, self._ticks).ravel()))
+        phases = self._frame.measured(y, self._ticks).ravel() if self._wiring.phases else ()
+        return np.concatenate((ref, y, (1.0,), phases))
 
     def _watch(self, ref: Vector, y: Vector) -> None:
         """Let it see, before tick 0, what is measured there: rising from zero, and then held."""
@@ -139,6 +138,7 @@ class MappedController(ExternalController):
             self._ticks = k
             share = min(1.0, (k + self._before) / rising) if rising else 1.0
             known = self._known(ref, y) * (1.0 + (share - 1.0) * wiring.rises)
+            known[len(ref) + len(y)] = share == 1.0
             if k == steps[0]:
                 self._first(known)
             self._step(wiring.inputs(known))

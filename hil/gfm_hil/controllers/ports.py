@@ -1,7 +1,7 @@
 """Which signal each port of a controller is: by their names, or by a map in a TOML file.
 
 Beside the signals of the table a port may be a phase of what is measured, ``v_a`` to ``i_o_c``, or
-of the bridge's voltage, ``e_a`` to ``e_c``, which ``Frame`` turns into u.
+of the bridge's voltage, ``e_a`` to ``e_c``, which ``Frame`` turns into u; or ``enable``.
 """
 
 import math
@@ -25,6 +25,7 @@ from gfm_runtime.signals import COUNTS, SIGNALS, carried, command_rows, names
 _GROUP = re.compile(r"^(ref|y|u)\.")
 #: an output of our own controllers: 0, or why the bridge must be blocked
 REASON = "reason"
+ENABLE = "enable"  # 0 while the controller sees the start rise from zero, then 1
 #: phases at the ports, measured and commanded
 PHASES = [f"{name}_{phase}" for name in MEASURED for phase in "abc"]
 BRIDGE = ["e_a", "e_b", "e_c"]
@@ -151,7 +152,8 @@ def wire(
     """Map a controller's ports, which are in its order, to the signals of a run. Raises UserError:
     a port or a signal that is not there, a port without a signal, or a signal of u that comes from
     nowhere or twice."""
-    known, u = [*names("ref"), *carried("y", inner)], [s.name for s in command_rows(inner)]
+    known = [*names("ref"), *carried("y", inner), ENABLE]
+    u = [s.name for s in command_rows(inner)]
     phases = inner not in (0, COUNTS)
     known += PHASES if phases else ()
     u += names("compare") if inner == COUNTS else ()
@@ -259,7 +261,7 @@ def _units(name: str, bases: Bases) -> dict[str, float]:
     if name in (*PHASES, *BRIDGE):
         base, units = ("peak V", "V") if name[0] in "ve" else ("peak A", "A")
     else:
-        base = next(s.base for s in (*SIGNALS, *command_rows(True)) if s.name == name)
+        base = next((s.base for s in (*SIGNALS, *command_rows(True)) if s.name == name), "")
         units = _SI.get(base, "")
     one = {
         "peak V": peak_V, "peak A": bases.S_n / (1.5 * peak_V), "S_n": bases.S_n, "V_n": bases.V_n,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import gfm_hil.controllers
 from gfm_hil.cli import main
 from gfm_hil.controllers import BenchContext, open_controller, read_map
 from gfm_hil.controllers.external import MappedController, ticks_a_step
@@ -28,6 +29,9 @@ from ...support.firmware import cc
 from ...support.processes import write
 
 SOURCE = Path(__file__).parents[2] / "support" / "foreign_model.c"
+PHASES = SOURCE.with_name("phases_model.c")
+EXAMPLE = Path(__file__).parents[3] / "examples" / "foreign_controller" / "controller.c"
+CONTROLLERS = Path(gfm_hil.controllers.__file__).parent
 MAP = """\
 step_s = 2e-4
 blocks = "block"
@@ -160,6 +164,40 @@ def test_a_model_of_others_by_its_map(foreign, tmp_path):
     assert found.columns["u_E_u"][:].tolist() == E
     assert set(found.columns["u_i_u"][:]) == {0.5}
     assert p[-1] == pytest.approx(0.6, abs=0.02)
+
+
+@compiles
+def test_phases_of_a_library_written_for_windows(exported, tmp_path):
+    """The same controller as a DLL by its map and as a library by our header: the same bits."""
+    headers = Path(exported("dll", "vsg-2", "none").removeprefix("dll:")).parent
+    own = f"-I{CONTROLLERS}"
+    flags = ["-std=c99", "-Wall", "-O2", "-shared", "-fPIC", own, str(EXAMPLE), "-lm"]
+    shim = [f"-I{CONTROLLERS / 'windows'}", f"-I{headers}", str(PHASES)]
+    for out, more in (("library.so", []), ("dll.so", shim)):
+        done = cc(tmp_path, *flags, *more, "-o", out)
+        assert (done.returncode, done.stderr) == (0, "")
+    ports = {"P": "P_ref W", "Q": "Q_ref var", "V": "V_ref V", "w": "omega_g rad/s",
+             "V_dc": "V_dcref V", "v_dc": "v_dc V"}  # fmt: skip
+    for name, unit in (("v", "V"), ("i", "A"), ("i_o", "A")):
+        ports |= {f'"{name}[{k}]"': f"{name}_{phase} {unit}" for k, phase in enumerate("abc")}
+    map_ = [
+        f'inputs.{name} = {{ signal = "{signal}", unit = "{unit}" }}'
+        for name, (signal, unit) in ((name, text.split()) for name, text in ports.items())
+    ]
+    map_ += [f'outputs."e[{k}]" = {{ signal = "e_{p}", unit = "V" }}' for k, p in enumerate("abc")]
+    map_ += ['outputs.i_dc = { signal = "i_u", unit = "A" }']
+    (tmp_path / "map.toml").write_text("\n".join(map_))
+    content = {"inner": "virtual-stator", "duration": 0.1, "plant": RIG, "events": [STEP]}
+    runs = {}
+    for kind, out, options in (("c", "library.so", []), ("dll", "dll.so", ["--map"])):
+        place = tmp_path / kind
+        place.mkdir()
+        options = [*options, str(tmp_path / "map.toml")] if options else []
+        runs[kind] = run(place, f"{kind}:{tmp_path / out}", *options, **content)
+    assert np.ptp(runs["c"].columns["true_p"][:]) > 0.05
+    for name in ("true_p", "true_q", "u_E_u", "u_E_q", "u_i_u", "u_omega_u"):
+        a, b = (one.columns[name][:] for one in runs.values())
+        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 @compiles
