@@ -156,8 +156,9 @@ def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Ex
     def options(of: argparse.ArgumentParser) -> Iterator[str]:
         for action in of._actions:
             yield from action.option_strings
-            for inside in action.choices.values() if isinstance(action.choices, dict) else ():
-                yield from options(inside)
+            if isinstance(action, argparse._SubParsersAction):
+                for inside in action.choices.values():
+                    yield from options(inside)
 
     known, first = set(options(top)), words[0]
     close = meant(first.partition("=")[0], known)

@@ -34,7 +34,7 @@ from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
 
 _U_ID = 2
-_ACTS = kept_of("plant").index("acts")
+_MEASURED, _ACTS = map(kept_of("plant").index, ("measured", "acts"))
 # what came of u[k]; HELD_BACK: it came, and the trace that is replayed says that it did not
 AWAITED, FRESH, OVERDUE, LEAVING, CUT_OFF, HELD_BACK = range(6)
 _NOTHING, _OTHER, _OVER = range(3)  # what one read of a link gives
@@ -119,6 +119,8 @@ def _ask(side, plant, i, k, due):
         return 0
     state, reason = (SAFE, PLANT_TRIP) if r.tripped != 0 else (0, 0)
     sequence, frame, message = end.out
+    if r.realtime:
+        times[k, _MEASURED] = now_ns()
     if r.every == 1 or k % r.every == 0:
         pack(sequence, frame, message, k, state, reason, records.y)
         end.send(end.handle, message)

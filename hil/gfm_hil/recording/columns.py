@@ -49,7 +49,7 @@ CONTROLLER_COUNTS = tuple(f"m_{n}" for n in carried("y", INNER))
 CONTROLLER_COLUMNS = (*(f"ref_{n}" for n in REF_NAMES), "law", "state", "X_est")
 # ns of CLOCK_MONOTONIC, -1: never; in lockstep a sample late, an answer is "received" at the look
 # that finds the next frame "sent"; "stall" is the longest gap between two looks at the clock
-PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall")
+PLANT_TIMES = ("scheduled", "woke", "sent", "received", "stall", "measured")
 CONTROLLER_TIMES = ("scheduled", "received", "computed", "sent", "stall")
 
 SIGNALS_OF: dict[Role, tuple[str, ...]] = {"plant": PLANT_COLUMNS, "controller": CONTROLLER_COLUMNS}
@@ -153,6 +153,7 @@ _TIMES = {
     "woke": "when the tick began",
     "sent": "when the frame was handed to the link",
     "received": "when the frame of this tick was taken from the link",
+    "measured": "when y was ready for the link",
     "computed": "when u was computed",
     "stall": "longest gap between two looks at the clock",
 }

@@ -7,7 +7,7 @@ the part that exceeds its usual time in a met tick by most is the cause:
 - own work: the plant's or the controller's computation, or an event at the tick;
 - stalled host: a side that polled for a frame, or computed, did not run for a while, or the
   controller overslept: the host of a virtual machine, the kernel or other work used its processor;
-- link: the rest of the time between y[k] sent and u[k] received.
+- link: the rest, from y[k] measured to u[k] received, with the calls of the kernel that send.
 
 If a tick began while a side was still late from the missed tick before it, it has the same cause.
 Where somebody watched the processors (``gfm_hil.run.stalls``), what stood still also gets a name,
@@ -110,14 +110,16 @@ def _by_clocks(timing: Timing, T_ns: int, missed: Times) -> tuple[Times, float]:
 def _parts(timing: Timing, T_ns: int) -> dict[int, NDArray[np.float64]]:
     """Time of each cause in every tick, ns; a missed tick lasts until the next deadline."""
     due, woke = timing["plant_scheduled"], timing["plant_woke"]
-    sent, received = timing["plant_sent"], timing["plant_received"]
-    heard, answered = timing["controller_received"], timing["controller_sent"]
-    worked = np.where((heard >= 0) & (answered >= 0), answered - heard, 0)
+    measured, sent = timing["plant_measured"], timing["plant_sent"]
+    heard, computed = timing["controller_received"], timing["controller_computed"]
+    received = timing["plant_received"]
+    worked = np.where((heard >= 0) & (computed >= 0), computed - heard, 0)
     end = np.where(received >= 0, received, np.maximum(due + T_ns, sent))
     zero = np.zeros(len(due), np.int64)
     gap = np.maximum(timing.get("plant_stall", zero), _away(timing, sent, end))
     parts = {
-        _OWN: sent - woke + worked, _LINK: end - sent - worked, _WAKE: woke - due, _STALL: gap
+        _OWN: measured - woke + worked, _LINK: end - measured - worked, _WAKE: woke - due,
+        _STALL: gap,
     }  # fmt: skip
     return {cause: part.clip(min=0).astype(float) for cause, part in parts.items()}
 

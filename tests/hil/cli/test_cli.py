@@ -354,6 +354,11 @@ def test_an_unknown_command_of_a_group_is_refused_with_the_one_that_was_meant(ca
     assert "did you mean 'poles'?" in capsys.readouterr().err
 
 
+def test_an_unknown_option_of_a_command_inside_a_group_is_refused_in_one_line(capsys):
+    assert main(["bench", "loop", "--to", "x"]) == 2
+    assert capsys.readouterr().err.startswith("gfmhil: --to x: gfmhil bench does not know it")
+
+
 def test_a_reader_that_has_seen_enough_is_no_error():
     read, write = os.pipe()
     os.close(read)

@@ -18,6 +18,7 @@ def good() -> dict[str, np.ndarray]:
     return {
         "plant_scheduled": due,
         "plant_woke": due + 300,
+        "plant_measured": due + 1_000,
         "plant_sent": due + 1_100,
         "plant_received": heard + 800 + 15_000,
         "plant_stall": np.full(TICKS, 200),
@@ -42,8 +43,10 @@ def test_late_wake_up():
     timing = good()
     timing["plant_woke"][7] += 90_000
     timing["plant_sent"][7] += 90_000
+    timing["plant_measured"][7] += 90_000
     timing["controller_received"][7] += 90_000
     timing["controller_sent"][7] += 90_000
+    timing["controller_computed"][7] += 90_000
     timing["plant_received"][7] = -1
     assert found(timing) == ["late wake-up"]
 
@@ -62,6 +65,7 @@ def test_role_that_stood_still_while_it_looked(role):
     if role == "controller":
         timing["controller_received"][7] += 85_000
         timing["controller_sent"][7] += 85_000
+        timing["controller_computed"][7] += 85_000
     timing["plant_received"][7] = -1
     assert found(timing) == ["stalled host"]
 
@@ -69,13 +73,24 @@ def test_role_that_stood_still_while_it_looked(role):
 def test_work_that_is_too_long_for_the_tick():
     timing = good()
     timing["controller_sent"][::5] += 95_000  # every fifth tick: not an outlier
+    timing["controller_computed"][::5] += 95_000  # every fifth tick: not an outlier
     timing["plant_received"][::5] = -1
     assert found(timing) == ["own work"] * (TICKS // 5)
+
+
+@pytest.mark.parametrize("sent", ["plant_sent", "controller_sent"])
+def test_a_call_that_sends_for_too_long_is_the_links(sent):
+    """A write to a pseudo terminal may take longer than a tick: it is no work of ours."""
+    timing = good()
+    timing[sent][::5] += 95_000
+    timing["plant_received"][::5] = -1
+    assert found(timing) == ["link"] * (TICKS // 5)
 
 
 def test_work_that_was_interrupted_is_a_stall():
     timing = good()
     timing["controller_sent"][7] += 95_000
+    timing["controller_computed"][7] += 95_000
     timing["plant_received"][7] = -1
     assert found(timing) == ["stalled host"]
 
@@ -84,6 +99,7 @@ def test_event_on_the_tick_is_own_work():
     timing = good()
     timing["plant_woke"][7] += 90_000
     timing["plant_sent"][7] += 90_000
+    timing["plant_measured"][7] += 90_000
     timing["plant_received"][7] = -1
     assert found(timing, 7) == ["own work"]
 
@@ -95,6 +111,7 @@ def test_ticks_that_follow_have_the_cause_of_the_first():
     for k in (7, 8, 9, 10):
         timing["controller_received"][k] = back + 900 * (k - 7)
         timing["controller_sent"][k] = back + 900 * (k - 7) + 800
+        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
     timing["controller_stall"][7] = 3 * T
     timing["plant_received"][[7, 8, 9]] = -1
     assert found(timing) == ["stalled host"] * 3
@@ -107,6 +124,7 @@ def test_frames_lost_while_the_controller_stood_still_are_not_the_links():
     for k, late in ((7, 0), (8, 900)):
         timing["controller_received"][k] = back + late
         timing["controller_sent"][k] = back + late + 800
+        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
     timing["controller_stall"][7] = back - timing["plant_scheduled"][6] - 20_000
     for name in ("controller_received", "controller_computed", "controller_sent"):
         timing[name][9:13] = -1
@@ -122,6 +140,7 @@ def test_answer_that_was_held_up_with_its_sender_is_not_the_links():
     for k in (8, 9):
         timing["controller_received"][k] = back + 900 * (k - 8)
         timing["controller_sent"][k] = back + 900 * (k - 8) + 800
+        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
     timing["controller_stall"][8] = back - timing["controller_sent"][7]
     timing["plant_received"][[7, 8]] = -1
     assert found(timing) == ["stalled host"] * 2
@@ -134,6 +153,7 @@ def test_wait_that_was_longer_than_the_gap_in_it():
     for k in range(7, 16):
         timing["controller_received"][k] = max(back, timing["plant_sent"][k] + 15_000) + 900 * k
         timing["controller_sent"][k] = timing["controller_received"][k] + 800
+        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
     timing["controller_stall"][7] = 600_000
     timing["plant_received"][7:15] = -1
     assert found(timing) == ["stalled host"] * 8
@@ -145,6 +165,7 @@ def test_plant_that_is_behind_does_not_blame_its_timer():
     for k, late in ((8, 190_000), (9, 95_000)):
         timing["plant_woke"][k] += late
         timing["plant_sent"][k] += late
+        timing["plant_measured"][k] += late
     timing["plant_received"][[7, 8, 9]] = -1
     assert found(timing) == ["stalled host"] * 3
 
