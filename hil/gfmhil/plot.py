@@ -2,6 +2,7 @@
 
 from gfm_hil.api.plot import (
     bode,
+    clearing_times,
     impedance,
     nyquist,
     participations,
@@ -16,6 +17,7 @@ from gfm_hil.studies.scan_figures import admittance, nfp, nyquist_on_grid, passi
 __all__ = [
     "admittance",
     "bode",
+    "clearing_times",
     "impedance",
     "nfp",
     "nyquist",

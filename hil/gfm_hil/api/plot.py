@@ -30,6 +30,7 @@ from gfm_hil.results.figures import (
 )
 from gfm_hil.results.look import figure_of, look, own_colour, rc, with_look
 from gfm_hil.results.look import save as save
+from gfm_hil.studies.clearing import OF_ANGLE, ClearingTime
 from gfm_hil.studies.linear_loop import title_of
 from gfm_hil.studies.margin_figures import NO_POINT, draw_sigma
 from gfm_runtime.signals import U_NAMES, Y_NAMES
@@ -238,6 +239,27 @@ def stability_map(stability: StabilityMap) -> Axes:
     axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
     if np.isnan(stability.sigma).any():
         axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
+    return axes
+
+
+@with_look
+def clearing_times(times: Sequence[ClearingTime], scr: Sequence[float]) -> Axes:
+    """Draw results of ``gfmhil.clearing_time`` over the short-circuit ratios of their grids, s: a
+    cross where a longer fault ends by the protection, an arrow where the longest tried is borne."""
+    (axes,) = pyplot_panels(1, (6.6, 3.6))
+    order = np.argsort(scr)
+    x, y = np.asarray(scr, float)[order], np.array([times[k].seconds for k in order])
+    axes.plot(x, y, color=COLOURS[0], lw=rc("lines.linewidth", 1.2))
+    kinds = np.array(["^" if not times[k].loss else "o" if times[k].loss in OF_ANGLE else "x"
+                      for k in order])  # fmt: skip
+    names = {"o": "falls out of step", "x": "is tripped", "^": "bears longer ones"}
+    for mark, name in names.items():
+        some = kinds == mark
+        if some.any():
+            axes.plot(x[some], y[some], mark, color=COLOURS[0], ms=5, label=name)
+    axes.set(xlabel="short-circuit ratio", ylabel="clearing time [s]", ylim=(0.0, None))
+    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+    dress(axes, f"{times[0].law}: {times[0].title}")
     return axes
 
 
