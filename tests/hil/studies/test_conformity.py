@@ -843,6 +843,13 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
         (law,), (model,) = (found.of(of, test) for of in ("vsg-2", name))
         for one, other in zip(law.verdicts, model.verdicts, strict=True):
             assert other.value == pytest.approx(one.value, abs=1e-3) and other.text == one.text
+    # which has settled for a while before the test
+    (lab.parent / "map.toml").write_text("settle_s = 0.3\n")
+    more = {"inner": "virtual-stator", "controller": f"dll:{library}"}
+    later = gfmhil.conform(against=lab / "jump.toml", ports=lab.parent / "map.toml", **more)
+    (at_rest,), (settled,) = found.of(name, "lab/jump"), later.of(name, "lab/jump")
+    for one, other in zip(at_rest.verdicts, settled.verdicts, strict=True):
+        assert other.value == pytest.approx(one.value, abs=1e-3) and other.text == one.text
     # one controller cannot be both of a network
     network = gfmhil.conform(against="miso/1-loss-of-last-machine", controller=f"dll:{library}")
     assert set(network.matrix.values()) == {CANNOT}
