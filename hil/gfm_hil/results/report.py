@@ -251,6 +251,8 @@ def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     for machine, judged in summary["machines"].items():
         said = f", doctor: {judged['worst']} ({'; '.join(judged['findings'])})" if judged else ""
         yield "machine", machine + said
+    for note in summary.get("notes", ()):
+        yield f"note at {note['t']:g} s", note["text"]
     if any(summary["faults"].values()):
         missing = (
             f"{role}: {', '.join(f'{number} {name}' for name, number in counted.items()) or 'none'}"

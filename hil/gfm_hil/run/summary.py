@@ -21,6 +21,7 @@ from gfm_hil.run.metrics import event_metrics
 from gfm_hil.run.modes import acting, free_from
 from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.scenario import Scenario
+from gfm_hil.scenario.events.note import NOTE
 from gfm_hil.scenario.expectation import reason_name
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.inner_file import NO_INNER
@@ -90,6 +91,8 @@ def summarise(
         wall_s: how long the run took, s.
     """
     done = len(signals["tick"])
+    notes = [{"t": e["t"], "text": e["label"]} for e in log if e["event"] == NOTE]
+    log = [e for e in log if e["event"] != NOTE]
     met = [e for e in log if e["event"] == "handshake"]
     controller: str | None = met[0]["controller"] if met else OUR_CONTROLLER
     plant, ours = "true_p" in signals, "ref_P_ref" in signals
@@ -128,6 +131,8 @@ def summarise(
         "events": _events(scenario, signals if plant else None, log, trips, done),
         "run": met[0]["run"] if met else None,
     }
+    if notes:
+        summary["notes"] = notes
     if INSTRUCTIONS in timing:
         summary["instructions"] = _instructions(timing[INSTRUCTIONS])
     injected = {role: end["injected"] for role, end in links.items() if "injected" in end}

@@ -1,11 +1,16 @@
 """The scope in Chromium: a run is shown, commanded, trips, and is reset."""
 
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from PIL import Image
 from websockets.sync.client import connect
+
+from gfm_hil.recording.log import read_events
+from gfm_hil.scenario.events import EVENTS
 
 from ...support.processes import wait_for
 from ...support.scope import HAS_BROWSER, Browser, Rig, rig
@@ -102,18 +107,92 @@ def test_a_refused_command_says_why(page):
     assert page.text("#now-P_ref") == "0.500"
 
 
-def test_grid(page):
-    page.write("#set-f_hz", "50.02")
-    page.write("#set-rate", "0.5")
-    page.click("#set-frequency")
-    wait_for(lambda: "grid 50.02 Hz at 0.5 Hz/s at tick" in said(page, "Grid"))
-    wait_for(lambda: page.text("#now-f_g") == "50.020")
-    page.write("#set-degrees", "-1")
-    page.click("#jump")
-    wait_for(lambda: "phase jump -1° at tick" in said(page, "Grid"))
-    page.write("#set-f_hz", "50")
-    page.click("#set-frequency")
-    wait_for(lambda: page.text("#now-f_g") == "50.000")
+def opened(page: Browser, kind: str) -> None:
+    """Open the panel of a kind of event."""
+    if not page.js(f"return document.querySelector('[data-event={kind}]').open"):
+        page.click(f"[data-event={kind}] summary")
+
+
+def answer(page: Browser, kind: str, text: str) -> None:
+    """Wait until the run has answered a panel."""
+    wait_for(lambda: text in page.text(f"[data-event={kind}] .said"))
+
+
+def test_every_kind_of_event_has_a_panel_by_its_schema(going, page):
+    kinds = page.js(
+        "return [...document.querySelectorAll('[data-event]')].map((e) => e.dataset.event)"
+    )
+    page.click("#run")  # a still picture leaves the processors to the panels
+    # the others have sections of their own, and this run has no network
+    assert [*kinds] == [k for k in EVENTS if k not in ("reference", "law", "reset", "breaker")]
+    opened(page, "grid-frequency")
+    page.write("#set-grid-frequency-f_hz", "50.02")
+    page.write("#set-grid-frequency-rate", "0.5")
+    page.click("#do-grid-frequency")
+    answer(page, "grid-frequency", "grid 50.02 Hz at 0.5 Hz/s at tick")
+    page.write("#set-grid-frequency-rate", "")
+    page.write("#set-grid-frequency-f_hz", "50")
+    page.click("#do-grid-frequency")
+    answer(page, "grid-frequency", "grid 50 Hz at tick")
+    opened(page, "gains")
+    page.write("#set-gains-values", "D_p = 0.0101")
+    page.click("#do-gains")
+    answer(page, "gains", "D_p = 0.0101 at tick")
+    opened(page, "grid-unbalance")
+    page.write("#set-grid-unbalance-retained", "0.9, 1, 1")
+    page.write("#set-grid-unbalance-duration", "0.01")
+    page.click("#do-grid-unbalance")
+    answer(page, "grid-unbalance", "at tick")
+    opened(page, "fault")
+    page.choose("#set-fault-kind", "LG")
+    page.write("#set-fault-R", "-1")
+    page.click("#do-fault")
+    answer(page, "fault", "R: must be greater than or equal to 0, not -1")
+    opened(page, "note")
+    page.write("#set-note-text", "the lab is warm")
+    page.click("#do-note")
+    answer(page, "note", "the lab is warm at tick")
+    wait_for(lambda: "the lab is warm" in page.text("#log .operator"))
+    (note,) = [e for e in read_events(going.folder, 300_000) if e["event"] == "note"]
+    assert note["operator"]["name"] == "operator"
+
+
+def test_a_desk_of_ones_own(page, tmp_path):
+    """Single signals, SI units, kept layouts, a picture and a table of the window."""
+    page.driver.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
+    )
+    page.click("#si")
+    wait_for(lambda: abs(float(page.text("[data-strip=voltage] .now")) - 380.0) < 20.0)
+    page.click("#signals summary")
+    for strip in ("power", "frequency", "dc", "inputs", "loop", "one-d_V_g"):
+        page.click(f"#signal-list [data-strip={strip}]")
+    page.click("#layouts summary")
+    page.write("#layout-name", "voltages")
+    page.click("#keep button")
+    page.click("#si")
+    page.click("#signals summary")
+    page.click("#signal-list [data-strip=voltage]")
+    wait_for(lambda: page.text("[data-strip=one-d_V_g] .now") == "1.000")
+    page.driver.refresh()
+    wait_for_state(page)
+    assert page.js("return document.querySelectorAll('.strip').length") == 6
+    page.click("#layouts summary")
+    page.click("[data-layout=voltages]")
+    shown = "return [...document.querySelectorAll('.strip')].map((e) => e.dataset.strip)"
+    wait_for(lambda: page.js(shown) == ["voltage", "one-d_V_g"])
+    wait_for(lambda: page.text("[data-strip=one-d_V_g] .now") == "380.0")
+    page.click("#files summary")
+    page.click("#png")
+    page.click("#csv")
+    (picture,) = wait_for(lambda: [*tmp_path.glob("A-rig-*s.png")])
+    (table,) = wait_for(lambda: [*tmp_path.glob("A-rig-*s.csv")])
+    with Image.open(picture) as image:
+        assert image.width > 600 and len(image.convert("RGB").getcolors(2**20) or ()) > 8
+    heads, *rows = [line.split(",") for line in table.read_text("utf-8").splitlines()]
+    assert heads[0] == "t [s]" and heads[1].startswith("V [V]") and len(rows) > 100
+    assert 360.0 < float(rows[-1][1]) < 400.0
+    assert re.fullmatch(r"[0-9.e+-]+/s", page.text("#miss-rate"))
 
 
 def test_without_the_token_one_may_look_not_touch(going, page):

@@ -1,5 +1,6 @@
 """The channels of a scope: recorded columns with names and units, and figures of the loop."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from gfm_hil.recording.columns import CONTROLLER_INNER, DERIVED, I_REF, PHASES, TABLE, Columns, wave
 from gfm_hil.recording.timing import LATE, MISS_NEEDS, ROUND_TRIP, SLACK, Duration, missed
 from gfm_hil.recording.waveforms import NEEDS, Phase
+from gfm_plant import Bases
 from gfm_runtime.signals import names
 
 _LEAST = {"p.u.": 0.01, "Hz": 0.02, "°": 0.5, "": 1.0}  # of a channel's range, by its unit
@@ -27,6 +29,7 @@ class ScopeChannel:
     description: str
     least: float  # the smallest range of values that fills the height of a plot, in ``unit``
     needs: tuple[str, ...]  # columns of the recording from which it is computed
+    base: str  # of a value in p.u., see ``si_bases``; "" for other units
     # computes its values of the ticks [first, last) from the columns; NaN if there is none
     of: Callable[[Columns, int, int], NDArray[np.float64]]
 
@@ -39,6 +42,17 @@ class ScopeChannel:
         if any(name not in columns for name in self.needs):
             return np.full(last - first, np.nan, np.float32)
         return self.of(columns, first, last).astype(np.float32)
+
+
+def si_bases(bases: Bases) -> dict[str, tuple[str, float]]:
+    """The unit and the value of 1 p.u. in SI by the base of a channel."""
+    S, V = bases.S_n, bases.V_n
+    current = bases.base_of("I")
+    return {
+        "S_n": ("W", S), "Q_n": ("var", S), "V_n": ("V", V), "S_n/V_n": ("A", current),
+        "V_dcref": ("V", bases.V_dcref), "S_n/V_dcref": ("A", S / bases.V_dcref),
+        "peak v": ("V", math.sqrt(2 / 3) * V), "peak i": ("A", math.sqrt(2) * current),
+    }  # fmt: skip
 
 
 def make_channels(T_s: float, f_b: float) -> tuple[ScopeChannel, ...]:
@@ -55,11 +69,12 @@ def make_channels(T_s: float, f_b: float) -> tuple[ScopeChannel, ...]:
         *(_column(f"u_{n}", "inner", f"u_{n}", f_b) for n in names("u_inner")),
         *(_column(n, "inner", n, f_b) for n in CONTROLLER_INNER),
         ScopeChannel("i_ref", "inner", "i_ref", "p.u.", "size of the current that the inner stage"
-                     " asks for", _LEAST["p.u."], I_REF, _i_ref),
+                     " asks for", _LEAST["p.u."], I_REF, "S_n/V_n", _i_ref),
         _duration("slack", SLACK, 10.0, T_s),
         _duration("round_trip", ROUND_TRIP, 5.0, T_s),
         _duration("late", LATE, 5.0, T_s),
-        ScopeChannel("miss", "loop", "miss", "", "ticks without a fresh u", 1.0, MISS_NEEDS, _miss),
+        ScopeChannel("miss", "loop", "miss", "", "ticks without a fresh u", 1.0, MISS_NEEDS, "",
+                     _miss),
     )  # fmt: skip
 
 
@@ -70,19 +85,22 @@ def _column(name: str, group: str, column: str, f_b: float) -> ScopeChannel:
     def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
         return np.asarray(columns[column][first:last] * factor)
 
-    return ScopeChannel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), of)
+    base = row.unit.partition("(")[2].removesuffix(")") if unit == "p.u." else ""
+    base = "Q_n" if name in ("q", "Q_ref") else base
+    return ScopeChannel(name, group, symbol, unit, row.quantity, _LEAST[unit], (column,), base, of)
 
 
 def _phase(name: str, phase: str, T_s: float, f_b: float) -> ScopeChannel:
     """A phase of a voltage or current; the recording of a run that goes on has no column t."""
     row, needs = DERIVED[wave(name, phase, si=False)], NEEDS[1:]
+    base = f"peak {name}"
 
     def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
         part = {n: columns[n][first:last] for n in needs} | {"t": np.arange(first, last) * T_s}
         return Phase(part, name, phase, f_b)[:]
 
     return ScopeChannel(
-        row.name, "wave", row.symbol, "p.u.", row.quantity, _LEAST["p.u."], needs, of
+        row.name, "wave", row.symbol, "p.u.", row.quantity, _LEAST["p.u."], needs, base, of
     )  # fmt: skip
 
 
@@ -96,7 +114,7 @@ def _duration(name: str, duration: Duration, least: float, T_s: float) -> ScopeC
         return duration.us(columns, T_s, first, last)
 
     needs = duration.needs
-    return ScopeChannel(name, "loop", duration.name, "µs", duration.meaning, least, needs, of)
+    return ScopeChannel(name, "loop", duration.name, "µs", duration.meaning, least, needs, "", of)
 
 
 def _miss(columns: Columns, first: int, last: int) -> NDArray[np.float64]:

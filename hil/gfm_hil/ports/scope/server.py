@@ -23,12 +23,14 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.scope.channels import make_channels
+from gfm_hil.ports.scope.channels import make_channels, si_bases
 from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
 from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session, in_words
-from gfm_hil.scenario import INPROC
-from gfm_runtime import law_titles
+from gfm_hil.recording.run import bases
+from gfm_hil.scenario import INPROC, Scenario
+from gfm_hil.scenario.events import EVENTS
+from gfm_runtime import LawError, law_file, law_titles
 from gfm_runtime.signals import group
 from gfm_runtime.states import STATES
 
@@ -206,7 +208,9 @@ class Scope:
             "labels": self.record.laws,
             "laws": [*law_titles(s.laws()).items()],
             "limits": {r.name: [r.low, r.high] for r in group("ref")},
-            "grid_hz": s.plant.grid.omega_g * self.record.f_b,
+            "bases": si_bases(bases(s)),
+            "events": {name: kind.model_json_schema() for name, kind in EVENTS.items()},
+            "choices": _choices(s),
         }
 
     async def _command(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
@@ -221,6 +225,26 @@ class Scope:
                 raise UserError("a run in one process (link inproc) takes no commands")
             self._operator = Operator(self.record.folder)
         return self._operator.command(event, by)
+
+
+def _choices(scenario: Scenario) -> dict[str, list[str]]:
+    """What fields of events may name, by the field; none of what the run has not."""
+    network = scenario.network
+    dumped = {} if network is None else network.model_dump(exclude_none=True)
+    tables = {key: table for key, table in dumped.items() if isinstance(table, dict)}
+    parts = {name: part for table in tables.values() for name, part in table.items()}
+    nodes = {
+        part[end] for part in parts.values() for end in ("node", "start", "end") if end in part
+    }
+    gains: set[str] = set()
+    for law in scenario.laws():
+        with contextlib.suppress(LawError):  # its file may be gone
+            gains |= law_file(law).parameters.keys()
+    lines = [*tables.get("lines", {}), *scenario.converters]
+    return {
+        "converter": scenario.converters, "name": [*parts], "line": lines, "node": sorted(nodes),
+        "values": sorted(gains),
+    }  # fmt: skip
 
 
 def _listen(host: str, ports: list[int]) -> Listener:

@@ -18,6 +18,7 @@ from gfm_hil.scenario.events.grid_profile import GridProfile
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
 from gfm_hil.scenario.events.grid_voltage import GridVoltage
 from gfm_hil.scenario.events.law import LawChange
+from gfm_hil.scenario.events.note import Note
 from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.scenario.events.reference import Reference
 from gfm_hil.scenario.events.reset import Reset
@@ -26,6 +27,7 @@ from gfm_hil.scenario.events.reset import Reset
 _KINDS: tuple[type[Event], ...] = (
     Reference, LawChange, GainChange, Reset, GridFrequency, GridVoltage, GridProfile, PhaseJump,
     GridImpedance, GridLoad, GridUnbalance, Fault, FaultClear, GridBreaker, LineBreaker,
+    Note,
 )  # fmt: skip
 EVENTS = {get_args(kind.model_fields["type"].annotation)[0]: kind for kind in _KINDS}
 """The kinds of events by what ``type`` says in a scenario."""

@@ -1,9 +1,11 @@
 // The knobs: set-points, grid, law, reset. They only send requests; the run decides.
 
+import { fields, fits } from "./forms.js";
 import { make, symbol, value } from "./text.js";
 
 const SETPOINTS = [["P_ref", 0.1], ["Q_ref", 0.1], ["V_ref", 0.01]];
-export const WATCHED = ["P_ref", "Q_ref", "V_ref", "d_omega_g"];
+const OWN = new Set(["reference", "law", "reset"]); // with sections of their own
+export const WATCHED = SETPOINTS.map(([name]) => name);
 
 export class Knobs {
   // about: of the run; tell(event, name): sends an event, returns whether it was accepted
@@ -12,8 +14,8 @@ export class Knobs {
     this.about = about;
     this.now = {};
     this.inputs = {};
-    place.replaceChildren(this.state(), this.setpoints(), this.grid(), this.laws());
-    this.all = place.querySelectorAll("button, input");
+    place.replaceChildren(this.state(), this.setpoints(), this.laws(), this.events());
+    this.all = place.querySelectorAll("button, input, select");
     this.allow(false);
   }
 
@@ -90,22 +92,27 @@ export class Knobs {
     return section;
   }
 
-  grid() {
-    const frequency = [
-      this.row(symbol("f_g"), "f_hz", "now-f_g",
-        { step: 0.05, unit: "Hz", initial: +this.about.grid_hz.toFixed(6) }),
-      this.row("at", "rate", "", { step: 0.5, unit: "Hz/s", initial: 0, min: 0 }),
-    ];
-    const section = this.section("Grid",
-      this.form("Set", "set-frequency", frequency, () => {
-        const rate = +this.inputs.rate.value;
-        const event = { type: "grid-frequency", f_hz: +this.inputs.f_hz.value };
-        this.send(section, rate ? { ...event, rate } : event);
-      }),
-      this.form("Jump", "jump",
-        [this.row("phase", "degrees", "", { step: 5, unit: "°", initial: 10 })],
-        () => this.send(section, { type: "grid-phase-jump", degrees: +this.inputs.degrees.value })));
-    return section;
+  // A panel for each kind of event, by its schema.
+  events() {
+    const { events, choices } = this.about;
+    const kinds = Object.entries(events).filter(([kind, schema]) =>
+      !OWN.has(kind) && fits(schema, choices));
+    const panels = kinds.map(([kind, schema]) => {
+      const { rows, read } = fields(`set-${kind}`, schema, choices);
+      const form = make("form", { novalidate: true }, ...rows,
+        make("button", { class: "strong go", id: `do-${kind}` }, "Send"));
+      form.addEventListener("submit", (submit) => {
+        submit.preventDefault();
+        this.send(panel, { type: kind, ...read() });
+      });
+      const said = make("p", { class: "said", role: "status" });
+      const what = (schema.description ?? "").replace(/\s+/g, " ").replaceAll("``", "");
+      const panel = make("details", { "data-event": kind },
+        make("summary", {}, kind.replaceAll("-", " ")), make("p", { class: "hint" }, what), form, said);
+      panel.said = said;
+      return panel;
+    });
+    return make("section", { class: "events" }, make("h2", {}, "Events"), ...panels);
   }
 
   laws() {
@@ -149,8 +156,6 @@ export class Knobs {
       this.now[name] = now[name];
       this.write(`now-${name}`, value(now[name], "p.u."));
     }
-    this.now.f_hz = now.d_omega_g;
-    this.write("now-f_g", value(now.d_omega_g, "Hz"));
   }
 
   write(id, text) {

@@ -1,21 +1,24 @@
 // The page: assembles its parts.
 
 import { Cursors } from "./cursors.js";
+import { Layouts, savePicture, saveTable } from "./desk.js";
 import { Events, OverviewMap } from "./events.js";
 import { decode, times } from "./frame.js";
 import { Knobs, WATCHED } from "./knobs.js";
 import { Link } from "./link.js";
 import { Look } from "./look.js";
 import { THEMES, colour, watch } from "./palette.js";
-import { STRIPS, Strip, channelsOf } from "./strips.js";
+import { STRIPS, Strip, addSingles, channelsOf } from "./strips.js";
 import { make, span } from "./text.js";
 import { Tools } from "./tools.js";
 
 const get = (id) => document.getElementById(id);
 const WORDS = { RUNNING: "running, no fault", READY: "ready", INIT: "not started yet" };
 const WORDS_MS = 200; // numbers that change faster are illegible
+const RATE_S = 2; // of the run, over which misses are counted for their rate
 
 const events = new Events(document.querySelector("#log ol"));
+let si = false, counted = []; // counted: [ticks done, misses] of late
 let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
 let summary = null, reason = "", control = false, pictures = 0, told = 0, later = 0;
 
@@ -54,20 +57,48 @@ function heard(message) {
 }
 
 function begin(message) {
-  about = { ...message, byName: Object.fromEntries(message.channels.map((c) => [c.name, c])) };
+  // after a reconnection the page stays as the operator has it
+  about ??= { byName: Object.fromEntries(message.channels.map((c) => [c.name, {}])) };
+  Object.assign(about, message);
+  addSingles(message.channels);
   document.title = `${about.title} · gfmhil scope`;
   get("title").textContent = about.title;
   get("where").textContent = `${about.link}, ${about.mode}, T\u209B = ${span(about.T_s)}`;
   look.T_s = about.T_s;
   look.live = about.live;
   look.watched = WATCHED;
-  knobs = new Knobs(get("knobs"), about, tell);
-  tools ??= new Tools(look, about, { signals: layout, cursors: toggleCursors });
+  knobs ??= new Knobs(get("knobs"), about, tell);
+  useUnits();
+  tools ??= new Tools(look, about, { signals: layout, cursors: toggleCursors,
+    si: () => arrange({ si: !si }) });
   cursors ??= new Cursors(get("readout"), () => strips, about.byName, origin, redraw);
   if (!strips.length && !look.live) look.mode = "held", look.span = about.capacity * about.T_s;
   layout();
   permit();
 }
+
+// Units of the channels as they are shown: p.u. as they come, or SI.
+function useUnits() {
+  for (const channel of about.channels) {
+    const [unit, scale] = (si && about.bases[channel.base]) || [channel.unit, 1];
+    Object.assign(about.byName[channel.name], channel, { unit, scale, least: channel.least * scale });
+  }
+}
+
+const panels = () => [...document.querySelectorAll("[data-event]")];
+
+// Applies a layout, or what it says of one.
+function arrange({ shown, si: units, open }) {
+  if (shown) for (const strip of STRIPS) strip.shown = shown.includes(strip.name);
+  if (units !== undefined) si = units;
+  if (open) for (const panel of panels()) panel.open = open.includes(panel.dataset.event);
+  get("si").setAttribute("aria-pressed", String(si));
+  useUnits();
+  layout();
+}
+
+const present = () => ({ si, shown: STRIPS.filter((strip) => strip.shown).map(({ name }) => name),
+  open: panels().filter((panel) => panel.open).map((panel) => panel.dataset.event) });
 
 async function tell(event) {
   const answer = await link.tell(event);
@@ -93,6 +124,7 @@ function layout() {
   const wanted = strips.flatMap((strip) => channelsOf(strip.spec));
   look.channels = [...new Set(wanted)];
   look.bins = bins();
+  tools.follow();
   look.ask();
 }
 
@@ -128,6 +160,8 @@ function seen(buffer) {
   const asked = look.asked.get(id);
   if (!asked) return; // a frame of an outdated request
   const frame = decode(buffer, asked.channels, asked.watched);
+  frame.plain = { ...frame.now }; // as they came, p.u.
+  scale(frame);
   const before = look.frame;
   if (frame.same && before) frame.bins = before.bins, frame.low = before.low, frame.high = before.high;
   look.frame = frame;
@@ -138,6 +172,16 @@ function seen(buffer) {
     redraw();
   }
   words(frame);
+}
+
+function scale(frame) {
+  for (const values of [frame.low, frame.high]) {
+    for (const [name, list] of Object.entries(values)) {
+      const by = about.byName[name].scale;
+      if (by !== 1) values[name] = list.map((v) => v * by);
+    }
+  }
+  for (const name of Object.keys(frame.now)) frame.now[name] *= about.byName[name].scale;
 }
 
 function over() {
@@ -179,7 +223,8 @@ function drawEdge(u) {
 
 function drawLevel(u) {
   const { ctx, bbox } = u;
-  const top = Math.round(u.valToPos(look.trigger.level, "y", true)) + 0.5;
+  const level = look.trigger.level * about.byName[look.trigger.channel].scale;
+  const top = Math.round(u.valToPos(level, "y", true)) + 0.5;
   if (top < bbox.top || top > bbox.top + bbox.height) return;
   const r = devicePixelRatio;
   ctx.save();
@@ -219,16 +264,24 @@ function words(frame) {
   get("time").textContent = `${(frame.head * about.T_s).toFixed(2)} s`;
   get("misses").textContent = String(frame.misses);
   get("misses").parentElement.classList.toggle("some", frame.misses > 0);
+  get("miss-rate").textContent = frame.live ? `${missRate(frame)}/s` : "";
   for (const strip of strips) strip.tell(frame);
   const running = about.states[frame.state] ?? "";
   if (frame.live) state(running || "running", running);
   else state(summary && summary.status !== "over" ? `over: ${summary.status}` : "over",
     summary?.status ?? "over");
-  knobs.show(frame.now);
+  knobs.show(frame.plain);
   why();
   knobs.condition(running === "SAFE", law?.gains ? "" : law?.name, reason || WORDS[running] || "");
   map.show(events.events);
   tools.show();
+}
+
+// Misses a second of the run, of late.
+function missRate({ head, misses }) {
+  counted = [...counted, [head, misses]].filter(([at]) => at <= head && (head - at) * about.T_s <= RATE_S);
+  const [[from, before]] = counted;
+  return head > from ? +((misses - before) / ((head - from) * about.T_s)).toPrecision(2) : 0;
 }
 
 function state(text, kind) {
@@ -258,6 +311,11 @@ function permit() {
   get("panel").classList.toggle("ended", !look.live && Boolean(summary?.reason));
   knobs.allow(!text);
 }
+
+new Layouts(present, arrange);
+get("png").onclick = () => savePicture(strips, about.title,
+  ["state", "law", "time"].map((id) => get(id).textContent).join(" · "), look.done);
+get("csv").onclick = () => saveTable(strips, about.byName, look.frame, about.T_s, about.title);
 
 setInterval(() => {
   get("rate").textContent = pictures ? `${pictures} fps` : "";

@@ -28,6 +28,13 @@ export const STRIPS = [
     shown: false },
 ];
 
+// A strip of its own for every channel.
+export function addSingles(channels) {
+  if (STRIPS.some((strip) => strip.single)) return;
+  STRIPS.push(...channels.map(({ name, description }) => ({ name: `one-${name}`, title: description,
+    traces: [name], references: {}, shown: false, single: true })));
+}
+
 const STEPS = [];
 for (let e = -9; e < 7; e++) for (const m of [1, 2, 5]) STEPS.push(+`${m}e${e}`);
 

@@ -1,6 +1,6 @@
 // Numbers and elements.
 
-const DIGITS = { "p.u.": 3, Hz: 3, "µs": 1, "°": 2, "": 0 };
+const DIGITS = { "p.u.": 3, Hz: 3, "µs": 1, "°": 2, "": 0, W: 0, var: 0, V: 1, A: 2 };
 
 export function value(number, unit) {
   if (number === undefined || Number.isNaN(number)) return "–";

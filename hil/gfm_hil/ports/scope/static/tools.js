@@ -9,7 +9,7 @@ const get = (id) => document.getElementById(id);
 const DOING = { [ARMED]: "armed", [FILLING]: "triggered", [AUTO]: "auto", [HELD]: "held" };
 
 export class Tools {
-  // on: {signals(), cursors()}
+  // on: {signals(), cursors(), si()}
   constructor(look, about, on) {
     this.look = look;
     this.about = about;
@@ -24,25 +24,32 @@ export class Tools {
     get("shorter").onclick = () => this.step(-1);
     get("longer").onclick = () => this.step(1);
     get("cursors").onclick = on.cursors;
+    get("si").onclick = on.si;
     this.makeTrigger();
-    get("signal-list").replaceChildren(...STRIPS.map((strip) => {
-      const box = make("input", { type: "checkbox", "data-strip": strip.name,
-        checked: strip.shown });
+    this.boxes = new Map(STRIPS.map((strip) => {
+      const box = make("input", { type: "checkbox", "data-strip": strip.name });
       box.onchange = () => {
         strip.shown = box.checked;
         on.signals();
       };
-      return make("label", {}, box, strip.title);
+      return [strip, box];
     }));
+    const listed = (single) => [...this.boxes].filter(([strip]) => Boolean(strip.single) === single)
+      .map(([strip, box]) => make("label", { title: strip.title }, box,
+        single ? this.about.byName[strip.traces[0]].symbol : "", make("span", {}, strip.title)));
+    get("signal-list").replaceChildren(...listed(false), make("h2", {}, "Single signals"),
+      ...listed(true));
     document.addEventListener("keydown", (event) => this.key(event));
     document.addEventListener("click", (event) => {
-      if (!get("signals").contains(event.target)) get("signals").open = false;
+      for (const menu of document.querySelectorAll(".menu")) {
+        if (!menu.contains(event.target)) menu.open = false;
+      }
     });
   }
 
   makeTrigger() {
-    const channels = STRIPS.flatMap((strip) => [...strip.traces, ...(strip.marks ? [strip.marks] : [])]);
-    get("trigger-channel").replaceChildren(...channels.map((name) =>
+    const channels = new Set(STRIPS.flatMap((strip) => [...strip.traces, ...(strip.marks ? [strip.marks] : [])]));
+    get("trigger-channel").replaceChildren(...[...channels].map((name) =>
       make("option", { value: name }, this.about.byName[name].symbol)));
     const change = () => this.look.setTrigger(this.trigger());
     for (const id of ["trigger-mode", "trigger-channel", "trigger-edge"]) {
@@ -73,7 +80,8 @@ export class Tools {
   trigger() {
     const mode = get("trigger-mode").value;
     if (mode === "off") return null;
-    return { channel: get("trigger-channel").value, level: +get("trigger-level").value,
+    const channel = get("trigger-channel").value;
+    return { channel, level: +get("trigger-level").value / this.about.byName[channel].scale,
       edge: get("trigger-edge").value, mode };
   }
 
@@ -98,6 +106,14 @@ export class Tools {
     if (!act) return;
     event.preventDefault();
     act();
+  }
+
+  // Shows which strips there are, and the trigger's level in the present units.
+  follow() {
+    for (const [strip, box] of this.boxes) box.checked = strip.shown;
+    const { trigger } = this.look;
+    if (!trigger) return;
+    get("trigger-level").value = +(trigger.level * this.about.byName[trigger.channel].scale).toPrecision(6);
   }
 
   show() {
