@@ -60,7 +60,10 @@ def in_table(cell: str) -> tuple[list[str], list[str]]:
 
 
 def test_the_catalogue_is_table_ii_and_what_the_text_names():
-    assert sorted(law_names()) == sorted([*ROWS, *BESIDE])
+    known, where = {*ROWS, *BESIDE}, "of tests/runtime/test_laws.py"
+    assert not (new := {*law_names()} - known), f"enter {new} in ROWS or BESIDE {where}"
+    assert not (new := known - {*ORDERS}), f"enter the number of states of {new} in ORDERS {where}"
+    assert known == {*law_names()}
     assert law_names().index("vsg-2") < law_names().index("vsg-10"), "natural order"
 
 
@@ -140,7 +143,7 @@ def test_printed_structure_constraints():
     assert law.phi[2, 3](1j) == pytest.approx(0.05 * law.phi[2, 4](1j), rel=1e-4)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [name for name, law in LAWS.items() if law.name in ORDERS])
 def test_number_of_states(name):
     law = LAWS[name]
     assert realise(law).order == discretise(law, 1e-4).order == ORDERS[law.name]
