@@ -27,6 +27,7 @@ from gfm_hil.run.cycles import hann
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
+from gfm_hil.scenario.events.note import Note
 
 _SIGNALS = {"p": "p", "V": "V", "omega_u": "omega_u", "i": "|i|"}
 _SPAN = 1.0  # s at the end that are judged, at most
@@ -102,7 +103,8 @@ def _last_disturbance(scenario: Scenario, log: Sequence[dict[str, Any]], done: i
     """The tick at which the last event of a run, planned or an operator's, was over; a run without
     events is judged as a whole, for it begins at rest."""
     happened = [e["tick"] for e in log if "label" in e or e["event"] == "recovered"]
-    over = [e.at(scenario.T_s) + round(e.lasts() / scenario.T_s) for e in scenario.events]
+    acts = [e for e in scenario.events if not isinstance(e, Note)]
+    over = [e.at(scenario.T_s) + round(e.lasts() / scenario.T_s) for e in acts]
     return max([*happened, *over], default=-done)
 
 

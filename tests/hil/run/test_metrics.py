@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import gfmhil
 from gfm_hil.api.law import as_law
+from gfm_hil.core.errors import UserError
 from gfm_hil.run.cycles import cycle_means
 from gfm_hil.run.metrics import METRICS, event_metrics
 from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
@@ -289,3 +290,16 @@ def test_a_window_is_fitted_from_where_nothing_acts_any_more():
     assert free_from(until(SAG), 1000, 6000) == 4000
     assert free_from(until(SAG), 1000, 3500) == 1000  # all of it within the sag
     assert free_from([], 1000, 3500) == 1000
+
+
+def test_a_note_is_kept_and_cuts_no_response_short():
+    step = {"type": "reference", "t": 0.05, "P_ref": 0.6}
+    note = {"type": "note", "t": 0.1, "text": "the lab is warm"}
+    base = {"title": "x", "duration": 0.4, "link": {"type": "inproc"}}
+    plain, noted = (gfmhil.run({**base, "events": e}) for e in ([step], [step, note]))
+    assert noted.summary["notes"] == [{"t": 0.1, "text": "the lab is warm"}]
+    same = ("events", "ripple_pu", "status")
+    assert [noted.summary[k] for k in same] == [plain.summary[k] for k in same]
+    assert "notes" not in plain.summary
+    with pytest.raises(UserError, match=r"events\.0\.text"):
+        gfmhil.run({**base, "events": [{**note, "text": "two\nlines"}]})
