@@ -3,8 +3,9 @@ benchmarks.network``.
 
 Every converter runs VSG-2 behind its own feeder to one bus with a load, and all that a run in
 process does is in the tick: the plant, the controllers, the recording. ``--case case39`` has a
-published case instead, with converters at the buses of ``--converters``. Rounds of all sizes take
-turns. Times are those of the processor, so that a busy machine counts little.
+published case instead, with converters at the buses of ``--converters``, and ``--bridges`` the
+paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts.
+Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
 its EMT solver takes for the same feeders, in three phases, with a voltage source in place of each
@@ -46,6 +47,29 @@ def star(n: int) -> Scenario:
     )  # fmt: skip
 
 
+def rigs() -> dict[str, Scenario]:
+    """The rig with MIMO-GFM, nominal resistances and several bridges."""
+    late = {"kind": "two-level", "dead_time_s": 2e-6}
+    drops = {"V_switch": 1.5, "V_diode": 1.2, "R_switch": 0.03, "R_diode": 0.02}
+    bridges = {
+        "averaged": None,
+        "two levels": {"kind": "two-level"},
+        "two levels, 2 us": late,
+        "two levels, 2 us, drops": late | drops,
+        "three levels": {"kind": "t-type"},
+        "three levels, 2 us": late | {"kind": "t-type"},
+    }
+    nominal = {"R_f": 1.0, "R_g": 1.0}
+    made = {
+        name: load_scenario(
+            "rig_pref_step", in_process=True, plant__factors=nominal, plant__bridge=bridge
+        )
+        for name, bridge in bridges.items()
+    }
+    made["two levels, 2 us, from counts"] = load_scenario("rig_switched", in_process=True)
+    return made
+
+
 def published(case: str, converters: str, folder: str) -> Scenario:
     """A power-flow case, with droop-3 at some of its buses; its files stay in a folder."""
     made = gfmhil.network_from(case, dict.fromkeys(converters.split(","), "droop-3"))
@@ -69,7 +93,8 @@ class Case:
         self.start = [array.copy() for array in self.arrays]
         wiring = self.plant.wiring
         self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
-        self.way = "series" if self.plant.net["sparse"][0] else "modes"
+        net = self.plant.net[0]
+        self.way = "series" if net["sparse"] or net["n_units"] else "modes"
         self.ns: list[float] = []
         self.round()  # compiles
         self.ns.clear()
@@ -136,12 +161,15 @@ def main() -> None:
     parser.add_argument("--sizes", default="1,2,4,10,30,100,300", help="converters on feeders")
     parser.add_argument("--case", help="a published case instead, such as case39")
     parser.add_argument("--converters", default="30", help="its buses with converters")
+    parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
     if asked.case:
         with tempfile.TemporaryDirectory() as folder:
             scenario = published(asked.case, asked.converters, folder)
             cases = [Case(asked.case, scenario)]
+    elif asked.bridges:
+        cases = [Case(name, scenario) for name, scenario in rigs().items()]
     else:
         cases = [Case("feeders", star(int(n))) for n in asked.sizes.split(",")]
     for _ in range(asked.rounds):
@@ -156,7 +184,7 @@ def main() -> None:
         least, middle = min(case.ns) / 1e3, float(np.median(case.ns)) / 1e3
         sizes = " | ".join(map(str, case.sizes))
         theirs = ""
-        if asked.dpsim and not asked.case:
+        if asked.dpsim and not (asked.case or asked.bridges):
             theirs = f" {dpsim(case.sizes[0], case.ticks // 10) / 1e3:.3g} |"
         print(
             f"| {case.name} | {sizes} | {case.way} | {case.set_up:.2g} | {least:.3g} |"

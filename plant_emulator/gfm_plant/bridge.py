@@ -20,6 +20,7 @@ from gfm_plant.dc_link import discharge
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, terminal
 from gfm_plant.period import limit_voltage, take_command
+from gfm_plant.powers import begin_powers
 from gfm_plant.records import COMPARE, N_GATES, PlantRecords
 from gfm_plant.series import (
     DC,
@@ -32,6 +33,7 @@ from gfm_plant.series import (
     bend,
     choose_powers,
     end_series,
+    find_path,
     find_terms,
     hold_current,
     limit_of,
@@ -50,6 +52,7 @@ _MOST_EVENTS = 200  # in a unit of the carrier; then currents may pass zero unse
 _MOST_STEPS = 100  # of a search
 _BALANCE = 10.0  # of v_dc that legs are moved by, per p.u. of the midpoint's displacement
 _RESOLUTION = 1e-14  # p.u.; what is watched has happened where it is further above zero
+_NEAR = 1e-8  # part of an interval; Newton's next step is none
 
 
 class Topology(NamedTuple):
@@ -76,9 +79,9 @@ TOPOLOGIES = {
 }  # fmt: skip
 
 # what ends an interval before its time: + the leg, its current is zero; it begins to conduct
-# outwards, or inwards; + 3 * outwards + inwards, two legs begin to; the DC source's limit; the
-# limit of phase currents
-_NOTHING, _ZERO, _OUT, _IN, _PAIR, _LIMIT, _PEAK = -1, 0, 3, 6, 9, 20, 21
+# outwards, or inwards; + 3 * outwards + inwards, two legs begin to; + the leg, its current is at
+# its limit, + 3 inwards; the DC source is at its limit, or leaves it
+_NOTHING, _OUT, _IN, _PAIR, _PEAK, _LIMIT, _EVENTS = -1, 3, 6, 9, 18, 24, 26
 _ALL = 3  # legs without current
 
 
@@ -258,7 +261,8 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None
         s = plant.st[k]
         s.soonest = s.next[0] = s.next[1] = s.next[2] = begin
     while t < end:
-        until, watched = min(end, t + longest), False
+        last = until = min(end, t + longest)
+        watched = limited = False
         for k in range(n.n_converters):
             r, s = plant.par[k], plant.st[k]
             if s.soonest <= t + _INSTANT:
@@ -268,8 +272,13 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None
             if s.due > 0:
                 _prepare(plant, k, c)
             until = min(until, s.soonest)
-            watched = watched or s.open >= 0 or _flows(s) or s.i_most[0] < math.inf
-            watched = watched or r.i_peak < math.inf
+            limited = limited or _limited(r, s)
+            watched = watched or limited or s.open >= 0 or _flows(s)
+        if field(n, "alone")[c]:
+            begin_powers(plant.now[0], plant.st[0].slot)
+            # a limit might be reached before edges that are passed already
+            if plant.par[0].dead > 0.0 and not limited and plant.st[0].open < 0:
+                until = _pass_edges(plant, c, t, last)
         h, tau, which, what = until - t, 1.0, -1, _NOTHING
         terms = find_terms(plant, c, h)
         if watched and events < _MOST_EVENTS:
@@ -277,7 +286,7 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None
         for k in range(n.n_converters):
             if t == begin and plant.par[k].filtered:
                 _see(plant.par[k], plant.st[k], 0)
-            if tau < 1.0:
+            if tau < 1.0 and k != which:
                 look(plant, k, c, h, terms, tau)
             _sense(plant, k, c, h, terms, tau)
         accept(plant, c, tau * h, terms, tau)
@@ -293,14 +302,73 @@ def _switch(r: Any, s: Any, t: float) -> None:
     s.soonest, s.due = math.inf, 2
     for x in range(3):
         if s.next[x] <= t + _INSTANT:
+            s.level[x], s.gate[x], s.on_at[x] = _switched(r, s, x, t)
             e_0, e_1 = s.edges[x, 0], s.edges[x, 1]
-            level = s.base[x] + (1 if t < e_0 or t >= e_1 else 0)
-            if level != s.level[x] and s.base[x] >= 0:
-                _command(r, s, x, level, t)
-            while s.on_at[x] <= t + _INSTANT:
-                _turn_on(r, s, x, t)
             s.next[x] = min(e_0 if t < e_0 else (e_1 if t < e_1 else math.inf), s.on_at[x])
         s.soonest = min(s.soonest, s.next[x])
+
+
+@inlined
+def _switched(r: Any, s: Any, x: int, t: float) -> tuple[int, int, float]:
+    """Return the level and the gates of leg x after an instant of a unit, and when its dead time
+    ends."""
+    level, gate, on_at = s.level[x], s.gate[x], s.on_at[x]
+    to = s.base[x] + (1 if t < s.edges[x, 0] or t >= s.edges[x, 1] else 0)
+    if to != level and s.base[x] >= 0:  # what is on turns off at once
+        level = to
+        if r.dead == 0.0 or (gate == r.off and gate % 2 == 1 and r.levels > 2):
+            gate, on_at = 2 * level, math.inf
+        elif gate % 2 == 1:
+            on_at = t + r.dead
+        elif gate != 2 * level:
+            gate, on_at = gate + (1 if 2 * level > gate else -1), t + r.dead
+    while on_at <= t + _INSTANT:
+        up = 1 if 2 * level > gate else -1
+        gate, on_at = gate + up, math.inf
+        if gate != 2 * level:
+            gate, on_at = gate + up, t + r.dead
+    return level, gate, on_at
+
+
+@compiled
+def _pass_edges(plant: PlantRecords, c: int, t: float, last: float) -> float:
+    """Let the gates of the only bridge change as long as its equations stay the same, since each
+    current that decides keeps its sign; returns when they do not, at the latest ``last``."""
+    r, s = plant.par[0], plant.st[0]
+    while s.soonest < last and _stay(plant, c, t):
+        _switch(r, s, s.soonest)
+        for x in range(3):
+            if not r.wide[s.gate[x]]:
+                s.flows[x] = 0
+    return min(s.soonest, last)
+
+
+@inlined
+def _stay(plant: PlantRecords, c: int, t: float) -> bool:
+    """Return whether the equations stay the same at the next change of the gates of the only
+    bridge, in an interval from t on."""
+    n, r, s, x = plant.net[0], plant.par[0], plant.st[0], field(plant.now[0], "vector")
+    at = s.soonest
+    unsure = 4.0 * bend(plant, 0, c, at + r.dead - t)  # from a tangent; bend: from a chord
+    for y in range(3):
+        changes = s.next[y] <= at + _INSTANT
+        if changes or s.flows[y] != 0:
+            i, slope = _of_leg(n, c, y, x[0, 0], x[0, 1]), _of_leg(n, c, y, x[1, 0], x[1, 1])
+            begin = i if s.flows[y] != 0 else i + slope * (at - t)
+            end = i + slope * (at - t + (r.dead if changes else 0.0))
+            if not (min(begin, end) > unsure or max(begin, end) < -unsure):
+                return False
+            if changes:
+                side, gate = 1 if end < 0.0 else 0, _switched(r, s, y, at)[1]
+                if r.band_kind[gate, side] != r.band_kind[s.gate[y], side]:
+                    return False
+    return True
+
+
+@inlined
+def _limited(r: Any, s: Any) -> bool:
+    """Return whether the limits of phase currents or of the DC source may end an interval."""
+    return r.i_peak < math.inf or s.i_most[0] < math.inf
 
 
 @inlined
@@ -310,37 +378,12 @@ def _flows(s: Any) -> bool:
 
 
 @inlined
-def _command(r: Any, s: Any, x: int, level: int, t: float) -> None:
-    """Begin to bring leg x to a level: what is on turns off at once."""
-    s.level[x] = level
-    gate, wanted = s.gate[x], 2 * level
-    if r.dead == 0.0 or (gate == r.off and gate % 2 == 1 and r.levels > 2):
-        s.gate[x], s.on_at[x] = wanted, math.inf
-    elif gate % 2 == 1:
-        s.on_at[x] = t + r.dead
-    elif gate != wanted:
-        s.gate[x] = gate + 1 if wanted > gate else gate - 1
-        s.on_at[x] = t + r.dead
-
-
-@inlined
-def _turn_on(r: Any, s: Any, x: int, t: float) -> None:
-    """End a dead time of leg x."""
-    wanted = 2 * s.level[x]
-    up = 1 if wanted > s.gate[x] else -1
-    s.gate[x] += up
-    s.on_at[x] = math.inf
-    if s.gate[x] != wanted:
-        s.gate[x] += up
-        s.on_at[x] = t + r.dead
-
-
-@inlined
-def _voltage(r: Any, s: Any, x: int, side: int, v_dc: float, mid: float, i: float) -> float:
+def _voltage(r: Any, s: Any, x: int, side: int, end: int, i: float) -> float:
     """Return the voltage of leg x above the lower rail, p.u. of v_dc, with the current i, p.u.,
-    along its axis; ``side`` is 0 where it flows outwards."""
+    along its axis; ``side`` is 0 where it flows outwards, ``end`` a row of ``ends``."""
     b = r.band[s.gate[x], side]
-    return b[0] * v_dc + b[1] * mid + b[2] - b[3] * i / (1.5 * r.leg)
+    constant = b[2] if end < 2 else 0.0
+    return b[0] * s.ends[end, DC] + b[1] * s.ends[end, MID] + constant - b[3] * i / (1.5 * r.leg)
 
 
 @inlined
@@ -367,7 +410,7 @@ def _settle(plant: PlantRecords, k: int, c: int) -> None:
     s.open = -1
     if none >= 2:
         hold_current(plant, k, c, 0j)
-        excess, out, into = _drives(n, c, r, s, 0)
+        excess, out, into = _drives(n, c, r, s)
         if excess > 0.0:
             _conduct_pair(plant, k, c, out, into)
         else:
@@ -377,20 +420,26 @@ def _settle(plant: PlantRecords, k: int, c: int) -> None:
 
 
 @compiled
-def _drives(n: Any, c: int, r: Any, s: Any, end: int) -> tuple[float, int, int]:
+def _drives(n: Any, c: int, r: Any, s: Any) -> tuple[float, int, int]:
     """Return by how much the circuit would drive a current through a bridge without any, p.u. of
-    v_dc, and the legs by which it would leave and enter it; ``end``: of the interval, 0 or 1."""
+    v_dc, and the legs by which it would leave and enter it."""
     out = into = 0
     low, high = -math.inf, math.inf
     for x in range(3):
-        outside = _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / (1.5 * r.leg)
-        least = _voltage(r, s, x, 0, s.ends[end, DC], s.ends[end, MID], 0.0) - outside
-        most = _voltage(r, s, x, 1, s.ends[end, DC], s.ends[end, MID], 0.0) - outside
+        least, most = _against(n, c, r, s, x, 0, 0), _against(n, c, r, s, x, 1, 0)
         if least > low:
             low, out = least, x
         if most < high:
             high, into = most, x
     return low - high, out, into
+
+
+@inlined
+def _against(n: Any, c: int, r: Any, s: Any, x: int, side: int, end: int) -> float:
+    """Return by how much the voltage by which a current leaves, or enters, leg x is above the
+    circuit's."""
+    outside = _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / (1.5 * r.leg)
+    return _voltage(r, s, x, side, end, 0.0) - outside
 
 
 @compiled
@@ -409,16 +458,14 @@ def _conduct_pair(plant: PlantRecords, k: int, c: int, out: int, into: int) -> N
 def _beyond(n: Any, c: int, r: Any, s: Any, x: int, end: int) -> tuple[float, float]:
     """Return by how much the voltage of leg x, which has no current and whose two others conduct,
     is below the least and above the largest one that it can have, p.u. of v_dc."""
-    v_dc, mid, mean = s.ends[end, DC], s.ends[end, MID], 0.0
+    mean = 0.0
     for y in range(3):
         if y != x:
             side = 1 if s.flows[y] < 0 else 0
             i = r.current * _of_leg(n, c, y, s.ends[end, 0], s.ends[end, 1])
-            mean += 0.5 * _voltage(r, s, y, side, v_dc, mid, i)
+            mean += 0.5 * _voltage(r, s, y, side, end, i)
     has = mean + _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / r.leg
-    return (
-        _voltage(r, s, x, 0, v_dc, mid, 0.0) - has, has - _voltage(r, s, x, 1, v_dc, mid, 0.0)
-    )  # fmt: skip
+    return _voltage(r, s, x, 0, end, 0.0) - has, has - _voltage(r, s, x, 1, end, 0.0)
 
 
 @compiled
@@ -519,104 +566,153 @@ def _times(q_aa: float, q_ab: float, q_bb: float, z: complex) -> complex:
     return complex(q_aa * z.real + q_ab * z.imag, q_ab * z.real + q_bb * z.imag)
 
 
-@compiled
+@inlined
 def _first_event(plant: PlantRecords, c: int, h: float, terms: int) -> tuple[float, int, int]:
     """Return when in the interval, as a part of it, the first of what is watched happens; in which
-    converter; and what."""
-    n, first, which, what = plant.net[0], 1.0, -1, _NOTHING
+    converter; and what. ``ends`` of that converter lead there then."""
+    n, first, slope, which, what = plant.net[0], 1.0, 0.0, -1, _NOTHING
     for k in range(n.n_converters):
         r, s = plant.par[k], plant.st[k]
-        if first < 1.0:
-            look(plant, k, c, h, terms, first)
-        f_0, f_1 = _excess(n, c, r, s, 0)[0], _excess(n, c, r, s, 1)[0]
-        # paths of currents are nearly straight
-        straight = s.open < 0 and s.i_most[0] == math.inf
-        if straight and max(f_0, f_1) < -r.current * bend(plant, k, c, h):
-            continue
-        a, f_a, most = 0.0, f_0, first
-        for part in range(1, 5):  # a current may leave zero and come back
-            b = 0.25 * part * most
-            look(plant, k, c, h, terms, b)
-            f_b, happens = _excess(n, c, r, s, 1)
-            if f_b > _RESOLUTION:
-                first, what = _search(plant, k, c, h, terms, a, f_a, b, f_b, happens)
-                which = k
-                break
-            a, f_a = b, f_b
+        known, most = False, _OUT
+        if _limited(r, s):
+            most = _EVENTS
+        elif s.open >= 0:
+            most = _PEAK if s.open == _ALL else _PAIR
+        for one in range(most):
+            if not _watches(r, s, one):
+                continue
+            highest = max(_excess(n, c, r, s, one, 0), _excess(n, c, r, s, one, 1))
+            if one < _OUT and highest < -r.current * bend(plant, k, c, h):
+                continue  # paths of currents are nearly straight
+            if not known:
+                find_path(plant, k, c, h, terms)
+                known = True
+            at, steep = _crossing(n, c, r, s, one, first)
+            if at < first:
+                first, slope, which, what = at, steep, k, one
+    if what != _NOTHING:
+        first = _search(plant, which, c, h, terms, what, first, slope)
+        if math.isnan(first):
+            return 1.0, -1, _NOTHING
     return first, which, what
+
+
+@inlined
+def _watches(r: Any, s: Any, what: int) -> bool:
+    """Return whether an event may end the interval of a converter."""
+    if what < _OUT:
+        return s.flows[what] != 0
+    if what < _PAIR:
+        return s.open == what % 3
+    if what < _PEAK:
+        out, into = (what - _PAIR) // 3, (what - _PAIR) % 3
+        return s.open == _ALL and out != into
+    if what < _LIMIT:
+        return r.i_peak < math.inf and s.base[0] >= 0
+    return s.trip == 0 and s.i_most[0] < math.inf
+
+
+@compiled
+def _excess(n: Any, c: int, r: Any, s: Any, what: int, end: int) -> float:
+    """Return what is above zero where an event has happened, at an end of the interval, or a term
+    of its series: rows of ``ends``."""
+    if what < _OUT:
+        return -s.flows[what] * r.current * _of_leg(n, c, what, s.ends[end, 0], s.ends[end, 1])
+    if what < _PAIR:
+        return _beyond(n, c, r, s, what % 3, end)[0 if what < _IN else 1]
+    if what < _PEAK:
+        out, into = (what - _PAIR) // 3, (what - _PAIR) % 3
+        return _against(n, c, r, s, out, 0, end) - _against(n, c, r, s, into, 1, end)
+    one = 1.0 if end < 2 else 0.0
+    if what < _LIMIT:
+        sign = 1.0 if what < _PEAK + 3 else -1.0
+        i = _of_leg(n, c, (what - _PEAK) % 3, s.ends[end, 0], s.ends[end, 1])
+        return sign * r.current * i - one * r.i_peak
+    below = one - s.ends[end, DC]
+    asked = r.k_p * below + s.ends[end, REG]
+    if s.limit == 0.0:
+        return asked - one * s.i_most[0] if what == _LIMIT else one * s.i_most[1] - asked
+    if what == _LIMIT:
+        return s.limit * (one * limit_of(s) - asked)
+    return s.limit * below * (1.0 if s.winds > 0.0 else -1.0)
+
+
+@compiled
+def _crossing(
+    n: Any, c: int, r: Any, s: Any, what: int, most: float
+) -> tuple[float, float]:  # fmt: skip
+    """Return about when an event first happens, as a part of the interval up to ``most`` (inf: it
+    does not), and how steep its excess is there.
+
+    By its series up to tau^N_PATH, and a further term that leads to its end.
+    """
+    p_0, p_1, p_2, p_3, p_4 = (
+        _excess(n, c, r, s, what, 0), _excess(n, c, r, s, what, 2), _excess(n, c, r, s, what, 3),
+        _excess(n, c, r, s, what, 4), _excess(n, c, r, s, what, 5),
+    )  # fmt: skip
+    p_5 = _excess(n, c, r, s, what, 1) - (p_0 + p_1 + p_2 + p_3 + p_4)
+    a, f_a = 0.0, p_0
+    for part in range(1, 5):  # a current may leave zero and come back
+        b = 0.25 * part * most
+        f_b = p_0 + b * (p_1 + b * (p_2 + b * (p_3 + b * (p_4 + b * p_5))))
+        if f_b > _RESOLUTION:
+            break
+        a, f_a = b, f_b
+    if a == most:
+        return math.inf, 0.0
+    at, slope = 0.5 * (a + b), 0.0
+    if f_a < -_RESOLUTION:  # else it may be that of a current which has just begun to flow
+        at = (a * f_b - b * f_a) / (f_b - f_a)
+    for _ in range(_MOST_STEPS):
+        f = p_0 + at * (p_1 + at * (p_2 + at * (p_3 + at * (p_4 + at * p_5))))
+        slope = p_1 + at * (2.0 * p_2 + at * (3.0 * p_3 + at * (4.0 * p_4 + at * 5.0 * p_5)))
+        a, b = (a, at) if f > 0.0 else (at, b)
+        to = _newton(a, b, at, f, slope)
+        at, step = to, abs(to - at)
+        if step < _NEAR:
+            break
+    return at, slope
+
+
+@inlined
+def _newton(a: float, b: float, at: float, f: float, slope: float) -> float:
+    """Return where f is zero by its slope, or the middle if that is not between a and b."""
+    to = at - f / slope
+    return to if a < to < b else 0.5 * (a + b)
 
 
 @compiled
 def _search(
-    plant: PlantRecords, k: int, c: int, h: float, terms: int,
-    a: float, f_a: float, b: float, f_b: float, what: int,
-) -> tuple[float, int]:  # fmt: skip
-    """Return where the excess is zero, between a, where it is not above, and b, where it is; and
-    what it is of. By false position (the Illinois form)."""
-    side = 0
+    plant: PlantRecords, k: int, c: int, h: float, terms: int, what: int, at: float, slope: float
+) -> float:  # fmt: skip
+    """Take ``ends`` to where an event happens, near a part of the interval; returns that part. NaN,
+    and ``ends`` at its end: it only nearly does."""
+    n, r, s = plant.net[0], plant.par[k], plant.st[k]
+    a, b, f = 0.0, 1.0, 0.0
     for _ in range(_MOST_STEPS):
-        at = 0.5 * (a + b)
-        if f_a < -_RESOLUTION:  # else it may be that of a current which has just begun to flow
-            at = (a * f_b - b * f_a) / (f_b - f_a)
-        if not a < at < b or f_b < _RESOLUTION:
-            break
         look(plant, k, c, h, terms, at)
-        f, happens = _excess(plant.net[0], c, plant.par[k], plant.st[k], 1)
-        if f > 0.0:
-            b, f_b, what = at, f, happens
-            f_a *= 0.5 if side == 1 else 1.0
-            side = 1
-        else:
-            a, f_a = at, f
-            f_b *= 0.5 if side == -1 else 1.0
-            side = -1
-    return b, what
-
-
-@compiled
-def _excess(n: Any, c: int, r: Any, s: Any, end: int) -> tuple[float, int]:
-    """Return the largest of what is watched of a converter at an end of the interval, each above
-    zero where it has happened, and which it is."""
-    worst, what = -math.inf, _NOTHING
-    for x in range(3):
-        if s.flows[x] != 0:
-            value = -s.flows[x] * r.current * _of_leg(n, c, x, s.ends[end, 0], s.ends[end, 1])
-            if value > worst:
-                worst, what = value, _ZERO + x
-    if s.open == _ALL:
-        value, out, into = _drives(n, c, r, s, end)
-        if value > worst:
-            worst, what = value, _PAIR + 3 * out + into
-    elif s.open >= 0:
-        least, most = _beyond(n, c, r, s, s.open, end)
-        if max(least, most) > worst:
-            worst = max(least, most)
-            what = (_OUT if least > most else _IN) + s.open
-    if r.i_peak < math.inf and s.base[0] >= 0:
-        value = _over_peak(n, c, r, s, end)
-        if value > worst:
-            worst, what = value, _PEAK
-    if s.trip == 0 and s.i_most[0] < math.inf:
-        v_dc = s.ends[end, DC]
-        asked = r.k_p * (1.0 - v_dc) + s.ends[end, REG]
-        if s.limit == 0.0:
-            value = max(asked - s.i_most[0], s.i_most[1] - asked)
-        else:
-            wound = s.limit * (1.0 - v_dc)
-            value = max(s.limit * (limit_of(s) - asked), wound if s.winds > 0.0 else -wound)
-        if value > worst:
-            worst, what = value, _LIMIT
-    return worst, what
+        f = _excess(n, c, r, s, what, 1)
+        if abs(f) <= _RESOLUTION:
+            break
+        a, b = (a, at) if f > 0.0 else (at, b)
+        to = _newton(a, b, at, f, slope)
+        if to == at:
+            break
+        at = to
+    if f < -_NO_CURRENT:
+        look(plant, k, c, h, terms, 1.0)
+        return math.nan
+    return at
 
 
 @compiled
 def _change(plant: PlantRecords, k: int, c: int, what: int) -> None:
     """Go on after an event in converter k, in the state at its instant."""
     r, s = plant.par[k], plant.st[k]
-    s.due = 1
-    if what == _LIMIT:
+    s.due = max(s.due, 1)
+    if what >= _LIMIT:
         _watch_source(r, s)
-    elif what == _PEAK:
+    elif what >= _PEAK:
         _block(r, s)
         s.due = 2
     elif what >= _PAIR:
@@ -692,10 +788,11 @@ def _weights(x: float) -> tuple[float, float, float, float]:
     """Return the weights of a first-order low-pass after x time constants: of its state, and of a
     parabola through its input at the beginning, the middle and the end."""
     if x < 0.1:
-        f_3 = 1 / 6 - x * (1 / 24 - x * (1 / 120 - x * (1 / 720 - x * (1 / 5040))))
+        y = x * x  # by powers of two, so that few products wait for each other
+        f_3 = (1 / 6 - x * (1 / 24)) + y * ((1 / 120 - x * (1 / 720)) + y * (1 / 5040))
         f_2 = 0.5 - x * f_3
-        f_1 = 1.0 - x * f_2
-        whole = 1.0 - x * f_1
+        f_1 = (1.0 - 0.5 * x) + y * f_3
+        whole = (1.0 - x) + y * f_2
     else:
         whole, f_1, f_2, f_3 = integrals(x)
     return (

@@ -35,6 +35,8 @@ TERMS = 24
 POWERS, ORDER, SLOTS = 5, 16, 256
 """How many powers of a matrix `powers` keeps, of which order, and of how many matrices."""
 
+_LINE = 64  # bytes of a line of the processor's cache, at which every array begins
+
 _NET: _Arrays = {
     "to_grid": (float, ("n_w",)),  # what each state of w brings to the grid, as a current
     # one sampling period in stretches, between the instants at which a command begins to act; each
@@ -316,14 +318,16 @@ def _allocate(header: np.dtype[np.void], arrays: _Arrays, lengths: dict[str, int
     formats, offsets = [f[0] for f in fields.values()], [f[1] for f in fields.values()]
     places, end = dict[str, int](), header.itemsize
     for name, (kind, shape) in arrays.items():
-        places[f"{name}_at"] = end = -(-end // 16) * 16
+        places[f"{name}_at"] = end = -(-end // _LINE) * _LINE
         formats.append(np.dtype((kind, tuple(lengths.get(str(n), n) for n in shape))))
         offsets.append(end)
         end += formats[-1].itemsize
     whole: Any = {
         "names": [*fields, *arrays], "formats": formats, "offsets": offsets, "itemsize": end
     }  # fmt: skip
-    record: Record = np.zeros(1, np.dtype(whole))
+    memory = np.zeros(end + _LINE, np.uint8)
+    first = -memory.ctypes.data % _LINE
+    record: Record = memory[first : first + end].view(np.dtype(whole))
     for name, value in (lengths | places).items():
         if name in fields:
             record[name] = value

@@ -105,14 +105,14 @@ def _store(builder: Any, vectors: Any, row: int, values: list[Any]) -> None:
 
 @intrinsic
 def _series(
-    typingctx: Any, power: Any, slot: Any, vectors: Any, h: Any, levels: Any, size: Any, whole: Any
+    typingctx: Any, power: Any, slot: Any, vectors: Any, h: Any, levels: Any, size: Any
 ) -> Any:
-    """Write x(h) to the last row of ``vectors``. ``whole``: take A^k x from x, row 0, and keep them
-    in rows k; else they are there already."""
-    literals = levels, size, whole
+    """Write x(h), by A^k x in rows k, to the last row of ``vectors``; no ``levels``: write A^k x by
+    x, row 0."""
+    literals = levels, size
     if not all(isinstance(one, types.Literal) for one in literals):
         return None
-    n_levels, n, begins = (one.literal_value for one in literals)
+    n_levels, n = (one.literal_value for one in literals)
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kinds, first = signature.args, builder.mul(arguments[1], _INT(POWERS * ORDER * ORDER))
@@ -121,9 +121,12 @@ def _series(
         rows = _pointer(context, builder, kinds[2], arguments[2])
         x: list[list[Any]] = [
             [builder.load(_at(builder, rows, k * ORDER + 4 * b), align=8) for b in range(n // 4)]
-            for k in range(1 if begins else POWERS)
+            for k in range(POWERS if n_levels else 1)
         ]
-        if begins:
+        if n_levels:
+            y = _sum(builder, matrix[-1], x, arguments[3], n_levels, n)
+            _store(builder, rows, POWERS, y)
+        else:
             zero = ir.Constant(_FOUR, [0.0] * 4)
             x += [[zero] * (n // 4) for _ in range(POWERS - 1)]
             for column, those in enumerate(_BLOCKS[n]):
@@ -134,37 +137,34 @@ def _series(
                         x[k][b] = _add(builder, entry, value, x[k][b])
             for k in range(1, POWERS):
                 _store(builder, rows, k, x[k])
-        y = _sum(builder, matrix[-1], x, arguments[3], n_levels, n)
-        _store(builder, rows, POWERS, y)
         return context.get_dummy_value()
 
     return types.void(power, types.int64, vectors, types.float64, *literals), make
 
 
 @inlined
-def begin_powers(now: Any, slot: int, h: float, levels: int) -> None:
-    """Find A^k x and x(h), rows k and POWERS of ``vector``, from x, its row 0, as long as
-    ``now.order`` says; x(h) by ``levels`` of Q_i, 2 or 3."""
+def begin_powers(now: Any, slot: int) -> None:
+    """Find A^k x, rows k of ``vector``, from x, its row 0, as long as ``now.order`` says."""
+    power, vector = field(now, "power"), field(now, "vector")
+    if now.order == SMALL:
+        _series(power, slot, vector, 0.0, 0, SMALL)
+    else:
+        _series(power, slot, vector, 0.0, 0, ORDER)
+
+
+@inlined
+def go_to(now: Any, slot: int, h: float, levels: int) -> None:
+    """Find x(h), row POWERS of ``vector``, after ``begin_powers``; by ``levels`` of Q_i, 2 or 3."""
     power, vector = field(now, "power"), field(now, "vector")
     if now.order == SMALL:
         if levels == 2:
-            _series(power, slot, vector, h, 2, SMALL, True)
+            _series(power, slot, vector, h, 2, SMALL)
         else:
-            _series(power, slot, vector, h, 3, SMALL, True)
+            _series(power, slot, vector, h, 3, SMALL)
     elif levels == 2:
-        _series(power, slot, vector, h, 2, ORDER, True)
+        _series(power, slot, vector, h, 2, ORDER)
     else:
-        _series(power, slot, vector, h, 3, ORDER, True)
-
-
-@compiled
-def go_to(now: Any, slot: int, h: float) -> None:
-    """Find x(h), row POWERS of ``vector``, after ``begin_powers``."""
-    power, vector = field(now, "power"), field(now, "vector")
-    if now.order == SMALL:
-        _series(power, slot, vector, h, 3, SMALL, False)
-    else:
-        _series(power, slot, vector, h, 3, ORDER, False)
+        _series(power, slot, vector, h, 3, ORDER)
 
 
 @compiled

@@ -24,6 +24,7 @@ N_PHASES = 10  # channels of the A/D at the phases, in the order of the group ``
 N_TRIPS = 7  # protections with a threshold, in the order of `protection.TRIP_REASONS`
 N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds follow
 N_LIVE = 10  # states of a converter with a switched bridge, see ``ends``
+N_PATH = 4  # terms of its path between two edges, see ``ends``
 N_GATES = 6  # states of the gates of a leg, at most, see `bridge`
 N_RING = 256  # places of a ring that holds one cycle
 
@@ -182,12 +183,13 @@ converter_state_dtype = np.dtype(
         ("open", "i8"),
         # of the interval between two edges: the states i_f, v, i_o (alpha and beta), v_dc, integral
         # of the source's control with i_u, current of the source, and midpoint, at its beginning
-        # and where it leads to; what v and i_o change by in a second there; what has to be done
+        # and where it leads to, and the first terms of the series between the two, see
+        # `series.find_path`; what v and i_o change by in a second there; what has to be done
         # before it: 1: equations, 2: find what conducts besides; the matrix of `powers` in
         # force; the bridge's voltage by v_dc, by mid and by nothing, as
         # a space vector, and what they and the voltage at its terminal, and the current, do to the
         # current, 1/s
-        ("ends", "f8", (2, N_LIVE)),
+        ("ends", "f8", (2 + N_PATH, N_LIVE)),
         ("slopes", "f8", (2, 4)),
         ("due", "i8"),
         ("slot", "i8"),

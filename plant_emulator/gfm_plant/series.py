@@ -21,19 +21,8 @@ import numpy as np
 
 from gfm_plant.layout import ORDER, POWERS, TERMS, field
 from gfm_plant.model import V_DC
-from gfm_plant.powers import (
-    MID_AT,
-    ONE,
-    SMALL,
-    SOURCE_AT,
-    N,
-    P,
-    begin_powers,
-    fill_powers,
-    find_slot,
-    go_to,
-)
-from gfm_plant.records import I_F, I_O, PlantRecords, V
+from gfm_plant.powers import MID_AT, ONE, SMALL, SOURCE_AT, N, P, fill_powers, find_slot, go_to
+from gfm_plant.records import I_F, I_O, N_PATH, PlantRecords, V
 from gfm_plant.solution import grid_source, own
 from gfm_plant.sparse import ENOUGH, how_many, turned
 from gfm_runtime.compiled import compiled, inlined
@@ -150,17 +139,15 @@ def hold_current(plant: PlantRecords, k: int, c: int, i: complex) -> None:
 @inlined
 def find_terms(plant: PlantRecords, c: int, h: float) -> int:
     """Find the series of an interval of h s from the present states on, and where it leads to;
-    returns how many terms of ``terms`` it has."""
+    returns how many terms of ``terms`` it has. `begin_powers` comes before."""
     n, now = plant.net[0], plant.now[0]
-    size = h * field(n, "fastest")[c]
     if field(n, "alone")[c]:
         terms, s, x = 0, plant.st[0], field(now, "vector")
-        begin_powers(now, s.slot, h, 2 if size < _TWO_LEVELS else 3)
-        _read_powers(plant, c)
         for j in range(4):
             s.slopes[0, j] = x[1, 2 + j]
+        _lead(plant, c, h)
     else:
-        terms = how_many(size)
+        terms = how_many(h * field(n, "fastest")[c])
         _find_together(plant, c, h, terms)
         x_1 = field(now, "terms")
         for k in range(n.n_converters):
@@ -170,6 +157,40 @@ def find_terms(plant: PlantRecords, c: int, h: float) -> int:
             s.slopes[0, 2], s.slopes[0, 3] = per_h * i_o.real, per_h * i_o.imag
             look(plant, k, c, h, terms, 1.0)
     return terms
+
+
+@compiled
+def find_path(plant: PlantRecords, k: int, c: int, h: float, terms: int) -> None:
+    """Write the terms of tau, ..., tau^N_PATH of converter k's series of an interval to ``ends``,
+    behind the ends."""
+    now, s = plant.now[0], plant.st[k]
+    if field(plant.net[0], "alone")[c]:
+        x, d = field(now, "vector"), 1.0
+        for j in range(1, N_PATH + 1):
+            d *= h * _PER[j]
+            for i in range(REG + 1):
+                s.ends[1 + j, i] = d * x[j, i]
+            s.ends[1 + j, SOURCE], s.ends[1 + j, MID] = 0.0, 0.0
+            if now.order == ORDER:
+                s.ends[1 + j, SOURCE], s.ends[1 + j, MID] = d * x[j, SOURCE_AT], d * x[j, MID_AT]
+        return
+    y, dc = field(now, "terms"), field(now, "dc_terms")
+    for j in range(1, N_PATH + 1):
+        there = j <= terms  # further terms are of another interval
+        for i in range(3):
+            z = y[j, own(k) + i] if there else 0j
+            s.ends[1 + j, 2 * i], s.ends[1 + j, 2 * i + 1] = z.real, z.imag
+        for what in range(4):
+            s.ends[1 + j, DC + what] = dc[j, k, what] if there else 0.0
+
+
+@inlined
+def _lead(plant: PlantRecords, c: int, h: float) -> None:
+    """Take ``ends`` of the only converter to h s after the beginning of the interval."""
+    n = plant.net[0]
+    levels = 2 if h * field(n, "fastest")[c] < _TWO_LEVELS else 3
+    go_to(plant.now[0], plant.st[0].slot, h, levels)
+    _read_powers(plant, c)
 
 
 @inlined
@@ -202,8 +223,7 @@ def look(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) 
     """Take ``ends`` of converter k to a part tau of the interval."""
     n, now, s = plant.net[0], plant.now[0], plant.st[k]
     if field(n, "alone")[c]:
-        go_to(now, s.slot, tau * h)
-        _read_powers(plant, c)
+        _lead(plant, c, tau * h)
         return
     x, dc = field(now, "terms"), field(now, "dc_terms")
     for i in range(3):
