@@ -94,6 +94,7 @@ class FrequencyScan:
         nfp: network frequency perturbation: change of the power that the converter gives over the
             change of the grid's frequency behind the line, p.u. over p.u., shape (K,).
         nfp_model: the same of the linear model, or None.
+        rest: voltage and current at the filter capacitor without perturbation, d + jq, p.u.
         line: R and L of the grid of the measurement, p.u.
         omega: base and grid frequency, rad/s and p.u.
         amplitude: of each tone, p.u. and rad.
@@ -108,6 +109,7 @@ class FrequencyScan:
     model: Response | None
     nfp: Response
     nfp_model: Response | None
+    rest: tuple[complex, complex]
     line: tuple[float, float]
     omega: tuple[float, float]
     amplitude: float
@@ -126,6 +128,23 @@ class FrequencyScan:
     def passivity(self) -> Vector:
         """The least eigenvalue of Y + Y^H, p.u., shape (K,), negative where Y is not passive."""
         return passivity(self.Y)
+
+    def stiffness(self, Y: Response) -> tuple[Response, Response]:
+        """P/θ and Q/V at the point of connection, behind the converter's transformer if it has one:
+        the change of the power that the converter gives over the change of the voltage's angle,
+        p.u./rad, and of its reactive power over the voltage's magnitude, p.u.; shape (K,) each.
+
+        Args:
+            Y: at the filter capacitor, measured or of the model, shape (K, 2, 2).
+        """
+        lcl, (v_0, i_0) = self.scenario.plant.lcl, self.rest
+        if lcl is not None:
+            Y = np.asarray(np.linalg.inv(np.linalg.inv(Y) + self._impedance(lcl.R, lcl.L)))
+            v_0 = v_0 - (lcl.R + 1j * self.omega[1] * lcl.L) * i_0
+        v, i = (np.array([x.real, x.imag]) for x in (v_0, i_0))
+        angle, size = np.array([-v[1], v[0]]), v / abs(v_0)  # of v, by its angle and by its length
+        across = np.array([[0.0, 1.0], [-1.0, 0.0]])  # q = i (across v)
+        return -Y @ angle @ v + i @ angle, -Y @ size @ across @ v + i @ across @ size
 
     def grid(self, scr: float, x_over_r: float) -> Response:
         """The dq impedance of a grid, shape (K, 2, 2), p.u.
@@ -717,8 +736,8 @@ def _found(
         answer = _power(np.asarray(v[..., 0]), np.asarray(-(model @ v)[..., 0]), q.rest)
         nfp_model = answer / _frequency(q.v_g, hz, q.rest[2], omega[0])
     return FrequencyScan(
-        name, scenario, hz, -amps @ np.linalg.inv(volts), model, nfp, nfp_model, line, omega,
-        amplitude, settle_s, settled,
+        name, scenario, hz, -amps @ np.linalg.inv(volts), model, nfp, nfp_model, q.rest[:2], line,
+        omega, amplitude, settle_s, settled,
     )  # fmt: skip
 
 

@@ -161,3 +161,47 @@ def test_a_recorded_voltage_is_played_as_the_grid_that_made_it(tmp_path):
     for name in ("p", "q"):
         off = np.abs(again.signals[name] - run.signals[name]).max()
         assert off < 1e-3 and np.ptp(run.signals[name]) > 0.3, (name, off)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"file": "none.csv"}, r"none\.csv: no such file"),
+        ({"map": "none.toml"}, r"none\.toml: No such file"),
+        ({"to": "none/grid.csv"}, r"none/grid\.csv: No such file"),
+        ({"f": ""}, r"map\.toml: channels\.f: missing; the grid needs it"),
+        ({"f": "g"}, r"site\.csv: channel 'g': is not in it"),
+        (
+            {"V": "volts"},
+            r"V = 380 p\.u\. 0\.003 s after its begin: must lie in \[0, 1\.5\]; units",
+        ),
+        ({"V": "below"}, r"site\.csv: V = -0\.1 p\.u\. 0\.009 s after its begin: must lie in"),
+        ({"f_n": 60.0, "f": "slow"}, r"site\.csv: f = 0\.6667 p\.u\. 0 s after .* \[0\.8, 1\.2\]"),
+        ({"most": 5}, r"site\.csv: would make 10 lines: must be <= 5; give a larger T_s"),
+        ({"f_n": 0.0}, "f_n = 0.0: must be > 0"),
+        ({"T_s": float("nan")}, "T_s = nan: must be > 0"),
+    ],
+)
+def test_what_cannot_be_played_as_a_grid_is_refused_in_one_line(
+    change, says, tmp_path, monkeypatch
+):
+    if "most" in change:
+        monkeypatch.setattr("gfm_hil.recording.foreign.played.MOST_LINES", change["most"])
+    columns = {
+        "t": 1e-3 * np.arange(10), "p": np.full(10, 0.5), "u": np.ones(10), "hz": np.full(10, 50.0),
+        "volts": np.where(np.arange(10) == 3, 380.0, 1.0), "below": 0.8 - 0.1 * np.arange(10),
+        "slow": np.full(10, 40.0),
+    }  # fmt: skip
+    rows = zip(*columns.values(), strict=True)
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in rows)]
+    (tmp_path / "site.csv").write_text("\n".join(lines))
+    channels = f'p = "p"\nq = "p"\nV = "{change.get("V", "u")}"\n'
+    if f := change.get("f", "hz"):
+        channels += f'f = {{ channel = "{f}", unit = "Hz" }}\n'
+    (tmp_path / "map.toml").write_text(f"S_n = 4e3\nV_n = 380.0\n[channels]\n{channels}")
+    where = {"file": "site.csv", "map": "map.toml", "to": "grid.csv"}
+    paths = {key: tmp_path / change.get(key, name) for key, name in where.items()}
+    how = {key: change[key] for key in ("f_n", "T_s") if key in change}
+    with pytest.raises(UserError, match=says) as found:
+        gfmhil.grid_profile(*paths.values(), **how)
+    assert "\n" not in str(found.value) and not paths["to"].exists()

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 import gfmhil
+from gfm_design.margins.admittance import line_impedance
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, toml_text
+from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, load_scenario, toml_text
 from gfm_hil.studies import envelopes
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.base import judge
@@ -51,6 +52,7 @@ from gfm_hil.studies.conformity.verdict import (
     Verdict,
     worst,
 )
+from gfm_hil.studies.scan import FrequencyScan
 from gfm_hil.testing.gate import gate
 from gfm_plant import load_converter
 from gfm_plant.options import Grid
@@ -583,7 +585,7 @@ def test_a_converter_of_ones_own_lies_beside_its_file(tmp_path, monkeypatch):
 def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path):
     cases = load_cases(["all"])
     sets = {
-        "miso", "aemo", "ercot", "gb", "ieee1547", "ieee2800", "fingrid", "openibr", "rte",
+        "miso", "aemo", "ercot", "esig", "gb", "ieee1547", "ieee2800", "fingrid", "openibr", "rte",
         "withstand",
     }  # fmt: skip
     assert {case.id.split("/")[0] for case in cases} == {*shipped_sets()} == sets
@@ -797,6 +799,7 @@ def test_a_run_that_has_no_operating_point_cannot_be_judged(lab):
         ('known = "ours"', 'known = "rumour"', "rumour"),
         ('kind = "no_trip"', 'kind = "nfp"\nunknown = "why"', "nfp: must be its only criterion"),
         ('kind = "no_trip"', 'kind = "nfp"', "bands, unknown: give one of them"),
+        ('kind = "no_trip"', 'kind = "stiffness"\nleast_P = 1.0', "least_Q, unknown: give both"),
         ("least = 0.05", "least = 0.05\nat = [7.0]", "at = 7"),
         (
             'kind = "no_trip"', 'kind = "settles"\ntolerance = 0.1\nwithin = 0.5\nto = "befor"',
@@ -911,6 +914,28 @@ def test_a_plot_is_judged_in_its_bands(band, verdict, at):
     if at is not None:
         x = np.degrees(np.angle(nfp)) if "phase" in next(iter(band)) else np.abs(nfp)
         assert found.value == pytest.approx(x[hz == at][0]) and f"At {at:.3g} Hz" in found.text
+
+
+@pytest.mark.parametrize("lcl", [None, {"L": 0.15, "earthed": True}])
+def test_p_over_theta_and_q_over_v_are_those_of_a_voltage_behind_a_reactance(lcl):
+    """At rest EV cos(delta)/X and |E cos(delta) - 2 V|/X, at whatever angle the frame lies."""
+    X, E, V, delta, hz = 0.45, 1.05, 0.98, 0.2, np.array([1e-4, 2e-4])
+    behind = 0.15 if lcl else 0.0
+    scenario = load_scenario("pref_step", plant={"lcl": lcl} if lcl else {})
+    Y = np.linalg.inv(line_impedance(hz, 0.0, X - behind, OMEGA_B))
+    i_o = (E * np.exp(1j * delta) - V) / (1j * X)
+    rest = tuple(np.exp(0.3j) * np.array([V + 1j * behind * i_o, i_o]))
+    nfp, omega = np.ones(2, complex), (OMEGA_B, 1.0)
+    scan = FrequencyScan(
+        "source", scenario, hz, Y, None, nfp, None, rest, (0.0, 0.2), omega, 0.0, 0.0, 0.0
+    )
+    P, Q = E * V * math.cos(delta) / X, abs(E * math.cos(delta) - 2 * V) / X
+    asked = {"from_hz": 1.0, "to_hz": 2.0, "least_P": 0.999 * P}
+    verdicts = one("stiffness", **asked, least_Q=1.001 * Q).judge_scan(scan)
+    assert [v.value for v in verdicts] == pytest.approx([P, Q], rel=1e-6)
+    assert [v.verdict for v in verdicts] == [PASS, FAIL]
+    (_, unknown) = one("stiffness", **asked, unknown="nobody says").judge_scan(scan)
+    assert unknown.verdict == CANNOT and "nobody says. The least |Q/V|" in unknown.text
 
 
 NFP = text_of("plot.toml")

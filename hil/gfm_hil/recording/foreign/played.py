@@ -12,7 +12,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.recording.foreign.channels import read_recording_map
 from gfm_hil.recording.foreign.files import read_channels
 from gfm_hil.recording.foreign.signals import sampled
-from gfm_runtime.signals import SIGNALS
+from gfm_hil.scenario.events.grid_profile import MOST_LINES, RANGES
 
 _LEAST_V = 0.1  # p.u.; the angle of a smaller voltage is not followed
 
@@ -33,8 +33,12 @@ def grid_profile(
         T_s: least time between lines, s: the sampling time of the scenario.
 
     Raises:
-        UserError: a file cannot be read or written, a channel is missing.
+        UserError: a file cannot be read or written, a channel is missing, V or f is beyond what a
+            grid may have, or there are more lines than an event takes.
     """
+    for name, value in ("f_n", f_n), ("T_s", T_s):
+        if not (math.isfinite(value) and value > 0):
+            raise UserError(f"{name} = {value}: must be > 0")
     try:
         s = sampled(read_channels(Path(file)), read_recording_map(Path(map)), f_n)
     except UserError as problem:
@@ -44,14 +48,28 @@ def grid_profile(
     f = s.of.get("f", s.of.get("f_grid"))
     if f is None:
         raise UserError(f"{map}: channels.f: missing; the grid needs it, or v and i")
-    low, high = {x.name: (x.low, x.high) for x in SIGNALS if x.group == "d"}["omega_g"]
     there = np.isfinite(f)
     if not there.any():
         raise UserError(f"{file}: V stays below {_LEAST_V} p.u.: it has no frequency")
     t = s.t - s.t[0]
-    omega_g = np.clip(np.interp(t, t[there], f[there]), low, high)
     every = slice(None, None, max(1, round(T_s / s.dt)))
-    columns = {"t": t[every], "omega_g": omega_g[every], "V_g": np.clip(s.of["V"][every], 0, 1.5)}
+    columns = {"t": t, "omega_g": np.interp(t, t[there], f[there]), "V_g": s.of["V"]}
+    columns = {name: x[every] for name, x in columns.items()}
+    if (count := len(columns["t"])) > MOST_LINES:
+        raise UserError(
+            f"{file}: would make {count} lines: must be <= {MOST_LINES}; give a larger T_s"
+        )
+    if s.vectors:  # what a jump makes of the frequency, the column degrees makes up for
+        columns["omega_g"] = np.clip(columns["omega_g"], *RANGES["omega_g"])
+    for name, said in ("omega_g", "f"), ("V_g", "V"):
+        low, high = RANGES[name]
+        x = columns[name]
+        k = int(np.argmax(np.maximum(low - x, x - high)))
+        if not low <= x[k] <= high:
+            raise UserError(
+                f"{file}: {said} = {x[k]:.4g} p.u. {columns['t'][k]:.4g} s after its begin: must "
+                f"lie in [{low:g}, {high:g}]; units and bases are those of {map}"
+            )
     if s.vectors:
         omega_n = 2 * math.pi * f_n
         ahead = s.vectors["v"] * np.exp(-1j * omega_n * t)
@@ -61,5 +79,8 @@ def grid_profile(
         turned = omega_n * 0.5 * (off[1:] + off[:-1]) * np.diff(columns["t"])
         columns["degrees"] = np.concatenate([[0.0], np.degrees(np.diff(angle) - turned)])
     rows = (",".join(f"{x:.9g}" for x in row) for row in np.stack([*columns.values()], 1))
-    write_text(Path(to), "\n".join([",".join(columns), *rows]) + "\n")
+    try:
+        write_text(Path(to), "\n".join([",".join(columns), *rows]) + "\n")
+    except OSError as problem:
+        raise UserError(f"{to}: {problem.strerror}") from None
     return Path(to)

@@ -26,8 +26,9 @@ from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import SIGNALS
 
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g", "degrees")
-_RANGE = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
-_MOST = 100_000  # lines
+#: of omega_g and V_g, p.u.
+RANGES = {s.name: (s.low, s.high) for s in SIGNALS if s.group == "d"}
+MOST_LINES = 100_000
 LARGEST_FILE = 64 << 20
 
 
@@ -161,8 +162,8 @@ def _lines(text: Any, file: str) -> Iterator[tuple[int, list[str]]]:
     """The lines that are not for people, with their numbers."""
     reader = csv.reader(text)
     for found, cells in enumerate(c for c in reader if c and not c[0].lstrip().startswith("#")):
-        if found > _MOST:
-            raise UserError(f"{file}: more than {_MOST} lines; thin it out")
+        if found > MOST_LINES:
+            raise UserError(f"{file}: more than {MOST_LINES} lines; thin it out")
         yield reader.line_num, cells
 
 
@@ -182,9 +183,9 @@ def _value(name: str, cell: str, f_n: float | None, where: str) -> float:
         value = float(cell)
     except ValueError:
         raise UserError(printable(f"{where}: {name} = {cell!r:.80}: must be a number")) from None
-    low, high = (-360.0, 360.0) if name == "degrees" else _RANGE.get(name, (0.0, 86400.0))
+    low, high = (-360.0, 360.0) if name == "degrees" else RANGES.get(name, (0.0, 86400.0))
     if name == "f_hz":
-        low, high = (limit * f_n for limit in _RANGE["omega_g"]) if f_n else (0.0, math.inf)
+        low, high = (limit * f_n for limit in RANGES["omega_g"]) if f_n else (0.0, math.inf)
     if not (math.isfinite(value) and low <= value <= high):
         raise UserError(f"{where}: {name} = {value:g}: must lie in [{low:g}, {high:g}]")
     return value

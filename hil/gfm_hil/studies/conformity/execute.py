@@ -31,7 +31,7 @@ from gfm_hil.run.runner import (
 from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge, own_droop
-from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
@@ -325,7 +325,7 @@ def _run_part(job: Job) -> PartResult:
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
         return PartResult(*names, "none", reason, cannot(criteria, reason))
-    external, plot = job.external, criteria[0] if isinstance(criteria[0], Nfp) else None
+    external, plot = job.external, criteria[0] if isinstance(criteria[0], Plot) else None
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
@@ -358,7 +358,7 @@ def _run_part(job: Job) -> PartResult:
                 from gfm_hil.studies.conformity.figure import draw_panels  # half a second to import
 
                 if plot is not None:
-                    panels = panels_of_plot(found, verdicts)
+                    panels = panels_of_plot(plot, found, verdicts)
                 else:
                     panels = panels_of_run(run, verdicts)
                 path = place / "figure.png"
@@ -368,7 +368,7 @@ def _run_part(job: Job) -> PartResult:
         return PartResult(*names, status, reason, verdicts, again_text, recording, figure)
 
 
-def _again(scenario: str, plot: Nfp | None, external: ControllerUnderTest | None) -> list[str]:
+def _again(scenario: str, plot: Plot | None, external: ControllerUnderTest | None) -> list[str]:
     """The command that repeats the run of a scenario file; none for the plot of a model."""
     if plot is not None:
         return plot.again(scenario) if external is None else []

@@ -16,6 +16,7 @@ from gfm_hil.results.curves import Panel
 from gfm_hil.results.figures import COLOURS
 from gfm_hil.run.cycles import cycle_means, cycle_ticks
 from gfm_hil.studies.conformity.criteria.base import at_connection
+from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     CONSISTENT,
@@ -96,21 +97,17 @@ def panels_of_run(run: Run, verdicts: Sequence[Verdict]) -> list[Panel]:
     return found
 
 
-def panels_of_plot(found: FrequencyScan, verdicts: Sequence[Verdict]) -> list[Panel]:
-    """Gain and phase of a network-frequency-perturbation plot."""
-    hz, model = found.frequency, found.nfp_model
-    panels = []
-    for title, of, unit in (
-        ("gain |Δp / Δω_g| [p.u./p.u.]", np.abs, "p.u./p.u."),
-        ("phase of Δp / Δω_g [°]", lambda z: np.degrees(np.angle(z)), "°"),
-    ):
-        curves = {} if model is None else {"linear model": np.asarray(of(model), np.float64)}
-        curves["measured"] = np.asarray(of(found.nfp), np.float64)
-        marks = _marks([(k, v) for k, v in enumerate(verdicts, 1) if v.unit == unit], 1.0)
+def panels_of_plot(plot: Plot, found: FrequencyScan, verdicts: Sequence[Verdict]) -> list[Panel]:
+    """The panels of a measured plot."""
+    hz, panels = found.frequency, []
+    for curve in plot.curves(found):
+        curves = {} if curve.model is None else {"linear model": curve.model}
+        curves["measured"] = curve.measured
+        marks = _marks([(k, v) for k, v in enumerate(verdicts, 1) if v.unit == curve.unit], 1.0)
         ends = float(hz[0]), float(hz[-1])
         over = "frequency of the perturbation [Hz]"
-        log = (True, unit != "°")
-        panels.append(Panel(title, hz, curves, ends, marks=marks, over=over, log=log))
+        log = (True, curve.log)
+        panels.append(Panel(curve.title, hz, curves, ends, marks=marks, over=over, log=log))
     return panels
 
 

@@ -23,7 +23,7 @@ from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, toml_text
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.base import KNOWN, Clause, Publication, UnderTest
-from gfm_hil.studies.conformity.criteria.nfp import Nfp
+from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_plant import ConverterParameters, load_converter
 from gfm_runtime.errors import allowed, printable
 from gfm_runtime.toml_file import read_toml
@@ -98,8 +98,9 @@ class Test(StrictSchema):
             raise ValueError(f"parts: names {names}: each once")
         for part in self.runs():
             asked = self.asked(part)
-            if any(isinstance(c, Nfp) for c in asked) and len(asked) > 1:
-                raise ValueError(f"parts {part.name!r}: nfp: must be its only criterion")
+            plot = next((c.kind for c in asked if isinstance(c, Plot)), None)
+            if plot is not None and len(asked) > 1:
+                raise ValueError(f"parts {part.name!r}: {plot}: must be its only criterion")
             if part.cannot is None and not asked:
                 raise ValueError(f"parts {part.name!r}: no criterion; give some to it or the test")
         own = sorted({"title", "law", "inner", "link", "mode"} & {*self.scenario})

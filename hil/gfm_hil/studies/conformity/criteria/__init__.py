@@ -27,6 +27,7 @@ KINDS = (
     "stays_in_step",
     "in_envelope",
     "nfp",
+    "stiffness",
 )
 
 BY_KIND: dict[str, type[Clause]] = {

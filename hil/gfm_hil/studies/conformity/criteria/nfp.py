@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.schema import StrictSchema
-from gfm_hil.scenario import Scenario
-from gfm_hil.studies.conformity.criteria.base import Clause
 from gfm_hil.studies.conformity.criteria.equivalent_damping import damping_of
+from gfm_hil.studies.conformity.criteria.plot import Curve, Plot
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.envelopes import fit_nfp
-from gfm_hil.studies.scan import FrequencyScan, measure_admittance
+from gfm_hil.studies.scan import FrequencyScan
 
 
 class Band(StrictSchema):
@@ -38,15 +36,12 @@ class Band(StrictSchema):
         return self
 
 
-class Nfp(Clause):
+class Nfp(Plot):
     """The network-frequency-perturbation plot, measured by small sines of the grid's frequency:
     gain and phase of the change of p over the change of the grid's frequency stay within bands. A
     part with this criterion has no other one, and no events count."""
 
     kind: Literal["nfp"] = Field(description="kind of criterion")
-    from_hz: float = Field(1.0, ge=0.01, description="lowest frequency of the plot, Hz")
-    to_hz: float = Field(100.0, gt=0, description="highest frequency of the plot, Hz")
-    points: int = Field(21, ge=2, le=1000, description="evenly apart on a logarithmic axis")
     bands: list[Band] = Field([], description="limits; each gives a verdict")
     unknown: str | None = Field(
         None, description="without bands: why none are known; the plot is drawn, and informative"
@@ -62,28 +57,10 @@ class Nfp(Clause):
     def _judged_or_not(self) -> Nfp:
         if bool(self.bands) == (self.unknown is not None):
             raise ValueError("bands, unknown: give one of them")
-        if self.at is not None:
-            raise ValueError("at: a plot has no time")
-        if not self.from_hz < self.to_hz:
-            raise ValueError(f"from_hz = {self.from_hz:g}: must be < to_hz = {self.to_hz:g}")
         for band in self.bands:
             if not self.from_hz <= band.from_hz < band.to_hz <= self.to_hz:
                 raise ValueError(f"bands: from {band.from_hz:g} Hz: must lie in the plot")
         return self
-
-    def scan(self, scenario: Scenario, controller_command: Sequence[str]) -> FrequencyScan:
-        """Measure the plot. Raises UserError: as ``measure_admittance``."""
-        return measure_admittance(
-            scenario, start_hz=self.from_hz, stop_hz=self.to_hz, points=self.points,
-            controller_command=controller_command,
-        )  # fmt: skip
-
-    def again(self, scenario: str) -> list[str]:
-        """The command that measures the plot of a scenario file again."""
-        return [
-            "gfmhil", "scan", scenario, "--from", f"{self.from_hz:g}", "--to", f"{self.to_hz:g}",
-            "--points", str(self.points),
-        ]  # fmt: skip
 
     def judge_scan(self, found: FrequencyScan) -> list[Verdict]:
         """The verdicts on a plot: on its damping, then one a band and gain or phase."""
@@ -137,8 +114,15 @@ class Nfp(Clause):
         ratio, text = damping_of(unit, omega_b)
         return self._made(PASS if low <= ratio <= high else FAIL, ratio, "", limit, text)
 
-    def _made(self, *rest: Any) -> Verdict:
-        return self.sourced(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
+    def curves(self, found: FrequencyScan) -> list[Curve]:
+        nfp, model = found.nfp, found.nfp_model
+        return [
+            Curve(title, unit, of(nfp), None if model is None else of(model), unit != "°")
+            for title, unit, of in (
+                ("gain |Δp / Δω_g| [p.u./p.u.]", "p.u./p.u.", np.abs),
+                ("phase of Δp / Δω_g [°]", "°", lambda z: np.degrees(np.angle(z))),
+            )
+        ]
 
 
 CRITERION = Nfp
