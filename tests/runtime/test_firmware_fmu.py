@@ -1,9 +1,12 @@
 """Laws as FMUs, validated and stepped by FMPy: the kernel's bits, states, and what they refuse."""
 
+import ctypes
+import re
 import shutil
 import sys
 from pathlib import Path
 from typing import Any, ClassVar
+from xml.etree import ElementTree
 
 import fmpy
 import numpy as np
@@ -164,6 +167,52 @@ def test_a_unit_from_counts_to_counts_has_the_kernels_bits(tmp_path, fmi):
     kernel = from_pin_to_pin(law, "float64", ref, counts, START)
     for row, expected in zip(counts, kernel, strict=True):
         assert unit.tick(ref, row) == expected
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_the_a2l_file_is_where_fmi_ls_xcp_wants_it_and_has_the_addresses(tmp_path, fmi):
+    """Section "Structure of the FMU Archive" and the tables of the manifest, version 1.0.0."""
+    file, folder = tmp_path / "law.fmu", tmp_path / "unpacked"
+    how = ["--inner", "cascaded", "--real", "float64", "--fmi", fmi, "--xcp"]
+    assert main(["firmware", "fmu", "vsg-2", *how, "-o", str(file)]) == 0
+    assert validate_fmu(str(file)) == []
+    fmpy.extract(str(file), str(folder))
+    extra = folder / "extra" / "org.fmi-standard.fmi-ls-xcp"
+    (library,) = folder.glob("binaries/*linux*/*.so")
+    a2l = extra / library.parent.name / f"{library.stem}.a2l"
+    assert {*extra.rglob("*.*")} == {extra / "fmi-ls-manifest.xml", a2l}
+    assert (folder / "documentation" / "fmi-ls-xcp.txt").is_file()
+
+    root = ElementTree.parse(extra / "fmi-ls-manifest.xml").getroot()
+    space = "{http://fmi-standard.org/fmi-ls-manifest}fmi-ls-"
+    assert root.tag == "fmiLayeredStandardManifest"
+    assert {*root.attrib} == {f"{space}{name}" for name in ("name", "version", "description")}
+    assert root.get(f"{space}name") == "org.fmi-standard.fmi-ls-xcp"
+    assert root.get(f"{space}version") == "1.0.0"
+    (interface,) = root
+    assert interface.tag == "Interface" and interface.get("definition") == a2l.name
+    assert interface.get("supportsDirectMemoryAccess") == "true"
+    assert interface.get("types") == "CoSimulation"
+
+    text = a2l.read_text("ascii")
+    assert "/include" not in text  # which the standard forbids
+    unit, second = Unit(folder), Unit(folder)
+    (row, *_) = [line for line in Path("/proc/self/maps").read_text().splitlines()
+                 if line.endswith(str(library.resolve()))]  # fmt: skip
+    base = int(row.partition("-")[0], 16)
+    refs, ys = accepted(1, 20, "float64", True)
+    for it in (unit, second):
+        it.start(START)
+    for ref, y in zip(refs, ys, strict=True):
+        u = unit.tick(ref, y)
+        second.tick(ref, y[::-1] * 0.5 + 0.5)
+        place = r"MEASUREMENT first_instance\.now\.u\.\w+ .*?ECU_ADDRESS (0x\w+)"
+        addresses = [int(x, 16) for x in re.findall(place, text, re.DOTALL)]
+        assert [ctypes.c_double.from_address(base + x).value for x in addresses] == u
+    unit.it.freeInstance()
+    third = Unit(folder)  # takes its place
+    third.start(START)
+    assert [ctypes.c_double.from_address(base + x).value for x in addresses] == START
 
 
 @pytest.mark.parametrize("fmi", FMI)

@@ -67,6 +67,10 @@ def add(command: argparse.ArgumentParser) -> None:
     unit.add_argument("law", metavar="LAW", help="a name, or a .toml file")
     _add_how(unit)
     unit.add_argument("--fmi", choices=FMI, default=FMI[-1], help=f"version of FMI ({FMI[-1]})")
+    unit.add_argument(
+        "--xcp", action="store_true",
+        help="with the A2L file of its memory, by the layered standard FMI-LS-XCP",
+    )  # fmt: skip
     unit.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .fmu")
     unit.set_defaults(call=call_fmu)
     a2l = kinds.add_parser("a2l", help="write the calibration file (A2L) of a firmware's ELF file")
@@ -163,7 +167,9 @@ def call_dll(options: argparse.Namespace) -> int:
 def call_fmu(options: argparse.Namespace) -> int:
     law = load_law(options.law, options.inner, options.counts)
     omega_b = _omega_b(options.f_n)
-    packed = fmu(law, options.T_s, options.real, options.fmi, omega_b)
+    if options.xcp:
+        need("elftools", "pyelftools", "firmware fmu --xcp", "calibration")
+    packed = fmu(law, options.T_s, options.real, options.fmi, omega_b, options.xcp)
     with replacing(options.out) as part:
         part.write_bytes(packed)
     print(options.out)

@@ -1,7 +1,8 @@
 """A law as an FMU for co-simulation: the exported C code with the interface of FMI 2.0 or 3.0.
 
 An FMU is a zip file: modelDescription.xml from the signal table, the sources with what builds them,
-and binaries of this machine and, where mingw is installed, of Windows.
+and binaries of this machine and, where mingw is installed, of Windows. With FMI-LS-XCP it also has
+the A2L file of this machine's binary, and a first instance that lies where that file says.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from gfm_runtime.errors import LawError
 from gfm_runtime.firmware.c_text import plain, written
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED
 from gfm_runtime.firmware.dll import build_library
+from gfm_runtime.firmware.elf import elf_a2l
 from gfm_runtime.firmware.module import RESULT_TEXT, Module, keys_of
 from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.signals import TABLE_VERSION, Signal, command_rows, group, table_hash
@@ -44,6 +46,7 @@ _MINGW = "x86_64-w64-mingw32-gcc"
 #: by FMI, folders of binaries
 _HERE = {"2": {"x86_64": "linux64"}, "3": {}}
 _WINDOWS = {"2": "win64", "3": "x86_64-windows"}
+_LS_XCP = "extra/org.fmi-standard.fmi-ls-xcp"  # 1.0.0 of the layered standard
 _DATE = (1980, 1, 1, 0, 0, 0)  # of all files, so that the same law gives the same bytes
 _CAUSALITIES = {
     "input": {"causality": "input", "variability": "continuous"},
@@ -54,7 +57,7 @@ _CAUSALITIES = {
 _OF_FMI_3 = ("<Output valueReference", "<InitialUnknown valueReference")
 
 
-def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
+def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float, xcp: bool = False) -> bytes:
     """The FMU of a law, as the bytes of its file.
 
     Args:
@@ -63,20 +66,26 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
         real: float32 or float64 inside; inputs and outputs are always 64 bits.
         fmi: which FMI.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
+        xcp: with FMI-LS-XCP, the layered standard for measuring and calibrating by XCP; needs
+            pyelftools.
 
     Raises:
         LawError: as ``make_modules``; there is no gcc or no FMPy (the package is named), or gcc
             fails.
     """
     m, own = one_module(laws, T_s, real, omega_b)
-    code, description = _sources(m, own, T_s, fmi)
+    code, description = _sources(m, own, T_s, fmi, xcp)
     held: dict[str, bytes] = {"modelDescription.xml": description}
     held |= {f"sources/{file}": text.encode() for file, text in code.items()}
     if fmi == "3":
         options = " ".join([*FLAGS, OPTIMISED])
         keys = {"P": m.prefix, "OPTIONS": options, "FILES": _files("SourceFile", code)}
         held["sources/buildDescription.xml"] = written("buildDescription.xml", keys).encode()
-    held |= _binaries(m, code, fmi)
+    held |= _binaries(m, code, fmi, xcp)
+    if xcp:
+        keys = keys_of(m)
+        held[f"{_LS_XCP}/fmi-ls-manifest.xml"] = written("fmi-ls-manifest.xml", keys).encode()
+        held["documentation/fmi-ls-xcp.txt"] = written("fmi-ls-xcp.txt", keys).encode()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for file, content in held.items():
@@ -85,7 +94,7 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float) -> bytes:
 
 
 def _sources(
-    m: Module, own: Mapping[str, str], T_s: float, fmi: Fmi
+    m: Module, own: Mapping[str, str], T_s: float, fmi: Fmi, xcp: bool
 ) -> tuple[dict[str, str], bytes]:
     """The law's ``own`` sources and the others by file name, and modelDescription.xml; the token
     follows from both."""
@@ -101,12 +110,15 @@ def _sources(
             "E_IN_USE": ", &u[2]" * m.stages,
             "GAIN_LOW": ", ".join(repr(s.low) for s in gains),
             "GAIN_HIGH": ", ".join(repr(s.high) for s in gains),
+            "NEW": "new_instance()" if xcp else "calloc(1, sizeof *it)",
+            "FREE": "free_instance" if xcp else "free",
             "REFUSALS": "@REFUSALS@",
             "TOKEN": "@TOKEN@",
         }
     )
     keys["FIRST"] = written("first.c", keys, m.choices)
-    interface = written("fmi.c", keys, {"fmi2": two, "tuned": m.tuning is not None})
+    choices = {"fmi2": two, "tuned": m.tuning is not None, "xcp": xcp}
+    interface = written("fmi.c", keys, choices)
     code = {
         **own,
         f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
@@ -227,8 +239,8 @@ def _refusals(fmi: Fmi, interface: str) -> str:
     return "\n".join(out)
 
 
-def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi) -> dict[str, bytes]:
-    """The libraries by their place in the FMU.
+def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi, xcp: bool) -> dict[str, bytes]:
+    """The libraries by their place in the FMU, and the A2L file of this machine's.
 
     Raises:
         LawError: there is no gcc, or a compiler fails.
@@ -248,4 +260,8 @@ def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi) -> dict[str, bytes]:
             library = next(Path(work).glob("made*"))
             out[f"binaries/{place}"] = library.read_bytes()
             library.unlink()
+        if xcp:  # of the same code with what only a debugger reads
+            build_library(Path(work), m.name, code, f"{m.prefix}.so", ["-fPIC", "-g", *flags])
+            text, *_ = elf_a2l(Path(work, f"{m.prefix}.so"))
+            out[f"{_LS_XCP}/{here}/{m.prefix}.a2l"] = text.encode()
     return out

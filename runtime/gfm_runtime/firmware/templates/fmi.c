@@ -173,6 +173,28 @@ typedef struct {
 /* @end@ */
 } instance_t;
 
+/* @if xcp@ */
+/* The A2L file has the addresses of this one, the first of a process; others are on the heap. */
+static instance_t first_instance;
+static char taken;
+
+static instance_t *new_instance(void)
+{
+    if (__sync_lock_test_and_set(&taken, 1))
+        return calloc(1, sizeof(instance_t));
+    memset(&first_instance, 0, sizeof first_instance);
+    return &first_instance;
+}
+
+static void free_instance(instance_t *it)
+{
+    if (it == &first_instance)
+        __sync_lock_release(&taken);
+    else
+        free(it);
+}
+
+/* @end@ */
 static @F@Status log_message(instance_t *it, @F@Status status, const char *text)
 {
     if (it != NULL && it->log != NULL)
@@ -208,7 +230,7 @@ const char *fmi2GetTypesPlatform(void)
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, fmi2String resources,
     const fmi2CallbackFunctions *call, fmi2Boolean visible, fmi2Boolean logging)
 {
-    instance_t *it = calloc(1, sizeof *it);
+    instance_t *it = @NEW@;
     (void)resources;
     (void)visible;
     (void)logging; /* there is a message only for a mistake, and for the safe state */
@@ -219,7 +241,7 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, 
     it->environment = call->componentEnvironment;
     if (type != fmi2CoSimulation || strcmp(token, TOKEN) != 0) {
         (void)log_message(it, fmi2Error, "this FMU is for co-simulation, and its GUID is " TOKEN);
-        free(it);
+        @FREE@(it);
         return NULL;
     }
     reset_state(&it->now);
@@ -231,7 +253,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     const fmi3ValueReference wanted[], size_t n_wanted, fmi3InstanceEnvironment environment,
     fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update)
 {
-    instance_t *it = calloc(1, sizeof *it);
+    instance_t *it = @NEW@;
     (void)name;
     (void)resources;
     (void)visible;
@@ -247,7 +269,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     it->environment = environment;
     if (strcmp(token, TOKEN) != 0) {
         (void)log_message(it, fmi3Error, "the instantiation token of this FMU is " TOKEN);
-        free(it);
+        @FREE@(it);
         return NULL;
     }
     reset_state(&it->now);
@@ -257,7 +279,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
 
 void @F@FreeInstance(@F@@INSTANCE@ instance)
 {
-    free(instance);
+    @FREE@(instance);
 }
 
 @F@Status @F@SetDebugLogging(
