@@ -1,4 +1,5 @@
-"""gfmhil fit: D, H and X_eff of a run or of a recording, with intervals."""
+"""gfmhil fit: D, H and X_eff of a run or of a recording, with intervals, and the parameters of
+WECC's models that follow from them."""
 
 import argparse
 import json
@@ -11,7 +12,7 @@ from gfm_hil.recording.foreign import ABOUT
 from gfm_hil.results.table import Table
 from gfm_hil.studies.unit_fit import fit_run
 
-_UNITS = {"D": "p.u./p.u.", "H": "s", "X_eff": "p.u."}
+_UNITS = {"D": "p.u./p.u.", "H": "s", "X_eff": "p.u.", "mp": "p.u.", "TPf": "s"}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -33,16 +34,17 @@ def call(options: argparse.Namespace) -> int:
     run = load_run(options.what, options.map, options.scenario)
     found = fit_run(run)
     if options.json:
-        print(json.dumps(asdict(found), indent=1))
+        print(json.dumps(asdict(found) | {"mp": found.mp, "TPf": found.TPf}, indent=1))
         return 0
     console = terminal(highlight=False)
     if ABOUT in run.summary:
         console.print(run.summary[ABOUT]["words"], markup=False, soft_wrap=True)
     rows = [
         [name, f"{getattr(found, name):.4g}", f"{low:.4g} to {high:.4g}", _UNITS[name]]
-        for name, (low, high) in found.interval.items()
+        for name, (low, high) in ((name, found.interval[name]) for name in _UNITS)
     ]
     console.print(Table(["", "", "95 %", ""], rows, text=None))
+    console.print("REGFM_A1 has mp, TPf and X_L = X_eff; REGFM_B1 without D1 and D2 mp, H and X_L")
     console.print(
         f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}"
     )

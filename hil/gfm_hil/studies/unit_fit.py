@@ -37,6 +37,9 @@ _ORDERS = 5  # of the autoregression, less one
 class UnitFit:
     """D, H and X_eff, and how well they are known.
 
+    WECC's models with this swing equation, by the names of their records: REGFM_A1 with mp, TPf and
+    X_L = X_eff, and REGFM_B1 with mp, H and X_L = X_eff, where D1 and D2 are 0.
+
     Attributes:
         D, H, X_eff: p.u./p.u., s, p.u.; noise may leave an X_eff below 0.
         interval: of 95 %, lower and upper end by name.
@@ -50,6 +53,16 @@ class UnitFit:
     interval: dict[str, tuple[float, float]]
     noise: float
     left: float
+
+    @property
+    def mp(self) -> float:
+        """The droop 1/D, p.u."""
+        return 1.0 / self.D
+
+    @property
+    def TPf(self) -> float:
+        """The lag of the droop's power measurement that is this inertia, 2 H/D, s."""
+        return 2.0 * self.H / self.D
 
 
 def fit_run(run: Run) -> UnitFit:
@@ -122,9 +135,14 @@ def fit_run(run: Run) -> UnitFit:
     def wide(*way: int) -> float:
         return sure * math.sqrt(max(0.0, float(np.array(way) @ covariance @ np.array(way))))
 
-    # D = omega_b zero/(stiff X) and H = omega_b/(2 stiff X): as logarithms, sums
+    # D = omega_b zero/(stiff X), H = omega_b/(2 stiff X) and TPf = 1/zero: as logarithms, sums
     interval = {}
-    for name, value, way in (("D", 2 * H * zero, (-1, 1, -1)), ("H", H, (-1, 0, -1))):
+    for name, value, way in (
+        ("D", 2 * H * zero, (-1, 1, -1)),
+        ("H", H, (-1, 0, -1)),
+        ("mp", 1 / (2 * H * zero), (1, -1, 1)),
+        ("TPf", 1 / zero, (0, -1, 0)),
+    ):
         factor = math.exp(min(_FAR, wide(*way)))
         interval[name] = value / factor, value * factor
     X_eff, beside = X - X_grid, X * wide(1, 0, 0)

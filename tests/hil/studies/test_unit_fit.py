@@ -31,6 +31,8 @@ TRUE = {
     "D": 1 / GAINS["D_p"],
     "H": 1 / (2 * GAINS["k_22"] * GAINS["D_p"]),
     "X_eff": load_converter("paper").pu()["L_f"],
+    "mp": GAINS["D_p"],
+    "TPf": 1 / GAINS["k_22"],
 }
 CHANNELS = ("p", "q", "V", "f")
 DRAWS = 100
@@ -71,7 +73,8 @@ def test_the_intervals_hold_what_is_true_in_95_of_100_draws(run, tmp_path, sigma
 
 def test_the_fit_of_a_run_without_noise_is_its_law(run):
     fit = envelopes.fit_run(run)
-    assert pytest.approx([TRUE["D"], TRUE["H"]], rel=3e-3) == [fit.D, fit.H]
+    for name in ("D", "H", "mp", "TPf"):
+        assert getattr(fit, name) == pytest.approx(TRUE[name], rel=3e-3)
     assert fit.X_eff == pytest.approx(TRUE["X_eff"], abs=1e-3)
     assert fit.noise < 1e-9 and fit.left < 1e-5
 
