@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.studies.conformity.criteria.equivalent_damping import damping_of
-from gfm_hil.studies.conformity.criteria.plot import Curve, Plot
+from gfm_hil.studies.conformity.criteria.plot import Plot, PlotPanel
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, INFORMATIVE, PASS, Outcome, Verdict
 from gfm_hil.studies.envelopes import fit_nfp
 from gfm_hil.studies.scan import FrequencyScan
@@ -114,10 +114,10 @@ class Nfp(Plot):
         ratio, text = damping_of(unit, omega_b)
         return self._made(PASS if low <= ratio <= high else FAIL, ratio, "", limit, text)
 
-    def curves(self, found: FrequencyScan) -> list[Curve]:
+    def curves(self, found: FrequencyScan) -> list[PlotPanel]:
         nfp, model = found.nfp, found.nfp_model
         return [
-            Curve(title, unit, of(nfp), None if model is None else of(model), unit != "°")
+            PlotPanel(title, unit, of(nfp), None if model is None else of(model), unit != "°")
             for title, unit, of in (
                 ("gain |Δp / Δω_g| [p.u./p.u.]", "p.u./p.u.", np.abs),
                 ("phase of Δp / Δω_g [°]", "°", lambda z: np.degrees(np.angle(z))),

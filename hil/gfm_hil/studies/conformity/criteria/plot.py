@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Curve:
+class PlotPanel:
     """A panel of a plot: measured, and by the linear model if there is one, shape (K,) each."""
 
     title: str
@@ -63,7 +63,7 @@ class Plot(Clause):
         """The verdicts on a plot."""
         raise NotImplementedError
 
-    def curves(self, found: FrequencyScan) -> list[Curve]:
+    def curves(self, found: FrequencyScan) -> list[PlotPanel]:
         """The panels of its figure."""
         raise NotImplementedError
 

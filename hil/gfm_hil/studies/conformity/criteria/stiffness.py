@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from gfm_hil.studies.conformity.criteria.plot import Curve, Plot
+from gfm_hil.studies.conformity.criteria.plot import Plot, PlotPanel
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict
 from gfm_hil.studies.scan import FrequencyScan
 
@@ -49,11 +49,11 @@ class Stiffness(Plot):
             verdicts.append(self._made(outcome, value, curve.unit, limit, text, least, None, over))
         return verdicts
 
-    def curves(self, found: FrequencyScan) -> list[Curve]:
+    def curves(self, found: FrequencyScan) -> list[PlotPanel]:
         measured = found.stiffness(found.Y)
         model = (None, None) if found.model is None else found.stiffness(found.model)
         return [
-            Curve(f"{name} [{unit}]", unit, np.abs(x), None if y is None else np.abs(y), True)
+            PlotPanel(f"{name} [{unit}]", unit, np.abs(x), None if y is None else np.abs(y), True)
             for name, unit, x, y in zip(
                 ("|P/θ|", "|Q/V|"), ("p.u./rad", "p.u./p.u."), measured, model, strict=True
             )
