@@ -19,8 +19,7 @@ import pytest
 
 from gfm_hil.engine.announcement import present
 from gfm_hil.ports.commands import Operator
-from gfm_hil.ports.modbus.image import Image
-from gfm_hil.ports.modbus.measures import Measures
+from gfm_hil.ports.modbus.device import Device
 from gfm_hil.ports.scope.channels import make_channels
 from gfm_hil.ports.scope.recording import open_recording
 from gfm_hil.scenario import load_scenario
@@ -84,7 +83,7 @@ def bench(link: str, place: Path) -> Iterator[tuple[Clients, dict[str, subproces
         look, control = addresses(iter(scope.stdout or ()))
         samples, blocks, metrics = ports_in(stream.stdout or (), 3)
         scenario = load_scenario(str(folder / "scenario.toml"))
-        image = Image(Measures(scenario).models(scenario.laws()))
+        image = Device(scenario, scenario.laws(), lambda: None, print, 0, lambda: 0.0).image
         token = control.partition("#token=")[2]
         yield Clients(folder, look, token, modbus, samples, blocks, metrics, image), started
     finally:
