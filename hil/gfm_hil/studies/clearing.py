@@ -20,7 +20,7 @@ LONGEST_S, AFTER_S = 2.0, 3.0
 _MOST_S = 60.0
 _OUT_OF_STEP = 180.0  # degrees, as the criterion stays_in_step has it
 
-NO_EQUILIBRIUM = "no equilibrium"  # it is lost even if the fault does not occur
+NO_EQUILIBRIUM = "no equilibrium"  # its angle runs away even if the fault does not occur
 NOT_REACHED = "equilibrium not reached"  # there is one, and the angle passes it
 OF_ANGLE = (NO_EQUILIBRIUM, NOT_REACHED)
 
@@ -115,7 +115,7 @@ def clearing_time(
     end = trials[high]
     ordered = tuple(trials[k] for k in sorted(trials))
     lost = end.duration if end.loss else math.inf
-    loss = NO_EQUILIBRIUM if end.loss and not high else end.loss
+    loss = NO_EQUILIBRIUM if end.loss == NOT_REACHED and not high else end.loss
     return ClearingTime(scenario.law, scenario.title, trials[low].duration, lost, loss, ordered)
 
 

@@ -13,7 +13,10 @@ from gfm_hil.scenario import load_scenario
 from gfm_hil.scenario.loading import plant_of
 from gfm_hil.studies.clearing import NO_EQUILIBRIUM, NOT_REACHED
 
-TRIPS = ("over_current", "over_voltage", "under_voltage", "dc_over_voltage", "dc_under_voltage")
+TRIPS = (
+    "over_current", "over_voltage", "under_voltage", "dc_over_voltage", "dc_under_voltage",
+    "over_frequency", "under_frequency",
+)  # fmt: skip
 OFF = {trip: {"enabled": False} for trip in TRIPS}
 
 
