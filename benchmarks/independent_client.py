@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument(
         "--links", default="shm,zmq ipc,zmq tcp,can,serial", help="by commas (%(default)s)"
     )
-    parser.add_argument("--rounds", type=int, default=9, help="rounds of each (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=25, help="rounds of each (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.3, help="of a round (%(default)s)")
     parser.add_argument("--policy", choices=("fifo", "other"), default="fifo", help="of both loops")
     parser.add_argument("--json", action="store_true", help="print JSON")

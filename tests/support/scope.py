@@ -20,7 +20,7 @@ PATIENCE_S = 60.0
 # 1 kHz, so that two processors suffice for both sides and the browser
 RIG = """
 title = "A rig that is told what to do"
-duration = 300.0
+duration = 900.0
 T_s = 1e-3
 mode = "realtime"
 law = "droop-5"

@@ -44,6 +44,9 @@ def page(going: Rig) -> Iterator[Browser]:
     with Browser() as browser:
         browser.driver.get(going.control)
         wait_for_state(browser)
+        if browser.text("#state") == "SAFE":
+            browser.click("#reset")
+            wait_for(lambda: browser.text("#state") == "RUNNING")
         yield browser
         assert browser.complaints() == []
 
@@ -139,7 +142,7 @@ def test_every_kind_of_event_has_a_panel_by_its_schema(going, page):
     page.click("#do-gains")
     answer(page, "gains", "D_p = 0.0101 at tick")
     opened(page, "grid-unbalance")
-    page.write("#set-grid-unbalance-retained", "0.9, 1, 1")
+    page.write("#set-grid-unbalance-retained", "0.98, 1, 1")  # deeper trips this rig
     page.write("#set-grid-unbalance-duration", "0.01")
     page.click("#do-grid-unbalance")
     answer(page, "grid-unbalance", "at tick")
@@ -155,6 +158,7 @@ def test_every_kind_of_event_has_a_panel_by_its_schema(going, page):
     wait_for(lambda: "the lab is warm" in page.text("#log .operator"))
     (note,) = [e for e in read_events(going.folder, 300_000) if e["event"] == "note"]
     assert note["operator"]["name"] == "operator"
+    assert page.text("#state") == "RUNNING"
 
 
 def test_a_desk_of_ones_own(page, tmp_path):
