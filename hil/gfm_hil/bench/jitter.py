@@ -5,6 +5,7 @@ the ticks lost here: they are the host's share of the misses.
 """
 
 import os
+import statistics
 import threading
 import time
 from collections import Counter
@@ -24,6 +25,7 @@ from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.pair import Pair, Policy, pair
 from gfm_hil.bench.pingpong import HYBRID, SLEEP, SPIN, wait_for
 from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
+from gfm_hil.bench.tail import median_interval
 from gfm_hil.realtime.clock import AHEAD_NS, now_ns
 from gfm_hil.run.attribution import Times, bursts
 from gfm_hil.run.stalls import ProcessorWatch
@@ -31,7 +33,8 @@ from gfm_runtime.compiled import cached
 
 #: the kernel's trace itself costs microseconds a wake-up, so it has a row of its own
 WATCHED = "sleep+spin, watched"
-WAITS = {"sleep+spin": HYBRID, "spin": SPIN, "nanosleep": SLEEP, WATCHED: HYBRID}
+#: ``nanosleep`` last: the programs of others follow it, and are compared with it
+WAITS = {"sleep+spin": HYBRID, "spin": SPIN, WATCHED: HYBRID, "nanosleep": SLEEP}
 PERIOD_NS = 100_000
 _LEAD_NS = 2_000_000  # between the call and the first deadline
 
@@ -145,16 +148,19 @@ def _row(
     }  # fmt: skip
 
 
-def _ratios(other: _Late, ours: _Late) -> dict[str, float]:
-    """p50 and p99 of another program to those of our ``nanosleep``: medians over the rounds.
+def _ratios(other: _Late, ours: _Late) -> dict[str, list[float]]:
+    """p50 and p99 of another program to those of our ``nanosleep``: of the ratios of the rounds the
+    median, and the interval in which that lies with 95 %.
 
     The others skip each deadline that passed while they were late, so a stall of ten periods is one
     of their times. Ours here are those of the same deadlines.
     """
     pairs = [(a, awaited(b)) for a, b in zip(other.rounds, ours.rounds, strict=False) if a.size]
-    ratios = [np.percentile(a, (50, 99)) / np.percentile(b, (50, 99)) for a, b in pairs]
-    median = np.median(ratios, axis=0).tolist() if ratios else []
-    return {name: round(ratio, 3) for name, ratio in zip(("p50", "p99"), median, strict=False)}
+    of_rounds = [np.percentile(a, (50, 99)) / np.percentile(b, (50, 99)) for a, b in pairs]
+    return {
+        name: [round(x, 3) for x in (statistics.median(each), *median_interval(each))]
+        for name, each in zip(("p50", "p99"), np.transpose(of_rounds).tolist(), strict=False)
+    }
 
 
 def awaited(late: Times) -> Times:

@@ -195,13 +195,21 @@ _NEARLY = 0.1  # relative difference to another program's p50 and p99 that is ag
 
 
 def _agrees(row: Row) -> str:
-    """Whether another program agrees with our ``nanosleep``."""
+    """Whether another program agrees with our ``nanosleep``: the medians say so, or the rounds
+    scatter too far to tell."""
     ratios = row.get("to_ours")
     if not ratios:
         return "–"
-    same = all(abs(ratio - 1) <= _NEARLY for ratio in ratios.values())
-    text = ", ".join(f"{ratio:.2f}" for ratio in ratios.values())
-    return f"{text}: {'agree' if same else 'differ'}"
+    if all(abs(middle - 1) <= _NEARLY for middle, _, _ in ratios.values()):
+        verdict = "agree"
+    elif any(low > 1 + _NEARLY or high < 1 - _NEARLY for _, low, high in ratios.values()):
+        verdict = "differ"
+    else:
+        verdict = "too few rounds to tell"
+    each = ", ".join(
+        f"{middle:.2f} ({low:.2f}–{high:.2f})" for middle, low, high in ratios.values()
+    )
+    return f"{each}: {verdict}"
 
 
 def realtime_tables(content: Row) -> Iterator[Table]:

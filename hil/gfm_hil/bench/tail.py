@@ -14,15 +14,29 @@ _EXCEED, _FEWEST = 1e-3, 50  # share of the times from which on the tail is fitt
 _BEYOND = (10, 100)  # times as many exchanges as were measured
 
 
+def _ranks(n: int, share: float) -> tuple[int, int]:
+    """The order statistics of n independent values between which the quantile lies with 95 %, by
+    the binomial distribution (H. A. David and H. N. Nagaraja, *Order Statistics*, 7.1). The first
+    is 0 or the second n + 1 where the values end before."""
+    low, high = binom.ppf([(1 - _SURE) / 2, (1 + _SURE) / 2], n, share)
+    return int(low), int(high) + 1
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Between which values the median of their distribution lies with 95 %; fewer than 6 values
+    give the least and the greatest, with less than that."""
+    n, ordered = len(values), sorted(values)
+    low, high = _ranks(n, 0.5)
+    return ordered[max(low, 1) - 1], ordered[min(high, n) - 1]
+
+
 def confidence(counts: Counts) -> dict[str, list[float | None]]:
-    """The interval of each percentile of ``SHARES`` but the largest time, µs, with 95 %: the order
-    statistics between which it lies, by the binomial distribution (H. A. David and H. N. Nagaraja,
-    *Order Statistics*, 7.1); None where the data end before. Times count as independent."""
+    """The interval of each percentile of ``SHARES`` but the largest time, µs, with 95 %; None where
+    the data end before. Times count as independent."""
     n, found = int(counts.sum()), {}
     for name, share in SHARES.items():
         if share < 1.0 and n:
-            low, high = binom.ppf([(1 - _SURE) / 2, (1 + _SURE) / 2], n, share)
-            ranks = low, high + 1
+            ranks = _ranks(n, share)
             ends = quantiles(counts, [min(max(rank, 1), n) / n for rank in ranks])
             inside = ranks[0] >= 1, ranks[1] <= n
             found[f"{name}_us_95"] = [

@@ -21,6 +21,8 @@ from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
 from gfm_hil.bench.jitter import PERIOD_NS, WAITS, WATCHED, awaited
 from gfm_hil.bench.kernel import compare
 from gfm_hil.bench.sweep import highest
+from gfm_hil.bench.tables import _agrees
+from gfm_hil.bench.tail import median_interval
 from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
@@ -136,6 +138,20 @@ def test_others_are_compared_at_the_deadlines_that_both_wait_for():
     assert len(theirs) == 1000 - 12 - 1
 
 
+def test_the_interval_of_a_median_has_the_ranks_of_the_tables():
+    """W. J. Conover, Practical Nonparametric Statistics, table of quantile confidence intervals."""
+    for n, ranks in {3: (1, 3), 6: (1, 6), 9: (2, 8), 20: (6, 15), 50: (18, 33)}.items():
+        assert median_interval([float(k) for k in range(n, 0, -1)]) == ranks
+
+
+@pytest.mark.parametrize(
+    ("p99", "verdict"),
+    [([1.08, 0.9, 1.3], "agree"), ([1.3, 1.2, 1.5], "differ"), ([1.3, 1.0, 1.5], "too few rounds")],
+)
+def test_agreement_is_told_where_the_rounds_can_tell(p99, verdict):
+    assert f": {verdict}" in _agrees({"to_ours": {"p50": [1.0, 0.9, 1.1], "p99": p99}})
+
+
 def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
     options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
     rows = bench(tmp_path, capsys, *options)["jitter"]
@@ -145,6 +161,7 @@ def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
         if row["wait"] in others:
             assert row["n"] > 0
             assert row["to_ours"].keys() == {"p50", "p99"}
+            assert all(low <= middle <= high for middle, low, high in row["to_ours"].values())
             continue
         assert (row["method"] is not None) == (row["wait"] == WATCHED)
         assert row["n"] == 2 * row["ticks"] == 2 * 2 * 200  # processors, rounds
