@@ -312,6 +312,15 @@ class Scenario(StrictSchema):
         """Events in order of their tick; within a tick in the order of the file."""
         return sorted(self.events, key=lambda e: e.at(self.T_s))
 
+    def shifted(self, by_s: float) -> Scenario:
+        """This scenario with its events ``by_s`` later (s; earlier if negative), and as much
+        longer."""
+        events = [
+            event.model_copy(update={"t": event.at(self.T_s) * self.T_s + by_s, "tick": None})
+            for event in self.events
+        ]
+        return self.model_copy(update={"duration": self.duration + by_s, "events": events})
+
     def digest(self) -> str:
         """Hash of all that both sides must agree on: scenario, signal table, and the content of
         the law and converter files, wherever each machine keeps them."""

@@ -266,15 +266,7 @@ def _scenario(job: Job) -> Scenario:
     changes: dict[str, Any] = {
         "link": LinkSettings(type="shm"), "T_s": min(found.T_s, asked.step_s or found.T_s),
     }  # fmt: skip
-    if asked.settle_s:
-        changes["duration"] = found.duration + asked.settle_s
-        changes["events"] = [
-            event.model_copy(
-                update={"t": event.at(found.T_s) * found.T_s + asked.settle_s, "tick": None}
-            )
-            for event in found.events
-        ]
-    return found.model_copy(update=changes)
+    return found.shifted(asked.settle_s).model_copy(update=changes)
 
 
 def _settled(run: Run, settle_s: float) -> Run:
@@ -288,15 +280,6 @@ def _settled(run: Run, settle_s: float) -> Run:
         )
     columns: dict[str, Any] = {name: column[first:] for name, column in run.columns.items()}
     columns["tick"], columns["t"] = columns["tick"] - first, columns["t"] - settle_s
-    scenario = run.scenario.model_copy(
-        update={
-            "duration": run.scenario.duration - settle_s,
-            "events": [
-                event.model_copy(update={"t": (event.t or 0.0) - settle_s})
-                for event in run.scenario.events
-            ],
-        }
-    )
     events = [
         {
             **line,
@@ -306,7 +289,7 @@ def _settled(run: Run, settle_s: float) -> Run:
         for line in run.events
         if line["tick"] >= first
     ]
-    return replace(run, scenario=scenario, columns=columns, events=events)
+    return replace(run, scenario=run.scenario.shifted(-settle_s), columns=columns, events=events)
 
 
 def run_part(job: Job) -> PartResult:
