@@ -45,6 +45,8 @@ OPTIONS = {
     "inner": "--inner",
     "counts": "--counts",
     "waveforms": "--waveforms",
+    "snapshot": "--snapshot",
+    "start_from": "--from",
 }
 
 

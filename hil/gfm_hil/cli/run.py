@@ -5,6 +5,7 @@ import contextlib
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 from gfm_hil.api.runs import run as run_one
 from gfm_hil.api.runs import run_network
@@ -36,6 +37,14 @@ def add(command: argparse.ArgumentParser) -> None:
         " pil:TARGET:FOLDER with a firmware around it; of a network NAME=KIND:NAME, again for each",
     )  # fmt: skip
     common.add_map(command, "--controller", action="append", default=[])
+    command.add_argument(
+        "--snapshot", type=float, metavar="S",
+        help="keep the state of both sides at this time in the run folder, s; lockstep",
+    )  # fmt: skip
+    command.add_argument(
+        "--from", dest="start_from", metavar="RUN",
+        help="start where the snapshot in this run folder was taken",
+    )  # fmt: skip
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
     command.add_argument("--json", action="store_true", help="print summary.json and nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -56,7 +65,10 @@ def call(options: argparse.Namespace) -> int:
     pil = any(text.rpartition("=")[2].startswith(PIL) for text in options.controller)
     if pil and not options.mode:
         options.mode = "lockstep"  # QEMU keeps no time
-    scenario = common.resolve(options, law=options.law, waveforms=options.waveforms)
+    scenario = common.resolve(
+        options, law=options.law, waveforms=options.waveforms, snapshot=options.snapshot,
+        start_from=options.start_from and str(Path(options.start_from).absolute()),
+    )  # fmt: skip
     folder = common.new_folder(options.out, find_scenario(options.scenario).stem)
     figures = not options.no_figures
     controllers = common.by_converter("--controller", options.controller, scenario.parts)

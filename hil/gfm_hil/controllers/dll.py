@@ -16,6 +16,8 @@ from gfm_hil.controllers.external import (
     BenchContext,
     ControllerError,
     MappedController,
+    State,
+    put_back,
     run_name,
     ticks_a_step,
 )
@@ -97,7 +99,8 @@ class _Values:
 
     def write(self, values: Vector) -> None:
         for view, value in zip(self._views, values, strict=True):
-            view[0] = value
+            if view.dtype != np.uint64:  # text is an address, which no number is
+                view[0] = value
 
     def read(self) -> Vector:
         return np.array([view[0] for view in self._views], float)
@@ -116,6 +119,8 @@ class DllController(MappedController):
     Raises:
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
+
+    gives_state = True
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
@@ -164,6 +169,27 @@ class DllController(MappedController):
             self._in.at, self._out.at, self._parameters.at, 0.0, _EMT, None, None,
             *(states.ctypes.data for states in self._states),
         )  # fmt: skip
+
+    def state(self) -> State:
+        """With the model's state in its arrays, where the interface wants all of it."""
+        ports = {"inputs": self._in.read(), "outputs": self._out.read()}
+        return super().state() | ports | {k: a.copy() for k, a in self._named_states()}
+
+    def restore(self, kept: State) -> None:
+        super().restore(kept)
+        inputs, outputs = self._in.read(), self._out.read()
+        put_back(self.name, kept, "inputs", inputs)
+        put_back(self.name, kept, "outputs", outputs)
+        self._in.write(inputs)
+        self._out.write(outputs)
+        if self._wiring.waits:  # it has not begun yet, and may do more there than set its states
+            self._call("Model_Initialize")
+            self._out.write(outputs)
+        for name, states in self._named_states():
+            put_back(self.name, kept, name, states)
+
+    def _named_states(self) -> list[tuple[str, NDArray[Any]]]:
+        return list(zip(("IntStates", "FloatStates", "DoubleStates"), self._states, strict=True))
 
     def start(self, u: Vector) -> None:
         super().start(u)

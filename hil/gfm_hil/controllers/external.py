@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     Retuned = tuple[DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
+State = dict[str, NDArray[Any]]
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
 
 
@@ -46,6 +47,7 @@ class ExternalController:
     name: str  # what the run calls it: 1 to 64 printable ASCII characters
     real = "float64"  # float64 or float32, for the laws that the controller's process has beside it
     has_laws = False  # it runs the run's own laws, between which events may change
+    gives_state = False  # it has ``state`` and ``restore``
     count = -1  # instructions of the law's step in the last tick; -1 where they are not counted
 
     def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
@@ -71,6 +73,15 @@ class ExternalController:
         """One tick: u[k] from the references (5,) and the measurements, p.u.; before it one that
         has our laws changes to that of the index ``changed``, or to none at -1. Raises
         ControllerError: it fails, or blocks the bridge."""
+
+    def state(self) -> State:
+        """What it remembers between two ticks. Raises ControllerError: it refuses."""
+        raise NotImplementedError
+
+    def restore(self, kept: State) -> None:
+        """Go on, after ``start``, from what another of its kind remembered. Raises UserError: that
+        was another controller; ControllerError: it refuses."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """End it, and remove what it left."""
@@ -112,6 +123,18 @@ class MappedController(ExternalController):
             u[1:NU_INNER] = self._frame.speed, e.real, e.imag
         self._ticks += 1
 
+    def state(self) -> State:
+        counted = np.array([self._ticks, self._before])
+        turned = np.array([self._frame.speed, self._frame.origin])
+        return {"counted": counted, "turned": turned, "commanded": self._u.copy()}
+
+    def restore(self, kept: State) -> None:
+        counted, turned = np.zeros(2, np.int64), np.zeros(2)
+        for name, into in (("counted", counted), ("turned", turned), ("commanded", self._u)):
+            put_back(self.name, kept, name, into)
+        self._ticks, self._before = map(int, counted)
+        self._frame.speed, self._frame.origin = map(float, turned)
+
     @property
     def _time(self) -> float:
         """Since the controller's first step, s."""
@@ -151,6 +174,18 @@ class MappedController(ExternalController):
 
     def _step(self, inputs: Vector) -> Vector:
         raise NotImplementedError
+
+
+def put_back(where: str, kept: State, name: str, into: NDArray[Any]) -> None:
+    """Write what was kept under a name where it was. Raises UserError: it does not fit there."""
+    found = kept.get(name)
+    if found is None or (found.dtype, found.shape) != (into.dtype, into.shape):
+        there = "nothing" if found is None else f"{found.dtype} {found.shape}"
+        raise UserError(
+            f"{where}: the snapshot has {there} for its {name}, and it has {into.dtype}"
+            f" {into.shape}: it is of another controller or plant, or of another version"
+        )
+    into[...] = found
 
 
 def refuse_source(text: str) -> None:

@@ -11,6 +11,7 @@ from gfm_hil.controllers.external import (
     BenchContext,
     ControllerError,
     MappedController,
+    State,
     run_name,
     ticks_a_step,
 )
@@ -58,6 +59,8 @@ class FmuController(MappedController):
         if of.coSimulation is None or of.fmiVersion.startswith("1."):
             raise UserError(f"{path}: must be an FMU for co-simulation of FMI 2.0 or 3.0")
         self.name = run_name("fmu", of.modelName)
+        can = of.coSimulation
+        self.gives_state = bool(can.canGetAndSetFMUstate and can.canSerializeFMUstate)
         self._two = of.fmiVersion.startswith("2.")
         variables = {v.name: v for v in of.modelVariables}
         inputs = [v for v in variables.values() if v.causality == "input"]
@@ -118,6 +121,24 @@ class FmuController(MappedController):
         except self._failed as problem:
             raise ControllerError(self._why(problem)) from None
         return outputs
+
+    def state(self) -> State:
+        try:
+            found = self._it.getFMUState()
+            data = bytes(self._it.serializeFMUState(found))
+            self._it.freeFMUState(found)
+        except self._failed as problem:
+            raise ControllerError(self._why(problem)) from None
+        return super().state() | {"FMUState": np.frombuffer(data, np.uint8)}
+
+    def restore(self, kept: State) -> None:
+        super().restore(kept)
+        try:
+            found = self._it.deserializeFMUState(kept["FMUState"].tobytes())
+            self._it.setFMUState(found)
+            self._it.freeFMUState(found)
+        except self._failed as problem:
+            raise ControllerError(self._why(problem)) from None
 
     def close(self) -> None:
         with contextlib.suppress(self._failed):

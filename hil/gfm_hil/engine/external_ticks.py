@@ -16,7 +16,8 @@ from numba import typeof, types
 from numpy.typing import NDArray
 
 from gfm_hil.controllers import ControllerError, ExternalController
-from gfm_hil.core.errors import PeerLost
+from gfm_hil.controllers.external import State, put_back
+from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.engine.controller_ticks import plant_tripped, receive, reply
 from gfm_hil.engine.loop_records import ControllerRecords, LinkEnd, Records, ReturnReason
 from gfm_hil.recording.columns import kept_of
@@ -75,6 +76,18 @@ class SteppedController:
         self._calls: tuple[Any, ...] = ()
         external.begin(controller, changed)
         external.start(self._start)
+
+    def state(self) -> State:
+        """What it remembers between two ticks. Raises ControllerError: it refuses."""
+        return {"name": np.array(self.name), "u": self._u.copy(), **self._external.state()}
+
+    def restore(self, kept: State) -> None:
+        """Go on from a snapshot. Raises UserError: that is of another controller; ControllerError:
+        it refuses."""
+        if (was := str(kept.get("name", "none"))) != self.name:
+            raise UserError(f"start_from: its snapshot is of the controller {was}, not {self.name}")
+        put_back(self.name, kept, "u", self._u)
+        self._external.restore(kept)
 
     def check(self, event: Event, controller: Controller) -> None:
         """Refuse an event that the external controller cannot follow. Raises ValueError: why."""

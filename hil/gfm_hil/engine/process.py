@@ -23,6 +23,7 @@ from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_benches
+from gfm_hil.engine.snapshot import external_snapshot
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
@@ -98,10 +99,16 @@ def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
                 raise UserError(f"events, {event.label()}: {external.name} has a law of its own")
     elif scenario.mode == "realtime":
         raise UserError(f"mode = 'realtime': {external.name} keeps no time; choose --mode lockstep")
+    if (scenario.snapshot is not None or scenario.start_from) and not external.gives_state:
+        key = "snapshot" if scenario.start_from is None else "start_from"
+        raise UserError(f"{key}: {external.name} has no interface that gives its state")
     try:
-        return SteppedController(
+        found = SteppedController(
             external, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)
         )
+        if scenario.start_from is not None:
+            found.restore(external_snapshot(scenario, bench))
+        return found
     except ControllerError as problem:
         raise UserError(str(problem)) from None
 

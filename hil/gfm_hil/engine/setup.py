@@ -15,11 +15,13 @@ from gfm_design.model.operating_point import OperatingPoint, operating_point, op
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.replay import Trace, no_trace, trace_of
+from gfm_hil.engine.snapshot import start_from
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
 from gfm_plant.model import DELTA
 from gfm_plant.names import MAY_START
+from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, carried
@@ -44,6 +46,7 @@ class Bench:
     # what computes u in place of the law; None for the law
     external: SteppedController | None = None
     trace: Trace = field(default_factory=no_trace)  # what the run replays
+    before: int = 0  # ticks of the plant before tick 0, of a run that starts from a snapshot
 
     @property
     def inner(self) -> int:
@@ -63,10 +66,16 @@ class Bench:
         self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
         self._asked = c.asked
 
+    @property
+    def wired(self) -> Wiring:
+        """How the plant was connected at the start."""
+        return self._plant.wiring
+
     def restore_plant(self, tick: int) -> None:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
         self.plant.restore(self._plant)
-        self.plant.st["tick"], self.u[:] = tick, _commands(self.start, self.inner)
+        self.plant.st["tick"] = tick + self.before
+        self.u[:] = _commands(self.start, self.inner)
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -164,6 +173,8 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         bench.keep()
         gains_of(one, controller.omega_b)
         benches.append(bench)
+    if scenario.start_from is not None:
+        start_from(scenario, benches)
     return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
 
 

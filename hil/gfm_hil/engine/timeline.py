@@ -16,9 +16,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gfm_hil.controllers import ControllerError
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.setup import Bench
+from gfm_hil.engine.snapshot import keep_snapshot
 from gfm_hil.recording.log import Outcome, Status
 from gfm_hil.scenario.events.base import Event, PlantEvent, nominal_hz
 from gfm_plant import Network, SynchroCheckResult, finish_check, trip_reason, wait_reason
@@ -26,6 +28,7 @@ from gfm_plant.names import CONTROLLER, NOT_ASKED
 from gfm_runtime.signals import carried, names
 from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, PLANT_TRIP, REASONS, SAFE
 
+_SNAPSHOT = object()
 _ROOM = 1 << 16  # bytes kept beside the log for its last lines
 
 
@@ -75,6 +78,8 @@ class Timeline:
         ]
         for begin, e in [(k, e) for k, e in ours if isinstance(e, PlantEvent)]:
             ours += [(begin + k, point) for k, point in e.course(bench.plant)]
+        if scenario.snapshot is not None:  # before the events of its tick
+            ours.insert(0, (round(scenario.snapshot / scenario.T_s), _SNAPSHOT))
         self._todo = deque[tuple[int, Any]](sorted(ours, key=lambda entry: entry[0]))
         self._inbox: deque[tuple[Any, Ticket]] = deque()
         self._changes = 0
@@ -112,6 +117,9 @@ class Timeline:
         """Carry out every event due at this tick, and the queued ones."""
         while self._todo and self._todo[0][0] <= tick:
             event = self._todo.popleft()[1]
+            if event is _SNAPSHOT:
+                self._keep(tick)
+                continue
             if not isinstance(event, Event):  # a point of an event's course
                 if self._bench.place == 0:
                     event.apply(self._bench.plant)
@@ -140,6 +148,14 @@ class Timeline:
         event.carry_out(self._bench)
         self.write(tick, event.type, label=self.label(event), **more)
 
+    def _keep(self, tick: int) -> None:
+        """Keep the state at a tick for other runs."""
+        try:
+            keep_snapshot(self._bench, self._path.parent, self._roles)
+        except (ValueError, OSError, ControllerError) as problem:
+            why = getattr(problem, "strerror", None) or problem
+            self.end("safe", f"the snapshot cannot be kept: {why}", tick)
+
     def label(self, event: Event) -> str:
         """What results call an event; no file is read for it while the loop runs."""
         return event.label_in(self._bench)
@@ -157,7 +173,7 @@ class Timeline:
             mine = st[self._bench.place]
             tripped = "plant" in self._roles and mine["trip"] not in (0, CONTROLLER)
             # the one time of a trip: when the bridge blocks, in the state that is beyond its limit
-            at = int(mine["trip_tick"]) if tripped else tick
+            at = int(mine["trip_tick"]) - self._bench.before if tripped else tick
             if self._bench.scenario.after_trip == "end":
                 self.end(*found, at)
                 return

@@ -322,7 +322,9 @@ def _room(bench: Bench) -> tuple[Kept, Kept]:
 
 
 def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:
-    """Run benches; the runs' columns are those kept."""
+    """Run benches; the runs' columns are those kept. Raises UserError: a snapshot has no place."""
+    if benches[0].scenario.snapshot is not None:
+        raise UserError("snapshot: is kept in a run folder, and a run in memory has none")
     plants, controllers = zip(*kept, strict=True)
     timelines = [TimelineInMemory(bench) for bench in benches]
     began, date = time.monotonic(), time.time()

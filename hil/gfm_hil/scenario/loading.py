@@ -174,10 +174,11 @@ def look_beside(content: Any, folder: Path) -> None:
         file = table[key]
         if not isinstance(file, str) or "\0" in file:
             continue
-        if key not in ("file", "trace") and not file.endswith(".toml"):
+        if key not in ("file", "trace", "start_from") and not file.endswith(".toml"):
             continue
         with contextlib.suppress(OSError):  # a name too long: the check of the file says so
-            if (folder / file).is_file() or (key == "trace" and (folder / file).is_dir()):
+            is_folder = key in ("trace", "start_from") and (folder / file).is_dir()
+            if (folder / file).is_file() or is_folder:
                 table[key] = str((folder / file).absolute())
 
 
@@ -192,6 +193,7 @@ def _files(content: Any) -> Iterator[tuple[Any, Any]]:
             elif key in table:
                 yield table, key
 
+    yield from within(content, "start_from")
     for one in (content, *_inside(content, "network", "converters").values()):
         yield from within(one, "law", "inner", "ready_laws", "compare")
         yield from within(_inside(one, "plant"), "converter")

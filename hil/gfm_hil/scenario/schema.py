@@ -215,6 +215,14 @@ class Scenario(StrictSchema):
         description="[from, to], s: the window of the figure of the three phases; from 3 cycles "
         "before the first event to 7 after it if none",
     )
+    snapshot: float | None = Field(
+        None, gt=0, description="s: when both sides keep their state in the run folder, before the "
+        "events of that tick; lockstep only",
+    )  # fmt: skip
+    start_from: str | None = Field(
+        None,
+        description="run folder with the snapshot at which this run starts; tick 0 is its tick",
+    )
     ready_laws: list[str] = Field(
         default_factory=list,
         description="further laws to make ready for an operator, besides those of the events",
@@ -415,6 +423,23 @@ class Scenario(StrictSchema):
                 problems.append(f"{where}.options: {problem}")
         return problems
 
+    def _wrong_snapshot(self) -> list[str]:
+        problems = []
+        if self.snapshot is not None and not 0 < round(self.snapshot / self.T_s) < self.ticks:
+            problems.append(
+                f"snapshot = {self.snapshot:g} s: must lie within the run of {self.duration:g} s"
+            )
+        if self.snapshot is not None and self.mode == "realtime":
+            problems.append(f"snapshot = {self.snapshot:g} s: needs mode = 'lockstep'")
+        key = "start_from" if self.snapshot is None else "snapshot"
+        if self.snapshot is not None or self.start_from is not None:
+            for link in self.links:
+                if link.impairment is not None and link.impairment.trace is not None:
+                    problems.append(f"{key}: goes with no link.impairment.trace")
+                if int(link.options.get("every", 1)) > 1:  # the link has u of several ticks then
+                    problems.append(f"{key}: needs link.options.every = 1")
+        return problems
+
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
         problems = check_expectation(
@@ -440,6 +465,7 @@ class Scenario(StrictSchema):
                     f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
                     f"{meant(asked, self.converters)}"
                 )
+        problems += self._wrong_snapshot()
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         if self.network is not None and self.plant.grid.scr is not None:

@@ -28,8 +28,7 @@ from gfm_runtime.switchover import settle_into
 from ...support.firmware import cc
 from ...support.processes import write
 
-SOURCE = Path(__file__).parents[2] / "support" / "foreign_model.c"
-PHASES = SOURCE.with_name("phases_model.c")
+PHASES = Path(__file__).parents[2] / "support" / "phases_model.c"
 EXAMPLE = Path(__file__).parents[3] / "examples" / "foreign_controller" / "controller.c"
 CONTROLLERS = Path(gfm_hil.controllers.__file__).parent
 MAP = """\
@@ -51,34 +50,6 @@ FAILS_AT = 100  # step of the model
 
 def compiles(test: Any) -> Any:
     return pytest.mark.apt(pytest.mark.timeout(900)(test))
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Our own laws as models, by kind, law and inner stage."""
-    found: dict[Any, str] = {}
-
-    def export(kind: str, law: str, inner: str) -> str:
-        if (kind, law, inner) not in found:
-            folder = tmp_path_factory.mktemp(kind)
-            out = folder / "law.fmu" if kind == "fmu" else folder
-            what = ["firmware", kind, law, "--inner", inner, "--real", "float64", "-o", str(out)]
-            assert main(what) == 0
-            found[kind, law, inner] = f"{kind}:{out if kind == 'fmu' else next(out.glob('*.so'))}"
-        return found[kind, law, inner]
-
-    return export
-
-
-@pytest.fixture(scope="module")
-def foreign(exported: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The library of ``foreign_model.c``."""
-    headers = Path(exported("dll", "vsg-2", "none").removeprefix("dll:")).parent
-    folder = tmp_path_factory.mktemp("foreign")
-    flags = ["-std=gnu99", "-Wall", "-O2", "-shared", "-fPIC", f"-I{headers}"]
-    done = cc(folder, *flags, str(SOURCE), "-o", "droop.so", "-lm")
-    assert (done.returncode, done.stderr) == (0, "")
-    return folder / "droop.so"
 
 
 def run(tmp_path: Path, model: str, *options: str, **content: Any) -> Run:

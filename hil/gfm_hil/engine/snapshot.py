@@ -1,0 +1,144 @@
+"""The state of a run at a tick: kept by both sides in the run folder, and where another run starts.
+
+The plant's records, grid and instruments included, are kept once, in the folder of the first
+converter; each controller's in that of its converter. With a controller that is not ours goes what
+that gives: a real-code model the arrays of its state, an FMU its FMU state.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.controllers.external import State, put_back
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import open_file, replacing
+from gfm_hil.core.roles import Role
+from gfm_hil.recording.run import read_scenario
+from gfm_hil.scenario import Scenario
+from gfm_runtime.assembly import SPARE
+
+if TYPE_CHECKING:
+    from gfm_hil.engine.setup import Bench
+
+_LARGEST = 1 << 30  # bytes of a file
+_SAME = ("T_s", "inner", "counts", "seed", "references", "plant", "network")
+_OWN = ("ctl", "laws", "states", "est")  # records of a controller of ours
+
+
+def keep_snapshot(bench: Bench, folder: Path, roles: Sequence[Role]) -> None:
+    """Write down the state of one side, or of both in process, between two ticks.
+
+    Raises:
+        ValueError: a law has other gains than its file, or the connections are not those of the
+            start, so that a run of this scenario could not begin here.
+        gfm_hil.controllers.ControllerError: a controller that is not ours refuses.
+        OSError: it cannot be written.
+    """
+    if "plant" in roles and bench.place == 0:
+        if bench.plant.wiring != bench.wired:
+            raise ValueError("the connections of the plant are not those of its start")
+        _write(_file(folder, "plant"), _memory(bench))
+    if "controller" in roles:
+        c = bench.controller
+        if c.gains or int(c.ctl["active"][0]) >= len(c.laws) - SPARE:
+            raise ValueError("a law has other gains than its file")
+        found: State = {name: _bytes(getattr(c, name)) for name in _OWN} | {"told": bench.u}
+        if bench.external is not None:
+            found |= {f"external_{name}": x for name, x in bench.external.state().items()}
+        _write(_file(folder, "controller"), found)
+
+
+def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
+    """Put all benches of a scenario where its ``start_from`` kept its state. Raises UserError: it
+    kept none, or was a run of another plant or of other laws."""
+    folder = Path(scenario.start_from or "")
+    _check_same(scenario, folder)
+    where = f"start_from = {scenario.start_from!r}"
+    for bench in benches:
+        own = _folder(folder, bench)
+        if bench.place == 0:
+            kept = _read(_file(own, "plant"), where)
+            plant, advance = bench.plant, bench.plant.net["advance"].copy()
+            for name, record in _memory(bench).items():
+                put_back(where, kept, name, record)
+            plant.net["advance"] = advance  # an address of this process
+        kept, c = _read(_file(own, "controller"), where), bench.controller
+        if (kept.get("laws", np.zeros(0)).tobytes()) != c.laws.tobytes():
+            raise UserError(
+                f"{where}: its laws are others than {', '.join(scenario.laws())}, or their files"
+                " have changed; name the same laws, with ready_laws if need be"
+            )
+        for name in _OWN:
+            put_back(where, kept, name, _bytes(getattr(c, name)))
+        put_back(where, kept, "told", bench.u)
+        request = int(c.ctl["request"][0])
+        c.asked = c.names[request if request >= 0 else int(c.ctl["active"][0])]
+    for bench in benches:
+        bench.before = int(bench.plant.st["tick"][0])
+
+
+def external_snapshot(scenario: Scenario, bench: Bench) -> State:
+    """What the controller that is not ours gave. Raises UserError: it cannot be read."""
+    own = _folder(Path(scenario.start_from or ""), bench)
+    kept = _read(_file(own, "controller"), f"start_from = {scenario.start_from!r}")
+    begin = "external_"
+    return {name.removeprefix(begin): x for name, x in kept.items() if name.startswith(begin)}
+
+
+def _folder(folder: Path, bench: Bench) -> Path:
+    return folder / bench.scenario.converter if bench.scenario.converter else folder
+
+
+def _file(folder: Path, role: Role) -> Path:
+    return folder / f"snapshot_{role}.npz"
+
+
+def _memory(bench: Bench) -> State:
+    """Views of all bytes of the plant's records."""
+    return {f"record_{k}": _bytes(record) for k, record in enumerate(bench.plant.memory)}
+
+
+def _bytes(record: NDArray[Any]) -> NDArray[np.uint8]:
+    return record.view(np.uint8)
+
+
+def _check_same(scenario: Scenario, folder: Path) -> None:
+    """Raise UserError unless two runs have what the records of a snapshot depend on."""
+    was = read_scenario(folder)
+    if scenario.converter is not None and was.parts:
+        was = was.of(scenario.converter)
+    for key in _SAME:
+        mine, theirs = (_plain(one, key) for one in (scenario, was))
+        if mine != theirs:
+            short = f" = {mine!r}, there {theirs!r}" if len(f"{mine}{theirs}") < 100 else ""
+            raise UserError(f"start_from = {str(folder)!r}: {key}{short}: must be as in that run")
+
+
+def _plain(scenario: Scenario, key: str) -> Any:
+    value = getattr(scenario, key)
+    found = value.model_dump(mode="json") if hasattr(value, "model_dump") else value
+    for member in found["converters"].values() if key == "network" and found else ():
+        for free in ("link", "late_policy", "expect"):
+            member.pop(free)
+    return found
+
+
+def _write(path: Path, found: State) -> None:
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, **found)  # type: ignore[arg-type]
+
+
+def _read(path: Path, where: str) -> State:
+    try:
+        with open_file(path, _LARGEST) as file, np.load(file, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except FileNotFoundError:
+        raise UserError(f"{where}: {path} is not there: it took no snapshot") from None
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as problem:
+        raise UserError(f"{where}: {path} cannot be read: {problem}") from None

@@ -1,0 +1,225 @@
+"""Networks of several models, and runs that go on from a snapshot: the bits of the run that was not
+cut."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gfmhil
+from gfm_hil.core.errors import UserError
+from gfm_hil.engine import setup
+from gfm_hil.recording.run import Run
+from gfm_hil.run import runner
+from gfm_plant import plant_sample
+from gfm_runtime.switchover import settle_into
+
+RIG = {"dc_source": {"mode": "regulated"}}
+CUT = 500  # tick of the snapshot
+T_S = 1e-4
+#: what no law fills where a model computes u, and what counts from the start of a run
+OF_LAWS = {"law", "X_est", "E_law", "i_ref_d", "i_ref_q", "limited"}
+OF_TIME = {"tick", "t"}
+
+
+def compiles(test: Any) -> Any:
+    return pytest.mark.apt(pytest.mark.timeout(900)(test))
+
+
+def steps(*ticks: int, **more: Any) -> list[dict[str, Any]]:
+    """Steps of P_ref at these ticks."""
+    powers = (0.4, 0.25, 0.45)
+    return [{"type": "reference", "tick": k, "P_ref": P, **more}
+            for k, P in zip(ticks, powers, strict=False)]  # fmt: skip
+
+
+def network(**changes: Any) -> dict[str, Any]:
+    """Three converters of three laws at one node, with a grid behind a line."""
+    laws = {"A": "vsg-2", "B": "droop-5", "C": "vsg-1"}
+    return {
+        "title": "three", "duration": 0.1, "references": {"P_ref": 0.3}, "plant": RIG,
+        "link": {"type": "shm", "peer_timeout_s": 20.0},
+        "network": {
+            "converters": {name: {"node": "bus", "law": law} for name, law in laws.items()},
+            "loads": {"base": {"node": "bus", "P": 0.6, "Q": 0.1}},
+            "lines": {"to grid": {"start": "bus", "end": "g", "L": 0.2, "R": 0.02}}, "grid": "g",
+        },
+        "events": steps(200, 700, converter="A"),
+        **changes,
+    }  # fmt: skip
+
+
+def check_equal(found: Run, whole: Run, first: int, without: set[str]) -> None:
+    """The run is that of the other from a tick on, bit for bit."""
+    assert np.ptp(whole.columns["true_p"][first:]) > 1e-3
+    assert set(found.columns) == set(whole.columns)
+    for name in whole.columns.keys() - without:
+        rest = whole.columns[name][first:]
+        assert found.columns[name][:].tobytes() == rest.tobytes(), name
+
+
+@compiles
+def test_two_dlls_and_a_law_in_a_network_and_their_snapshot(exported, tmp_path, monkeypatch):
+    """Each converter has the bits of the network whose three laws are ours, settled at the first
+    measurement as the models settle themselves; and those bits from a snapshot on."""
+    models = {
+        name: exported("dll", law, "none") for name, law in (("A", "vsg-2"), ("B", "droop-5"))
+    }
+    given, cut = network(snapshot=CUT * T_S), tmp_path / "cut"
+    whole = gfmhil.run_network(given, cut, controllers=models, figures=False)
+    assert whole.status == "completed"
+    names = [run.summary["controller"] for run in whole.values()]
+    assert names == ["dll vsg-2", "dll droop-5", "gfmhil"]
+    rest = network(duration=0.05, events=steps(700 - CUT, converter="A"))
+    rest["events"][0]["P_ref"] = given["events"][1]["P_ref"]
+    goes_on = gfmhil.run_network(
+        rest, tmp_path / "rest", controllers=models, figures=False, start_from=str(cut)
+    )
+    for name, run in goes_on.items():
+        check_equal(run, whole[name], CUT, OF_TIME | (OF_LAWS if name != "C" else set()))
+
+    make = setup.make_benches
+
+    def settled(scenario: Any) -> Any:
+        benches = make(scenario)
+        for k, bench in enumerate(benches[:2]):
+            c, y = bench.controller, bench.y.copy()
+            plant_sample(bench.plant.copy().records, k, y)
+            settle_into(c.laws[0], c.states[0], c.ctl["ref"][0], y, bench.u.copy(), np.zeros(3))
+        return benches
+
+    monkeypatch.setattr(runner, "make_benches", settled)
+    ours = gfmhil.run_network(network())
+    for name, run in whole.items():
+        check_equal(run, ours[name], 0, OF_LAWS if name != "C" else set())
+
+
+@compiles
+@pytest.mark.parametrize("kind", ["dll", "fmu"])
+def test_a_model_goes_on_from_its_state(exported, kind, tmp_path):
+    """A new instance in a new process gets what the interface gives of the model's state."""
+    model = exported(kind, "vsg-2", "cascaded")
+    given = {"title": "cut", "duration": 0.1, "law": "vsg-2", "inner": "cascaded",
+             "link": {"type": "shm", "peer_timeout_s": 20.0}}  # fmt: skip
+    whole = gfmhil.run(
+        {**given, "events": steps(300), "snapshot": CUT * T_S}, folder=tmp_path / "cut",
+        controller=model, figures=False,
+    )  # fmt: skip
+    goes_on = gfmhil.run(
+        {**given, "duration": 0.05, "start_from": str(tmp_path / "cut")}, folder=tmp_path / "rest",
+        controller=model, figures=False,
+    )  # fmt: skip
+    check_equal(goes_on, whole, CUT, OF_TIME | OF_LAWS)
+    with pytest.raises(UserError, match="its snapshot is of the controller"):
+        gfmhil.run(
+            {**given, "duration": 0.05, "start_from": str(tmp_path / "cut")},
+            folder=tmp_path / "other", controller=exported("dll", "droop-5", "cascaded"),
+            figures=False,
+        )  # fmt: skip
+
+
+@compiles
+def test_a_model_of_others_goes_on_between_two_of_its_steps(foreign, tmp_path):
+    """Its step is two ticks, and the snapshot lies within one; ``at`` counts its steps."""
+    from .test_controllers import MAP
+
+    (tmp_path / "map.toml").write_text(MAP + "parameters.at = 300\nparameters.what = 5\n")
+    given = {"title": "cut", "duration": 0.1, "law": "vsg-2", "plant": RIG,
+             "link": {"type": "shm", "peer_timeout_s": 20.0}}  # fmt: skip
+    how = {"controller": f"dll:{foreign}", "ports": tmp_path / "map.toml", "figures": False}
+    whole = gfmhil.run(
+        {**given, "events": steps(300), "snapshot": (CUT + 1) * T_S}, folder=tmp_path / "cut", **how
+    )
+    rest = {**given, "duration": 0.05, "start_from": str(tmp_path / "cut")}
+    goes_on = gfmhil.run(rest, folder=tmp_path / "rest", **how)
+    reason = "dll droop of others: blocks the bridge: block = 1"
+    assert whole.summary["reason"] == goes_on.summary["reason"] == reason
+    assert whole.ticks == goes_on.ticks + CUT + 1
+    ran = goes_on.ticks - 1  # the last tick has no u of the controller
+    for name in ("true_p", "true_q", "u_omega_u", "u_E_u", "y_V"):
+        rest_of = whole.columns[name][CUT + 1 : CUT + 1 + ran]
+        assert goes_on.columns[name][:ran].tobytes() == rest_of.tobytes(), name
+
+
+NOISY = {"sensors": {"noise_std": {"p": 1e-3}}, "delay": {"samples": 1, "fraction": 0.5}}
+
+
+@pytest.mark.parametrize("inner", [None, "cascaded"])
+def test_a_run_of_a_law_goes_on_in_process(tmp_path, inner):
+    """With noise, a delay, a ramp of a reference and one of the grid that go on, and a law that has
+    changed."""
+    events = [
+        {"type": "law", "tick": 100, "law": "droop-5"},
+        {"type": "reference", "tick": 450, "P_ref": 0.6, "ramp_s": 0.02},
+        {"type": "grid-frequency", "tick": 400, "f_hz": 49.9, "rate": 5.0},
+        {"type": "reference", "tick": 700, "P_ref": 0.3},
+    ]
+    given = {"title": "cut", "duration": 0.1, "law": "vsg-2", "plant": NOISY,
+             "link": {"type": "inproc"}, "seed": 3}  # fmt: skip
+    given |= {} if inner is None else {"inner": inner}
+    cut = tmp_path / "cut"
+    whole = gfmhil.run(
+        {**given, "events": events, "snapshot": CUT * T_S}, folder=cut, figures=False
+    )
+    later = {**given, "duration": 0.05, "start_from": str(cut), "ready_laws": ["droop-5"],
+             "events": [{**events[3], "tick": 700 - CUT}]}  # fmt: skip
+    check_equal(gfmhil.run(later), whole, CUT, OF_TIME)
+
+
+def test_a_trip_after_a_snapshot_has_the_tick_of_the_new_run(tmp_path):
+    given = {"title": "cut", "duration": 0.1, "law": "vsg-2", "link": {"type": "inproc"}}
+    dip = {"type": "grid-voltage", "V_g": 0.0}
+    whole = gfmhil.run(
+        {**given, "events": [{**dip, "tick": 700}], "snapshot": CUT * T_S},
+        folder=tmp_path / "cut", figures=False,
+    )  # fmt: skip
+    later = {**given, "duration": 0.05, "start_from": str(tmp_path / "cut"),
+             "events": [{**dip, "tick": 700 - CUT}]}  # fmt: skip
+    found = gfmhil.run(later)
+    assert (found.status, found.summary["reason"]) == ("tripped", whole.summary["reason"])
+    at, before = (run.events[-1]["tick"] for run in (found, whole))
+    assert at == before - CUT > 200
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"T_s": 2e-4}, "T_s = 0.0002, there 0.0001: must be as in that run"),
+        ({"references": {"P_ref": 0.2}}, "references"),
+        ({"law": "droop-5"}, "its laws are others than droop-5"),
+        ({"snapshot": 1.0}, "snapshot = 1 s: must lie within the run of 0.01 s"),
+        ({"snapshot": 0.005}, "snapshot: is kept in a run folder"),
+    ],
+)
+def test_wrong_snapshots_are_one_line(tmp_path_factory, changes, message):
+    cut = tmp_path_factory.getbasetemp() / "cut"
+    given = {"title": "cut", "duration": 0.01, "law": "vsg-2", "link": {"type": "inproc"}}
+    if not cut.exists():
+        gfmhil.run({**given, "snapshot": 0.005}, folder=cut, figures=False)
+    start: dict[str, Any] = {} if "snapshot" in changes else {"start_from": str(cut)}
+    with pytest.raises(UserError, match=message) as said:
+        gfmhil.run({**given, **start, **changes})
+    assert "\n" not in str(said.value)
+
+
+def test_a_folder_without_a_snapshot_or_with_a_damaged_one(tmp_path):
+    given = {"title": "cut", "duration": 0.01, "law": "vsg-2", "link": {"type": "inproc"}}
+    gfmhil.run(given, folder=tmp_path / "cut", figures=False)
+    start = {**given, "start_from": str(tmp_path / "cut")}
+    with pytest.raises(UserError, match="is not there: it took no snapshot"):
+        gfmhil.run(start)
+    (tmp_path / "cut" / "snapshot_plant.npz").write_bytes(b"PK\x03\x04 nothing")
+    with pytest.raises(UserError, match="cannot be read"):
+        gfmhil.run(start)
+    np.savez(tmp_path / "cut" / "snapshot_plant.npz", record_0=np.zeros(3, np.uint8))
+    with pytest.raises(UserError, match="of another controller or plant"):
+        gfmhil.run(start)
+
+
+def test_a_snapshot_while_the_connections_are_others(tmp_path):
+    given = {"title": "cut", "duration": 0.01, "law": "vsg-2", "link": {"type": "inproc"},
+             "snapshot": 0.006}  # fmt: skip
+    fault = {"type": "fault", "t": 0.005, "position": 0.5, "R": 0.2, "duration": 0.004}
+    run = gfmhil.run({**given, "events": [fault]}, folder=tmp_path / "cut", figures=False)
+    said = "the snapshot cannot be kept: the connections of the plant are not those of its start"
+    assert (run.status, run.summary["reason"]) == ("safe", said)
