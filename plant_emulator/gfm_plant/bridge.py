@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.beside import advance_link, begin_average
 from gfm_plant.dc_link import discharge
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, terminal
@@ -174,7 +175,10 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
         if first < end and begin < last:
             if begin <= first:
                 for k in range(n.n_converters):
-                    _load(plant, k, c, unit)
+                    if plant.par[k].levels == 0:
+                        begin_average(plant, k, c, unit)
+                    else:
+                        _load(plant, k, c, unit)
             a, b = max(begin, first) - first, min(end, last) - first
             _advance_unit(plant, c, a, b)
             for k in range(n.n_converters):
@@ -265,6 +269,8 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None
         watched = limited = False
         for k in range(n.n_converters):
             r, s = plant.par[k], plant.st[k]
+            if r.levels == 0:
+                continue
             if s.soonest <= t + _INSTANT:
                 _switch(r, s, t)
             if s.due == 2:
@@ -574,6 +580,8 @@ def _first_event(plant: PlantRecords, c: int, h: float, terms: int) -> tuple[flo
     for k in range(n.n_converters):
         r, s = plant.par[k], plant.st[k]
         known, most = False, _OUT
+        if r.levels == 0:
+            continue
         if _limited(r, s):
             most = _EVENTS
         elif s.open >= 0:
@@ -727,10 +735,14 @@ def _change(plant: PlantRecords, k: int, c: int, what: int) -> None:
 
 @inlined
 def _sense(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) -> None:
-    """Take the battery and the sensors' filters on over a part tau of an interval of h s."""
+    """Take the battery and the sensors' filters on over a part tau of an interval of h s, and the
+    DC link of an averaged bridge."""
     r, s = plant.par[k], plant.st[k]
     step, v_0, v_2 = tau * h, s.ends[0, DC], s.ends[1, DC]
-    if r.energy > 0.0:
+    v_1 = 0.0
+    if r.levels == 0:
+        v_0, v_1, v_2 = advance_link(plant, k, h, terms, tau)
+    elif r.energy > 0.0:
         s.drawn[0], s.drawn[2] = _drawn(r, s, 0), _drawn(r, s, 1)
         look(plant, k, c, h, terms, 0.5 * tau)
         s.drawn[1], v_1 = _drawn(r, s, 1), s.ends[1, DC]
@@ -739,7 +751,8 @@ def _sense(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float
     if not r.filtered:
         return
     b_0, b_1, b_2, b_3 = _weights(step * r.omega_s)
-    v_1 = 0.5 * (v_0 + v_2) + 0.125 * step * (_dc_slope(r, s, 0) - _dc_slope(r, s, 1))
+    if r.levels > 0:
+        v_1 = 0.5 * (v_0 + v_2) + 0.125 * step * (_dc_slope(r, s, 0) - _dc_slope(r, s, 1))
     s.sensed[0] = b_0 * s.sensed[0] + b_1 * v_0 + b_2 * v_1 + b_3 * v_2
     _see(r, s, 1)
     for j in range(3):  # the value in the middle by those at the ends and their slopes

@@ -152,6 +152,8 @@ def _make(
     if grid.finite is not None and grid_node is not None:
         dynamic.append(("plant.grid.finite", "", grid.finite))
     carriers, updates = _carrier(converters, T_s)
+    if carriers:
+        _check_beside(converters, carriers * updates)
     conversions = int(max(par["phase_samples"]))
     if (par["phase_samples"] != conversions).any():
         raise ValueError("phases.samples: must be the same for all converters of a network")
@@ -359,12 +361,6 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
                 f"{where}.{name} = {value:g}: must be less than {most:g} s,"
                 f" {'half a' if name == 'dead_time_s' else 'a'} period of the carrier"
             )
-    units = round(carriers) * bridge.updates
-    if abs(options.delay.fraction * units - round(options.delay.fraction * units)) > 1e-9:
-        raise ValueError(
-            f"plant.delay.fraction = {options.delay.fraction:g}: compare values are loaded"
-            f" {units} times a period, so it must be a multiple of {1 / units:g}"
-        )
     topology = TOPOLOGIES[bridge.kind]
     par["levels"], par["off"] = topology.levels, topology.off
     par["counts"], par["count_s"] = round(counts), 1 / bridge.timer_hz
@@ -383,15 +379,33 @@ def _carrier(converters: Mapping[str, tuple[Plant, str]], T_s: float) -> tuple[i
     """Return the periods of the carrier in T_s, 0 if no bridge is switched, and how often compare
     values are loaded in one. Raises ValueError: the bridges differ."""
     found = {
-        (0, 1) if b.kind == "average" else (round((b.carrier_hz or 1 / T_s) * T_s), b.updates)
+        (round((b.carrier_hz or 1 / T_s) * T_s), b.updates)
         for b in (options.bridge for options, _ in converters.values())
+        if b.kind != "average"
     }
     if len(found) > 1:
         raise ValueError(
-            "bridge: where one bridge of a network is switched all must be, with one carrier_hz and"
-            " one updates"
+            "bridge: all switched bridges of a network must have one carrier_hz and one updates"
         )
-    return found.pop()
+    return found.pop() if found else (0, 1)
+
+
+def _check_beside(converters: Mapping[str, tuple[Plant, str]], units: int) -> None:
+    """Raise ValueError if the commands of a converter, averaged ones included, do not begin with a
+    unit of the carrier, or an averaged bridge has what it cannot have beside a switched one."""
+    for name, (options, _) in converters.items():
+        plant = "plant" if len(converters) == 1 else f"{name}: plant"
+        fraction = options.delay.fraction
+        if abs(fraction * units - round(fraction * units)) > 1e-9:
+            raise ValueError(
+                f"{plant}.delay.fraction = {fraction:g}: compare values are loaded"
+                f" {units} times a period, so it must be a multiple of {1 / units:g}"
+            )
+        if options.bridge.kind == "average" and options.i_peak is not None:
+            raise ValueError(
+                f"{plant}.i_peak = {options.i_peak:g}: an averaged bridge beside a switched one has"
+                " no such limit; leave it out, or give it a bridge.kind of 'two-level' or 't-type'"
+            )
 
 
 def _pack_units(net: Record, cuts: Sequence[float]) -> None:

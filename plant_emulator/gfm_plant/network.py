@@ -289,7 +289,7 @@ def _pack_rates(
     net["axis"][circuit] = np.exp(-1j * angle)
     net["leg_axis"][circuit] = np.exp(1j * (2 * np.pi / 3 * np.arange(3) - angle))
     fastest = max(one.fastest for one in axes)
-    net["fastest"][circuit] = max(_fastest_with_dc(r, fastest) for r in plant.par)
+    net["fastest"][circuit] = max(_fastest_with_dc(r, fastest) for r in plant.par if r["levels"])
     by_w = [one.by_w.copy() for one in axes]
     for k in range(N):
         i_f, v, i_o = range(N_OWN * k, N_OWN * (k + 1))
@@ -403,7 +403,7 @@ def _pack_joint(plant: Network, wiring: Wiring) -> float:
     if net["n_units"]:
         c, norm = net["n_c"] - 1, max(np.linalg.norm(flow, 2) for flow in one.flow)
         net["axis"][c], net["leg_axis"][c] = 1.0, np.exp(2j * np.pi / 3 * np.arange(3))
-        net["fastest"][c] = max(_fastest_with_dc(r, float(norm)) for r in plant.par)
+        net["fastest"][c] = max(_fastest_with_dc(r, float(norm)) for r in plant.par if r["levels"])
     return max(float(np.abs(np.linalg.eigvals(flow).imag).max()) for flow in one.flow)
 
 

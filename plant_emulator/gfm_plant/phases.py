@@ -112,19 +112,18 @@ def _count(r: Any, tick: int, j: int, value: float) -> float:
 
 
 @compiled
-def apply_counts(plant: PlantRecords, k: int, begin: float, lasts: float) -> None:
+def apply_counts(plant: PlantRecords, k: int, frame: complex, lasts: float) -> None:
     """Set the command of an averaged bridge that acts to the mean voltage, which stands still, of
     the compare values that came with it.
 
     Args:
-        begin: of the stretch in which it acts, s after that of the period.
-        lasts: how long, s.
+        frame: the converter's, as a phasor that stands still, when it begins to act.
+        lasts: how long it acts, s.
     """
     r, s, n = plant.par[k], plant.st[k], plant.net[0]
     z = 0j
     for x in range(3):
         z += _A[x] * min(max(s.u_now[COMPARE + x], 0.0), 1.0 * r.counts)
-    frame = field(plant.now[0], "unit")[k] * stands(plant, begin)
     half = 0.5 * n.omega_b * s.u_now[1] * lasts
     frame = frame * complex(math.cos(half), math.sin(half))
     E = z * frame.conjugate() * (r.leg * s.x[V_DC] / r.counts)

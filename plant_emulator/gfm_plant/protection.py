@@ -69,7 +69,7 @@ def trip(plant: PlantRecords, k: int, reason: int, value: float) -> None:
     (`gfm_plant.grid.take_out`).
     """
     s, n, now = plant.st[k], plant.net[0], plant.now[0]
-    switched = n.n_units > 0
+    switched = plant.par[k].levels > 0
     if s.trip == 0 and (now.row == 0 or switched):
         s.trip = reason
         s.trip_tick = s.tick

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_plant.beside import average_rates, set_average
 from gfm_plant.layout import ORDER, POWERS, TERMS, field
 from gfm_plant.model import V_DC
 from gfm_plant.powers import MID_AT, ONE, SMALL, SOURCE_AT, N, P, fill_powers, find_slot, go_to
@@ -61,6 +62,8 @@ def begin_series(plant: PlantRecords, c: int, at: float) -> None:
             s.ends[0, 2 * i], s.ends[0, 2 * i + 1] = w[own(k) + i].real, w[own(k) + i].imag
         s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID] = s.x[V_DC], s.i_source, s.mid
         s.ends[0, REG] = s.i_reg + plant.par[k].i_u_gain * s.u_now[0]
+        if plant.par[k].levels == 0:
+            set_average(plant, k, c)
     g, omega_g = grid_source(n), now.omega_g + 0.5 * n.T_s * now.omega_g_slope
     for k in range(2):
         E = now.sequence[k]
@@ -92,8 +95,9 @@ def end_series(plant: PlantRecords, c: int, at: float, lasted: float) -> None:
     for k in range(n.n_converters):
         s = plant.st[k]
         unit[k] = normal(s.ahead * back)
-        s.x[V_DC], s.i_source, s.mid = s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID]
-        s.i_reg = s.ends[0, REG] - plant.par[k].i_u_gain * s.u_now[0]
+        if plant.par[k].levels > 0:
+            s.x[V_DC], s.i_source, s.mid = s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID]
+            s.i_reg = s.ends[0, REG] - plant.par[k].i_u_gain * s.u_now[0]
         for i in range(3):
             w[own(k) + i] = complex(s.ends[0, 2 * i], s.ends[0, 2 * i + 1])
     for i in range(n.n_states):
@@ -236,6 +240,8 @@ def look(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) 
         s.ends[1, 2 * i], s.ends[1, 2 * i + 1] = y.real, y.imag
         if i > 0:
             s.slopes[1, 2 * i - 2], s.slopes[1, 2 * i - 1] = slope.real / h, slope.imag / h
+    if plant.par[k].levels == 0:  # its link follows, see `beside`
+        return
     for what in range(4):
         value = dc[terms, k, what]
         for j in range(terms - 1, -1, -1):
@@ -271,7 +277,7 @@ def accept(plant: PlantRecords, c: int, step: float, terms: int, tau: float) -> 
             for j in range(terms - 1, -1, -1):
                 y = complex(x[j, i].real + tau * y.real, x[j, i].imag + tau * y.imag)
             w[i] = y
-        for k in range(n.n_converters, now.n_s):
+        for k in range(now.n_s):
             source[k] = source[k] * turned(speed[k] * step)
     for k in range(n.n_converters):
         s = plant.st[k]
@@ -295,7 +301,7 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
             x[0, own(k) + i] = complex(s.ends[0, 2 * i], s.ends[0, 2 * i + 1])
         for what in range(4):
             dc[0, k, what] = s.ends[0, DC + what]
-    for k in range(n.n_converters, now.n_s):
+    for k in range(now.n_s):
         s_term[k] = source[k]
     for j in range(1, terms + 1):
         d = h * _PER[j]
@@ -304,6 +310,9 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
         for k in range(n.n_converters):
             at = own(k)
             i, v, i_o = x[j - 1, at + I_F], x[j - 1, at + V], x[j - 1, at + I_O]
+            if plant.par[k].levels == 0:
+                _average_term(plant, c, k, j, d)
+                continue
             (
                 i_a, i_b, v_a, v_b, o_a, o_b,
                 dc[j, k, 0], dc[j, k, 1], dc[j, k, 2], dc[j, k, 3],
@@ -323,9 +332,31 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
             row, column = link_place[c, 1, e, 0], link_place[c, 1, e, 1]
             y = s_term[column]
             x[j, row] += _linked(link[c, 1, e], d, y)
-        for k in range(n.n_converters, now.n_s):
+        for k in range(now.n_s):
             y, turn = s_term[k], d * s_speed[k]
             s_term[k] = complex(-turn * y.imag, turn * y.real)
+
+
+@inlined
+def _average_term(plant: PlantRecords, c: int, k: int, j: int, d: float) -> None:
+    """Write term j of the own states of a converter whose bridge is averaged."""
+    n, now = plant.net[0], plant.now[0]
+    x, E, q = field(now, "terms"), field(now, "source_term")[k], field(n, "own_rates")
+    at = own(k)
+    i, v, i_o = x[j - 1, at + I_F], x[j - 1, at + V], x[j - 1, at + I_O]
+    by_v, by_i = average_rates(plant.par[k], plant.st[k])
+    x[j, at + I_F] = complex(
+        d * (by_v * (E.real - v.real) - by_i * i.real),
+        d * (by_v * (E.imag - v.imag) - by_i * i.imag),
+    )
+    x[j, at + V] = complex(
+        d * (q[c, k, 0, 0] * i.real + q[c, k, 0, 1] * v.real + q[c, k, 0, 2] * i_o.real),
+        d * (q[c, k, 1, 0] * i.imag + q[c, k, 1, 1] * v.imag + q[c, k, 1, 2] * i_o.imag),
+    )
+    x[j, at + I_O] = complex(
+        d * (q[c, k, 0, 3] * v.real + q[c, k, 0, 4] * i_o.real),
+        d * (q[c, k, 1, 3] * v.imag + q[c, k, 1, 4] * i_o.imag),
+    )
 
 
 @inlined

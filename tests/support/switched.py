@@ -1,4 +1,5 @@
-"""A switched converter on line and grid, integrated from edge to edge by SciPy's DOP853.
+"""A switched converter on line and grid, or at a bus with averaged ones, integrated from edge to
+edge by SciPy's DOP853.
 
 Nothing of the plant's own solution is in here: the three legs are written out phase by phase, the
 currents and voltages as space vectors that stand still, and the integrator finds the zeros of
@@ -105,7 +106,8 @@ class Reference:
     def slope(
         self, t: float, z: NDArray[np.complex128], u: Any, signs: list[int], open_: list[int]
     ):
-        r, (i, v, i_o, v_dc, reg) = self.par, z
+        r, (i, v, i_o, v_dc, reg) = self.par, z[:5]
+        node, more = self.outside(t, z)
         v_dc, w = v_dc.real, r["omega_b"]
         kept, self.z = self.z, z
         legs = [self.leg(x, signs[x]) for x in range(3)]
@@ -126,10 +128,15 @@ class Reference:
         return np.array([
             di,
             w / r["C_f"] * (i - i_o),
-            w / r["L_g"] * (v - self.V_g * self.grid * np.exp(1j * w * t) - r["R_g"] * i_o),
+            w / r["L_g"] * (v - node - r["R_g"] * i_o),
             w / r["C_dc"] * (i_dc - drawn),
             r["k_i"] * (1 - v_dc),
+            *more,
         ])  # fmt: skip
+
+    def outside(self, t: float, z: NDArray[np.complex128]) -> tuple[complex, list[complex]]:
+        """The voltage at the end of the line, and the slopes of what is there besides."""
+        return self.V_g * self.grid * np.exp(1j * self.par["omega_b"] * t), []
 
     def settle(self) -> tuple[list[int], list[int]]:
         """Signs of the currents, and the legs that stay without any."""
@@ -219,3 +226,49 @@ class Reference:
         self.go(self.T_s, u)
         self.tick, self.t = self.tick + 1, 0.0
         self.on_at = [at - self.T_s for at in self.on_at]
+
+
+@dataclass
+class AtABus(Reference):
+    """One at a bus with averaged converters, a resistor, a capacitor and a line to the grid.
+
+    Attributes:
+        others: records of the averaged converters' parameters.
+        E: the voltages of these at t = 0 of tick 0, space vectors that stand still.
+        u: their commands, (n, 4).
+        conductance, susceptance, L_tie, R_tie: of the load, the capacitor and the line.
+        R_fault: between phases a and c at the bus.
+        z: besides the voltage of the bus, the current to the grid, and of each other converter i,
+            v, i_o, v_dc and the integral of the DC source's control.
+    """
+
+    others: Any = ()
+    E: Any = ()
+    u: Any = ()
+    conductance: float = 0.0
+    susceptance: float = 0.0
+    L_tie: float = 0.0
+    R_tie: float = 0.0
+    R_fault: float = math.inf
+
+    def outside(self, t: float, z: NDArray[np.complex128]) -> tuple[complex, list[complex]]:
+        w, bus, i_g = self.par["omega_b"], z[5], z[6]
+        v_a, _, v_c = (bus * AXES.conj()).real
+        leak = 2 / 3 * (v_a - v_c) / self.R_fault * (AXES[0] - AXES[2])
+        arrives, more = z[2] - i_g - self.conductance * bus - leak, list[complex]()
+        for k, r in enumerate(self.others):
+            i, v, i_o, v_dc, reg = z[7 + 5 * k : 12 + 5 * k]
+            e = self.E[k] * np.exp(1j * w * self.u[k, 1] * (self.T_s * self.tick + t))
+            i_dc = r["i_u_gain"] * self.u[k, 0] + r["k_p"] * (1 - v_dc.real) + reg.real
+            arrives += i_o
+            more += [
+                w / r["L_f"] * (e - v - r["R_f"] * i),
+                w / r["C_f"] * (i - i_o),
+                w / r["L_g"] * (v - bus - r["R_g"] * i_o),
+                w / r["C_dc"] * (i_dc - (e * i.conjugate()).real / v_dc.real),
+                r["k_i"] * (1 - v_dc.real),
+            ]
+        grid = super().outside(t, z)[0]
+        return bus, [
+            w / self.susceptance * arrives, w / self.L_tie * (bus - grid - self.R_tie * i_g), *more
+        ]  # fmt: skip
