@@ -28,7 +28,7 @@ class _Model(NamedTuple):
     at_0: tuple[str, ...]
 
 
-_MODELS = {
+MODELS = {
     "REGFMA1": _Model(
         "regfm-a1",
         ("1", "1"),
@@ -68,7 +68,7 @@ class Record(NamedTuple):
         Raises:
             UserError: a number that makes no law.
         """
-        law = Law.load(_MODELS[self.model].law)
+        law = Law.load(MODELS[self.model].law)
         content = law.file.model_dump(mode="json", exclude_none=True)
         values = self.numbers | {"R_e": R_e, "X_L": X_L}
         for name, value in values.items():
@@ -98,7 +98,7 @@ def read_dyr(path: str | Path) -> list[Record]:
         raise UserError(f"{path}: no such file") from None
     found = [one for one in (_record(path, *r) for r in _records(path, text)) if one is not None]
     if not found:
-        raise UserError(f"{path}: no record of {' or '.join(_MODELS)}")
+        raise UserError(f"{path}: no record of {' or '.join(MODELS)}")
     return found
 
 
@@ -123,9 +123,9 @@ def _record(path: str | Path, line: int, fields: list[str]) -> Record | None:
     names = [name.upper() for name in fields[1:4]]
     name, skip = (names[2], 10) if len(names) > 2 and names[0] == "USRMDL" else ("", 3)
     name = (name or (names[0] if names else "")).replace("_", "")[:7]
-    if name not in _MODELS:
+    if name not in MODELS:
         return None
-    model = _MODELS[name]
+    model = MODELS[name]
     if not fields[0].isdecimal():
         raise UserError(f"{where}, bus: {fields[0]!r} is no number of a bus")
     if not re.fullmatch("[A-Za-z0-9]{1,2}", fields[2]):

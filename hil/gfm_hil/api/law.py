@@ -15,7 +15,7 @@ import numpy as np
 
 from gfm_hil.api.lti import cells_of, content_of, read_matrix
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import check_empty, write_text
+from gfm_hil.core.files import check_empty, write_new, write_text
 from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
@@ -347,14 +347,7 @@ class Law:
         Raises:
             UserError: it is there already, or cannot be written.
         """
-        path = Path(path)
-        if path.exists():
-            raise UserError(f"{path}: is there already; choose another name")
-        try:
-            write_text(path, self.to_toml())
-        except OSError as problem:
-            raise UserError(f"{path}: {problem.strerror}") from None
-        return path
+        return write_new(Path(path), self.to_toml())
 
     def __repr__(self) -> str:
         cells = [

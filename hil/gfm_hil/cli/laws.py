@@ -1,4 +1,4 @@
-"""gfmhil laws: the catalogue, the inner stages, one law, and laws of a dynamic data file."""
+"""gfmhil laws: the catalogue, the inner stages, one law, and records of a dynamic data file."""
 
 import argparse
 import inspect
@@ -8,9 +8,11 @@ from typing import Any
 
 from rich.markup import escape
 
-from gfm_hil.api.dyr import read_dyr
-from gfm_hil.api.law import cell_text
+from gfm_hil.api.dyr import MODELS, read_dyr
+from gfm_hil.api.dyr_nearest import nearest_record
+from gfm_hil.api.law import Law, cell_text
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_new
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
@@ -43,7 +45,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--industry", action="store_true", help="models of the industry: REGFM_A1, REGFM_B1"
     )
-    kinds = command.add_subparsers(metavar="show|import")
+    kinds = command.add_subparsers(metavar="show|import|export")
     show = kinds.add_parser("show", help="one law, with its transfer functions")
     show.add_argument("name", help="catalogue name or law file")
     show.add_argument("--T_s", type=float, default=1e-4, metavar="S", help="sampling time, s")
@@ -57,6 +59,15 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     read.add_argument("-o", "--out", default=".", metavar="FOLDER", help="for the law files")
     read.set_defaults(call=call_import)
+    write = kinds.add_parser("export", help="the record of a dynamic data file nearest to a law")
+    write.add_argument("name", help="catalogue name or law file")
+    write.add_argument(
+        "--as", dest="model", choices=list(MODELS), default="REGFMA1", help="(%(default)s)"
+    )
+    write.add_argument("--bus", type=int, default=1, help="its number (%(default)s)")
+    write.add_argument("--machine", default="1", metavar="ID", help="at the bus (%(default)s)")
+    write.add_argument("-o", "--out", metavar="FILE", help="a new file (default: print the record)")
+    write.set_defaults(call=call_export)
 
 
 def call(options: argparse.Namespace) -> int:
@@ -110,6 +121,20 @@ def call_import(options: argparse.Namespace) -> int:
     for record in read_dyr(options.file):
         law = record.law(*options.impedance)
         print(law.save(Path(options.out) / f"{law.name}.toml"))
+    return 0
+
+
+def call_export(options: argparse.Namespace) -> int:
+    found = nearest_record(Law.load(options.name), options.model)
+    text = found.record(options.bus, options.machine)
+    if options.out is None:
+        print(text, end="")
+    else:
+        print(write_new(Path(options.out), text))
+    rows = [(name, f"{100 * far:.3g} %") for name, far in found.far.items()]
+    rows += [(name, f"not in {found.model}") for name in found.without]
+    heads = ("element", "largest distance, 0.1 to 10 Hz")
+    terminal(stderr=True).print(Table(heads, rows, text=None))
     return 0
 
 

@@ -142,6 +142,18 @@ def write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def write_new(path: Path, text: str) -> Path:
+    """Write a text file; returns its path. Raises UserError: it is there already, or cannot be
+    written."""
+    if path.exists():
+        raise UserError(f"{path}: is there already; choose another name")
+    try:
+        write_text(path, text)
+    except OSError as problem:
+        raise UserError(f"{path}: {problem.strerror}") from None
+    return path
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the names in ``folder`` are on disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -1,11 +1,14 @@
 """Records of REGFM_A1 and REGFM_B1: the published ones become the shipped laws, and what is none is
 refused in one line."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.api.dyr import read_dyr
+from gfm_hil.api.dyr_nearest import nearest_record
+from gfm_hil.api.law import Law
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_runtime import law_file, load_law
@@ -63,6 +66,56 @@ def test_a_file_without_them_is_refused(tmp_path):
         read_dyr(path)
     with pytest.raises(UserError, match="no such file"):
         read_dyr(tmp_path / "none.dyr")
+
+
+@pytest.mark.parametrize(("model", "apart"), [("REGFMA1", 1e-6), ("REGFMB1", 0.1)])
+def test_the_record_of_a_law_read_again_has_the_swing_of_the_law(tmp_path, model, apart, capsys):
+    """VSG-2 is REGFM_A1 but for what no limit touches, and REGFM_B1 but for its filters of 1 ms."""
+    path = tmp_path / "plant.dyr"
+    assert main(["laws", "export", "vsg-2", "--as", model, "--bus", "7", "-o", str(path)]) == 0
+    (record,) = read_dyr(path)
+    assert (record.bus, record.machine, record.model) == (7, "1", model)
+    law = record.law(0.03, 0.15)  # the choke of pref_step
+    ours, theirs = (each.closed_loop("pref_step").poles() for each in (Law.load("vsg-2"), law))
+    swing = ours[np.argmin(abs(ours + 3.0 - 23.0j))]
+    assert swing == pytest.approx(-2.93 + 23.08j, abs=0.01)
+    assert abs(theirs - swing).min() < apart * abs(swing)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", ["regfm-a1", "regfm-b1"])
+def test_the_shipped_models_come_nearest_to_themselves(name):
+    """To the last digits of a record, or by H in place of D2 where phasors cannot tell."""
+    model = "REGFM" + name[-2:].upper()
+    found = nearest_record(Law.load(name), model)
+    assert found.without == () and max(found.far.values()) < (1e-9 if model == "REGFMA1" else 0.02)
+    shipped = Law.load(name).gains
+    for number in ("mp", "mq", "kpv", "kiv", "TQf"):
+        assert found.numbers[number] == pytest.approx(shipped[number], rel=0.01, abs=1e-9)
+
+
+def test_a_record_says_what_of_a_law_it_leaves_out():
+    found = nearest_record(Law.load("mimo-gfm-deployable"), "REGFMA1")
+    assert found.without == ("phi21", "phi24", "phi25", "phi31", "phi32")
+    assert max(found.far.values()) < 1e-6
+    assert nearest_record(Law.load("vsg-8"), "REGFMA1").far["phi22"] == pytest.approx(
+        0.296, abs=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (["droop-1"], "droop-1: it has no V on E_u (phi35), and REGFMA1 is not without"),
+        (["matching-2"], "matching-2: it has no p on omega_u (phi22)"),
+        (["hybrid-angle"], "hybrid-angle: REGFMA1 has not the errors of 'hybrid-angle'"),
+        (["regfm-a1", "--as", "REGFMB1"], "regfm-a1: H of its swing (phi22) would be 0"),
+        (["vsg-2", "--bus", "0"], "bus 0: must be a number from 1 to 999999"),
+        (["vsg-2", "--machine", "abc"], "machine 'abc': must be one or two letters"),
+    ],
+)
+def test_a_law_without_such_a_core_has_no_record(refused, line, said):
+    assert said in refused("laws", "export", *line)
 
 
 WORDS = st.sampled_from(
