@@ -3,8 +3,8 @@
 For every law of the catalogue on the plant of `pref_step` and on that of `rig_pref_step` (without
 noise and rounding, so that two runs can be compared), it takes the unstable word with the fewest
 misses, n + 1, and the worst word of n, and runs both on the bench: a trace says which ticks are
-missed. Two runs that differ by a millionth of P_ref show whether a difference grows. They last the
-longer the slower it would, but a minute at most. Writes
+missed. Two runs that differ by a millionth of P_ref and V_ref show whether a difference grows. They
+last the longer the slower it would, but a minute at most. Writes
 
     docs/tables/latency_words.md        what laws bear by the linear loop, and by the bench
 
@@ -33,8 +33,8 @@ from gfm_runtime import law_names
 DOCS = Path(__file__).resolve().parent
 SECONDS, FIRST = (8.0, 60.0), 10  # of a run, least and most; tick at which the words begin
 TIMES = 8.0  # the factors of e by which a difference should grow or shrink in a run
-STEP, GREW, SMALL = 1e-6, 1e-3, 1e-13  # of P_ref; of a difference, p.u.
-BACK, PARTS = 300, 24  # tick at which P_ref is as before; windows of the difference
+STEP, GREW, SMALL = 1e-6, 1e-3, 1e-13  # of both; of a difference, p.u.
+BACK, PARTS = 300, 24  # tick at which both are as before; windows of the difference
 SHOWN = ("true_p", "true_q", "true_V", "true_v_dc")
 SETTINGS = {"ideal": "pref_step", "rig": "rig_pref_step"}
 
@@ -42,8 +42,8 @@ SETTINGS = {"ideal": "pref_step", "rig": "rig_pref_step"}
 def setting(
     name: str, law: str, trace: str | None, step: float, seconds: float = SECONDS[0]
 ) -> Scenario:
-    """A scenario of ``SETTINGS`` without noise, rounding and its events; P_ref has a pulse at its
-    start."""
+    """A scenario of ``SETTINGS`` without noise, rounding and its events; P_ref and V_ref have a
+    pulse at its start."""
     content: dict[str, Any] = load_scenario(SETTINGS[name]).model_dump(
         mode="json", exclude_unset=True
     )
@@ -53,8 +53,10 @@ def setting(
     plant.get("sensors", {}).pop("noise_std", None)
     content |= {"law": law, "duration": seconds, "mode": "lockstep", "expect": "completed"}
     content |= {"late_policy": {"hold": 10**6}, "link": {"type": "inproc"}, "compare": []}
-    pulse = ((5, 0.5 + step), (BACK, 0.5))
-    content["events"] = [{"tick": k, "type": "reference", "P_ref": P} for k, P in pulse]
+    pulse = ((5, step), (BACK, 0.0))  # of both, so that no mode stays below rounding
+    content["events"] = [
+        {"tick": k, "type": "reference", "P_ref": 0.5 + by, "V_ref": 1.0 + by} for k, by in pulse
+    ]
     if trace is not None:
         content["link"]["impairment"] = {"trace": trace}
     return check_scenario(content, name)

@@ -10,7 +10,7 @@ import errno
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -73,7 +73,16 @@ class _Version(argparse.Action):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Names the choice that is most like an unknown one."""
+    """Names the choice that is most like an unknown one, and says what is wrong in one line."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        options, unknown = super().parse_known_args(args, namespace)
+        if not hasattr(options, "parsed_by"):  # a sub-command's comes before its command's
+            options.parsed_by = self
+        return options, unknown
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} ({self.prog} --help)\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:
@@ -127,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(_no_command(given[0]))
     options, unknown = top.parse_known_args(given)
     if unknown:
-        return _refuse(_unknown(top, options.command, unknown))
+        return _refuse(_unknown(options.parsed_by, unknown))
     try:
         return int(options.call(options))
     except KeyboardInterrupt as stop:
@@ -148,26 +157,20 @@ def _no_command(word: str) -> Exception:
     return UserError(f"{word}: no command; {allowed(word, COMMANDS)}")
 
 
-def _unknown(top: argparse.ArgumentParser, command: str, words: list[str]) -> Exception:
+def _unknown(parser: argparse.ArgumentParser, words: list[str]) -> Exception:
     """The error that a command does not know some of the words given to it."""
     from gfm_hil.core.errors import UserError
     from gfm_runtime.errors import meant
 
-    def options(of: argparse.ArgumentParser) -> Iterator[str]:
-        for action in of._actions:
-            yield from action.option_strings
-            if isinstance(action, argparse._SubParsersAction):
-                for inside in action.choices.values():
-                    yield from options(inside)
-
-    known, first = set(options(top)), words[0]
+    known = {option for action in parser._actions for option in action.option_strings}
+    first = words[0]
     close = meant(first.partition("=")[0], known)
     if first.endswith(".toml") and "--law" in known:
         place = "after --scenario" if "--scenario" in known else "before all options"
         close = f"; a law's file comes after --law, a scenario's {place}"
     elif "=" in first and not first.startswith("-"):
         close = "; a scenario's file says such values, an option changes what --help lists"
-    return UserError(f"{' '.join(words)}: gfmhil {command} does not know it{close}")
+    return UserError(f"{' '.join(words)}: {parser.prog} does not know it{close}")
 
 
 def _refuse(problem: Exception) -> int:

@@ -356,7 +356,15 @@ def test_an_unknown_command_of_a_group_is_refused_with_the_one_that_was_meant(ca
 
 def test_an_unknown_option_of_a_command_inside_a_group_is_refused_in_one_line(capsys):
     assert main(["bench", "loop", "--to", "x"]) == 2
-    assert capsys.readouterr().err.startswith("gfmhil: --to x: gfmhil bench does not know it")
+    assert capsys.readouterr().err.startswith("gfmhil: --to x: gfmhil bench loop does not know it")
+
+
+def test_a_value_that_an_option_does_not_take_is_refused_in_one_line(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "latency", "--for", "3parsecs"])
+    said = "gfmhil bench latency: argument --for: '3parsecs': must be as 12h, 90m or 30s"
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"{said} (gfmhil bench latency --help)\n"
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():
