@@ -4,7 +4,8 @@ benchmarks.network``.
 Every converter runs VSG-2 behind its own feeder to one bus with a load, and all that a run in
 process does is in the tick: the plant, the controllers, the recording. ``--case case39`` has a
 published case instead, with converters at the buses of ``--converters``, and ``--bridges`` the
-paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts.
+paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts, and
+four converters on feeders of which none, one or all are switched.
 Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
@@ -30,15 +31,19 @@ from gfm_hil.scenario import Scenario, load_scenario
 TICKS = 100_000  # of all converters of a case in a round
 
 
-def star(n: int) -> Scenario:
-    """n converters on feeders."""
+def star(n: int, switched: int = 0, bridge: dict[str, Any] | None = None) -> Scenario:
+    """n converters on feeders, the first of which have a switched bridge."""
+    own = [{"plant": {"bridge": bridge}} if k < switched else {} for k in range(n)]
     names = [f"c{k}" for k in range(n)]
     return load_scenario(
         {
             "title": f"{n} converters", "duration": 10.0, "law": "vsg-2",
             "link": {"type": "inproc"},
             "network": {
-                "converters": {name: {"node": f"at_{name}"} for name in names},
+                "converters": {
+                    name: {"node": f"at_{name}", **more}
+                    for name, more in zip(names, own, strict=True)
+                },
                 "lines": {f"to_{name}": {"start": f"at_{name}", "end": "bus", "L": 0.1, "R": 0.01}
                           for name in names},
                 "loads": {"load": {"node": "bus", "P": 0.45 * n, "Q": 0.1 * n}},
@@ -48,7 +53,7 @@ def star(n: int) -> Scenario:
 
 
 def rigs() -> dict[str, Scenario]:
-    """The rig with MIMO-GFM, nominal resistances and several bridges."""
+    """The rig with MIMO-GFM, nominal resistances and several bridges, and four converters."""
     late = {"kind": "two-level", "dead_time_s": 2e-6}
     drops = {"V_switch": 1.5, "V_diode": 1.2, "R_switch": 0.03, "R_diode": 0.02}
     bridges = {
@@ -66,6 +71,10 @@ def rigs() -> dict[str, Scenario]:
         )
         for name, bridge in bridges.items()
     }
+    made["four averaged"] = star(4)
+    made["four, one of two levels"] = star(4, 1, bridges["two levels"])
+    made["four, one of two levels, 2 us"] = star(4, 1, late)
+    made["four of two levels"] = star(4, 4, bridges["two levels"])
     made["two levels, 2 us, from counts"] = load_scenario("rig_switched", in_process=True)
     return made
 

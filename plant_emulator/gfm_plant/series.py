@@ -292,7 +292,6 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
     x, dc, w = field(now, "terms"), field(now, "dc_terms"), field(now, "w")
     source, s_term = field(now, "source"), field(now, "source_term")
     s_speed = field(now, "source_speed")
-    n_links, link_place, link = field(n, "n_links"), field(n, "link_place"), field(n, "link")
     for i in range(own(n.n_converters), n.n_states):
         x[0, i] = w[i]
     for k in range(n.n_converters):
@@ -324,14 +323,8 @@ def _find_together(plant: PlantRecords, c: int, h: float, terms: int) -> None:
             x[j, at + I_F] = complex(i_a, i_b)
             x[j, at + V] = complex(v_a, v_b)
             x[j, at + I_O] = complex(o_a, o_b)
-        for e in range(n_links[c, 0]):
-            row, column = link_place[c, 0, e, 0], link_place[c, 0, e, 1]
-            y = x[j - 1, column]
-            x[j, row] += _linked(link[c, 0, e], d, y)
-        for e in range(n_links[c, 1]):
-            row, column = link_place[c, 1, e, 0], link_place[c, 1, e, 1]
-            y = s_term[column]
-            x[j, row] += _linked(link[c, 1, e], d, y)
+        _add_links(n, now, c, 0, d, x[j - 1], x[j])
+        _add_links(n, now, c, 1, d, s_term, x[j])
         for k in range(now.n_s):
             y, turn = s_term[k], d * s_speed[k]
             s_term[k] = complex(-turn * y.imag, turn * y.real)
@@ -360,8 +353,25 @@ def _average_term(plant: PlantRecords, c: int, k: int, j: int, d: float) -> None
 
 
 @inlined
-def _linked(by: Any, d: float, y: complex) -> complex:
-    return complex(d * by[0] * y.real + d * by[2] * y.imag, d * by[1] * y.imag + d * by[3] * y.real)
+def _add_links(n: Any, now: Any, c: int, which: int, d: float, last: Any, to: Any) -> None:
+    """Add to the next terms of w what the entries of w' = A w, or of B s, make of the last ones.
+
+    The entries are in the order of their rows, so that a row adds up in registers. What one axis
+    does to the other is there only with several contacts.
+    """
+    place, link, e = field(n, "link_place"), field(n, "link"), 0
+    count = field(n, "n_links")[c, which]
+    while e < count:
+        row, alpha, beta = place[c, which, e, 0], 0.0, 0.0
+        while e < count and place[c, which, e, 0] == row:
+            y = last[place[c, which, e, 1]]
+            alpha += link[c, which, e, 0] * y.real
+            beta += link[c, which, e, 1] * y.imag
+            if now.joint:
+                alpha += link[c, which, e, 2] * y.imag
+                beta += link[c, which, e, 3] * y.real
+            e += 1
+        to[row] += complex(d * alpha, d * beta)
 
 
 @inlined
