@@ -167,7 +167,7 @@ def _scope(place: Path) -> Iterator[Take]:
     run = {"title": "f", "duration": 0.1, "law": "vsg-2", "link": {"type": "inproc"}}
     done = run_scenario(check_scenario(run, ""), place / "run")
     access, served, ports = Access(), Served(), list[int]()
-    scope = scope_server.Scope(open_recording(done.folder), access)
+    scope = scope_server.Scope([open_recording(done.folder)], access)
     pace, scope_server.FRAMES_PER_S = scope_server.FRAMES_PER_S, 500
     task = asyncio.run_coroutine_threadsafe(
         scope.serve("127.0.0.1", [0], None, ports.append), served.loop

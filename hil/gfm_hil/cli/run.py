@@ -12,12 +12,12 @@ from gfm_hil.api.runs import run_network
 from gfm_hil.cli import common
 from gfm_hil.controllers import PIL
 from gfm_hil.core.errors import UserError
-from gfm_hil.ports import PORTS
+from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.port import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
 from gfm_hil.results.report import PAGE
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.scenario import INPROC, find_scenario
+from gfm_hil.scenario import find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -76,18 +76,17 @@ def call(options: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         run: Run | NetworkRun
         stay: dict[str, subprocess.Popen[str]] = {}
+        for name, number in _ports(options, bool(scenario.parts)).items():
+            beside = companion(name, folder, number, scenario.in_process)
+            if (process := stack.enter_context(beside)) is not None:
+                stay[name] = process
         if scenario.network is not None:
-            _check_network(options)
             with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_network(
                     scenario, folder, controllers=controllers, ports=maps,
                     figures=figures, progress=progress, notice=notice,
                 )  # fmt: skip
         else:
-            for name, number in _ports(options).items():
-                beside = companion(name, folder, number, scenario.link.type == INPROC)
-                if (process := stack.enter_context(beside)) is not None:
-                    stay[name] = process
             with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
                 run = run_one(
                     scenario, folder=folder, controller=controllers.get(""), ports=maps.get(""),
@@ -106,16 +105,15 @@ def call(options: argparse.Namespace) -> int:
     return common.exit_code(run)
 
 
-def _ports(options: argparse.Namespace) -> dict[str, int]:
-    """The numbers of the ports that the options name."""
+def _ports(options: argparse.Namespace, network: bool) -> dict[str, int]:
+    """The numbers of the ports that the options name. Raises UserError: one of them looks at one
+    converter, and there is a network."""
     named = {name: getattr(options, name) for name in PORTS}
-    return {name: number for name, number in named.items() if number is not None}
-
-
-def _check_network(options: argparse.Namespace) -> None:
-    """Refuse what is of one converter."""
-    for name in _ports(options):
-        raise UserError(
-            f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
-            " folder of a converter"
-        )
+    found = {name: number for name, number in named.items() if number is not None}
+    for name in found:
+        if network and not make_port(name).networks:
+            raise UserError(
+                f"--{name}: looks at one converter; start gfmhil {name} beside the run, with the"
+                " folder of a converter"
+            )
+    return found

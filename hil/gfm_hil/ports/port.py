@@ -26,6 +26,7 @@ from gfm_hil.links.zeromq.options import beyond_loopback
 from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.live import begun
+from gfm_hil.recording.run import converters_of
 from gfm_runtime.children import guarded
 
 INTERRUPTED = 130
@@ -128,7 +129,10 @@ class BesideRun:
 
 
 def recorded(folder: Path) -> bool:
-    """Whether there is a recording: of a run that has begun to record, or of a finished one."""
+    """Whether there is a recording: of a run that has begun to record, or of a finished one; of a
+    network those of all converters."""
+    if converters := converters_of(folder):
+        return all(recorded(folder / name) for name in converters)
     return (folder / "signals.npz").is_file() or begun(folder)
 
 
@@ -148,6 +152,7 @@ class OperatorPort(ABC):
     commands = False  # it needs a run that takes commands
     early = 0  # how many lines it prints before the run begins
     stays = False  # it goes on when the run is over, until Ctrl-C
+    networks = False  # it serves the runs of all converters of a network
     or_any = False  # without ``--port`` it takes a free one if its own is in use
     socket = socket.SOCK_STREAM  # its kind
     # how it encrypts, once the options are checked; None: plainly

@@ -312,3 +312,60 @@ def test_it_fits(going, width, height, dark):
             box = page.js(f"return document.querySelector('{place}').getBoundingClientRect().top")
             assert 0 <= box < height
         assert page.complaints() == []
+
+
+NETWORK = """
+title = "Four converters that are watched"
+duration = 600.0
+T_s = 1e-3
+mode = "realtime"
+law = "droop-5"
+[references]
+P_ref = 0.3
+[late_policy]
+hold = 10000
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+[plant]
+delay = { samples = 1 }
+dc_source = { mode = "regulated" }
+[network.converters.A]
+node = "bus"
+references = { P_ref = 0.2 }
+[network.converters.B]
+node = "bus"
+[network.converters.C]
+node = "bus"
+[network.converters.D]
+node = "bus"
+references = { P_ref = 0.5 }
+[network.loads.base]
+node = "bus"
+P = 1.3
+Q = 0.2
+"""
+
+
+def test_four_converters_of_a_network(tmp_path):
+    """One scope of a run of four: the page shows the one that is chosen, and commands it."""
+    with rig(tmp_path, NETWORK) as four, Browser() as page:
+        page.driver.get(four.control)
+        wait_for(lambda: page.text("#state") == "RUNNING")
+        shown = "return [...document.querySelectorAll('#converter option')].map((o) => o.value)"
+        assert page.js(shown) == ["A", "B", "C", "D"]
+        assert page.js("return document.querySelector('#converter').value") == "A"
+        page.choose("#converter", "D")
+        wait_for(lambda: page.js("return document.title").startswith("D \u00b7 "))
+        wait_for(lambda: page.text("#state") == "RUNNING")
+        assert page.js("return document.querySelector('#converter').value") == "D"
+        moves(page)
+        page.write("#set-P_ref", "0.4")
+        page.click("#apply")
+        assert "P_ref = 0.4 at tick" in wait_for(lambda: said(page, "Set-points").strip("…"))
+        told = {
+            name: [e["label"] for e in read_events(four.folder / name, 10**6) if "operator" in e]
+            for name in "ABCD"
+        }
+        assert told == {"A": [], "B": [], "C": [], "D": ["P_ref = 0.4"]}
+        assert page.complaints() == []

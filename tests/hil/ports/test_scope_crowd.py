@@ -29,7 +29,7 @@ LOOK = {"kind": "look", "id": 1, "channels": ["p"], "bins": 50, "mode": "held", 
 @pytest.fixture
 def scope(run) -> Scope:
     """The scope of a finished run."""
-    return Scope(open_recording(run().folder), Access())
+    return Scope([open_recording(run().folder)], Access())
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.ports.scope.picture import HEAD
 from gfm_hil.ports.scope.recording import open_recording
@@ -34,7 +35,7 @@ def served(run) -> Iterator[tuple[int, Access, Any]]:
     """A finished run, served; its port, the rules, and the run."""
     done = run(events=[{"type": "reference", "t": 0.05, "P_ref": 0.6}])
     access = Access()
-    scope = Scope(open_recording(done.folder), access)
+    scope = Scope([open_recording(done.folder)], access)
     with serving(scope) as port:
         yield port, access, done
 
@@ -122,6 +123,30 @@ def test_it_says_what_there_is_and_shows_it(served):
         p = done.signals["y_p"].astype(np.float32)
         assert (values[0].min(), values[1].max()) == (p.min(), p.max())
         assert values[2, 0] == pytest.approx(50 * done.signals["y_omega_u"][:16].min())
+
+
+def test_a_page_asks_for_a_converter_of_a_network(tmp_path):
+    """Each gets the recording of the converter that it names, one that names none the first."""
+    given = {
+        "title": "two", "duration": 0.1, "law": "droop-3", "link": {"type": "inproc"},
+        "network": {
+            "converters": {"A": {"node": "bus", "references": {"P_ref": 0.2}},
+                           "B": {"node": "bus", "references": {"P_ref": 0.4}}},
+            "loads": {"base": {"node": "bus", "P": 0.6, "Q": 0.0}},
+        },
+    }  # fmt: skip
+    run = gfmhil.run_network(given, tmp_path / "run", figures=False)
+    scope = Scope([open_recording(run.folder / name) for name in run], Access())
+    with serving(scope) as port:
+        for query, name in (("", "A"), ("?of=A", "A"), ("?of=B", "B"), ("?of=C", "A")):
+            with connect(f"ws://127.0.0.1:{port}/socket{query}") as socket:
+                about = words(socket, "about")
+                assert (about["converter"], about["converters"]) == (name, ["A", "B"])
+                socket.send(json.dumps({**LOOK, "start": 0.0, "span": 0.1}))
+                frame = next(f for f in iter(lambda: socket.recv(10), None) if isinstance(f, bytes))
+                values = np.frombuffer(frame, "<f4", 2 * 63, 8 * len(HEAD)).reshape(2, 63)
+                p = run[name].signals["y_p"].astype(np.float32)
+                assert (values[0].min(), values[1].max()) == (p.min(), p.max())
 
 
 def test_a_run_that_is_over_can_be_played(served):

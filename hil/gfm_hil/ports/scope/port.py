@@ -19,7 +19,7 @@ class ScopePort(OperatorPort):
     risk, remedy = "unencrypted", "give --cert and --key, or --plain if that is meant"
     opens = "--plain", "serve beyond this machine unencrypted: everybody on the way sees the token"
     needs = "websockets", "websockets", "the scope", "scope"
-    stays = or_any = True
+    stays = or_any = networks = True
 
     def options(self, command: argparse.ArgumentParser) -> None:
         command.add_argument(
@@ -46,12 +46,14 @@ class ScopePort(OperatorPort):
         from gfm_hil.ports.scope.recording import open_recording
         from gfm_hil.ports.scope.server import Scope
         from gfm_hil.ports.scope.session import Access
+        from gfm_hil.recording.run import converters_of
 
         run.wait(commands=False)
         access = Access(
             [*options.name, options.host], dict.fromkeys(options.operator or [_OPERATOR])
         )
-        scope = Scope(open_recording(run.folder), access)
+        places = [run.folder / name for name in converters_of(run.folder)] or [run.folder]
+        scope = Scope([open_recording(place) for place in places], access)
 
         def ready(port: int) -> None:
             host = f"[{options.host}]" if ":" in options.host else options.host

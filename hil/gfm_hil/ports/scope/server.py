@@ -7,10 +7,10 @@ import logging
 import os
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from urllib.parse import parse_qs
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -19,20 +19,11 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.identity import Identity
 from gfm_hil.core.supervised import supervised
-from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
-from gfm_hil.ports.scope.channels import make_channels, si_bases
-from gfm_hil.ports.scope.pyramid import Pyramid
 from gfm_hil.ports.scope.recording import Recording
-from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session, in_words
-from gfm_hil.recording.run import bases
-from gfm_hil.scenario import INPROC, Scenario
-from gfm_hil.scenario.events import EVENTS
-from gfm_runtime import LawError, law_file, law_titles
-from gfm_runtime.signals import group
-from gfm_runtime.states import STATES
+from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session
+from gfm_hil.ports.scope.watched import WatchedRun
 
 FRAMES_PER_S = 30
 _LOG_S = 0.25  # poll interval of the event log
@@ -41,7 +32,6 @@ _PAGES = 16  # most pages that look, and as many that control
 WAITING = 64  # most connections that are not a page yet or fetch a file
 HALF_OPEN_S = 10.0  # timeout for a connection to become a page
 _PING_S = 10.0  # interval and timeout of pings: a dead page is dropped
-_EVENTS = 500  # newest events that are sent to pages
 
 _STATIC = Path(__file__).resolve().parent / "static"
 _TYPES = {
@@ -51,6 +41,7 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _SOCKET = "/socket"
+_CONVERTER = "of"  # query of a page that looks at one converter of a network, with its name
 _CONTROL = "control"  # query of a page that sends its token first and waits for the answer
 
 _LOG = logging.getLogger("gfmhil.scope")  # clients other than browsers are no error
@@ -68,17 +59,24 @@ def static_files() -> dict[str, tuple[str, bytes]]:
 
 
 class Scope:
-    """A server for one run."""
+    """A server for one run, or for those of a network's converters.
 
-    def __init__(self, record: Recording, access: Access) -> None:
-        self.record, self.access = record, access
-        self._pyramid = Pyramid(record, make_channels(record.T_s, record.f_b))
-        self._sessions: set[Session] = set()
-        self._events = record.events()
-        self._ended = record.ended()
-        self._static = static_files()
-        self._operator: Operator | None = None
-        self._commands = asyncio.Lock()
+    Args:
+        records: of the runs; a page that asks for none by its converter's name gets the first.
+        access: who may look and control.
+    """
+
+    def __init__(self, records: Sequence[Recording], access: Access) -> None:
+        self.access, self._static = access, static_files()
+        names = [record.scenario.converter or "" for record in records]
+        others = names if len(names) > 1 else []
+        self._runs = {
+            name: WatchedRun(record, others) for name, record in zip(names, records, strict=True)
+        }
+
+    @property
+    def _sessions(self) -> list[Session]:
+        return [session for run in self._runs.values() for session in run.sessions]
 
     async def serve(
         self,
@@ -117,7 +115,8 @@ class Scope:
             return _response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", refusal)
         path, _, query = request.path.partition("?")
         if path == _SOCKET:
-            if query == _CONTROL or not (full := await self._full(control=False)):
+            asked = parse_qs(query, keep_blank_values=True)
+            if _CONTROL in asked or not (full := await self._full(control=False)):
                 return None
             return _response(http.HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", full)
         if path not in self._static:
@@ -132,7 +131,9 @@ class Scope:
         if len(same) < _PAGES:
             return ""
         read = await asyncio.gather(*(session.reads() for session in same))
-        self._sessions -= {s for s, reads in zip(same, read, strict=True) if not reads}
+        gone = {s for s, reads in zip(same, read, strict=True) if not reads}
+        for run in self._runs.values():
+            run.sessions -= gone
         if not all(read):
             return ""
         return f"{_PAGES} pages {'control' if control else 'look'} already"
@@ -141,110 +142,44 @@ class Scope:
         """Serve one page's connection to its end. A page that announces that it will control
         takes no place of the pages that look: until its token is accepted it counts as waiting,
         and the listener drops the oldest waiting connection."""
-        session = Session(connection, self._pyramid, self.access, self._command)
+        request = connection.request
+        asked = parse_qs("" if request is None else request.path.partition("?")[2], True)
+        run = self._runs.get(asked.get(_CONVERTER, [""])[0]) or next(iter(self._runs.values()))
+        session = Session(connection, run.pyramid, self.access, run.command)
         with contextlib.suppress(ConnectionClosed):
-            request = connection.request
-            if request is not None and request.path.partition("?")[2] == _CONTROL:
+            if _CONTROL in asked:
                 await session.hear(await connection.recv())
             if full := await self._full(bool(session.operator)):
                 await connection.close(CloseCode.TRY_AGAIN_LATER, full)
                 return
             listener.keep(connection.transport.get_extra_info("socket").fileno())
-            self._sessions.add(session)
+            run.sessions.add(session)
             try:
-                await session.say("about", **self._about())
-                await session.say("events", **self._happened())
+                await session.say("about", **run.about())
+                await session.say("events", **run.happened())
                 await session.run()
             finally:
-                self._sessions.discard(session)
+                run.sessions.discard(session)
 
     async def _frames(self) -> None:
         """Read new ticks and send pictures, at a constant rate."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            while not self._pyramid.update():
-                await asyncio.sleep(0)
-            for session in list(self._sessions):
-                session.picture()
+            for run in self._runs.values():
+                while not run.pyramid.update():
+                    await asyncio.sleep(0)
+                for session in list(run.sessions):
+                    session.picture()
             due = max(due + 1 / FRAMES_PER_S, loop.time())
             await asyncio.sleep(due - loop.time())
 
     async def _follow_log(self) -> None:
-        """Send new events to the pages, and detect the end of the run."""
-        said = self._happened()
+        """Send new events to the pages, and detect the ends of the runs."""
         while True:
-            self._events = await asyncio.to_thread(self.record.events)
-            self._ended = self.record.ended()
-            if self._ended and self.record.live:
-                self.record.finish()
-            self.record.look_up_laws()
-            now = self._happened()
-            if now != said:
-                news = in_words("events", **now)
-                for session in list(self._sessions):
-                    session.post(news)
-            said = now
+            for run in self._runs.values():
+                await run.follow_log()
             await asyncio.sleep(_LOG_S)
-
-    def _happened(self) -> dict[str, Any]:
-        events = self._events[-_EVENTS:]
-        return {"events": events, "summary": self._ended, "labels": self.record.laws}
-
-    def _about(self) -> dict[str, Any]:
-        """The run's data that a page needs; no file names, only the scenario's title."""
-        s = self.record.scenario
-        return {
-            "title": s.title,
-            "live": self.record.live,
-            "commands": self.record.live and s.link.type != INPROC,
-            "mode": s.mode,
-            "link": s.link.type,
-            "T_s": self.record.T_s,
-            "capacity": self.record.capacity,
-            "f_b": self.record.f_b,
-            "channels": [channel.about() for channel in self._pyramid.channels],
-            "states": STATES,
-            "labels": self.record.laws,
-            "laws": [*law_titles(s.laws()).items()],
-            "limits": {r.name: [r.low, r.high] for r in group("ref")},
-            "bases": si_bases(bases(s)),
-            "events": {name: kind.model_json_schema() for name, kind in EVENTS.items()},
-            "choices": _choices(s),
-        }
-
-    async def _command(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
-        async with self._commands:
-            return await asyncio.to_thread(self._command_now, event, by)
-
-    def _command_now(self, event: dict[str, Any], by: Identity) -> dict[str, Any]:
-        if not self.record.live:
-            raise UserError("the run is over")
-        if self._operator is None:
-            if self.record.scenario.link.type == INPROC:
-                raise UserError("a run in one process (link inproc) takes no commands")
-            self._operator = Operator(self.record.folder)
-        return self._operator.command(event, by)
-
-
-def _choices(scenario: Scenario) -> dict[str, list[str]]:
-    """What fields of events may name, by the field; none of what the run has not."""
-    network = scenario.network
-    dumped = {} if network is None else network.model_dump(exclude_none=True)
-    tables = {key: table for key, table in dumped.items() if isinstance(table, dict)}
-    parts = {name: part for table in tables.values() for name, part in table.items()}
-    nodes = {
-        part[end] for part in parts.values() for end in ("node", "start", "end") if end in part
-    }
-    gains: set[str] = set()
-    for law in scenario.laws():
-        with contextlib.suppress(LawError):  # its file may be gone
-            gains |= law_file(law).parameters.keys()
-    lines = [*tables.get("lines", {}), *scenario.converters]
-    return {
-        "converter": scenario.converters, "name": [*parts], "line": lines, "node": sorted(nodes),
-        "values": sorted(gains),
-    }  # fmt: skip
 
 
 def _listen(host: str, ports: list[int]) -> Listener:

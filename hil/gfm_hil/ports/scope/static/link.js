@@ -8,7 +8,7 @@ function token() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
   if (given) {
     sessionStorage.setItem(KEY, given);
-    history.replaceState(null, "", location.pathname);
+    history.replaceState(null, "", location.pathname + location.search);
   }
   return sessionStorage.getItem(KEY) ?? "";
 }
@@ -25,9 +25,11 @@ export class Link {
 
   open() {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    // Pages with a token have places of their own: the query announces that a hello comes first.
-    const query = this.token ? "?control" : "";
-    this.socket = new WebSocket(`${scheme}://${location.host}/socket${query}`);
+    // The address names a network's converter. Pages with a token have places of their own: the query
+    // announces that a hello comes first.
+    const query = new URLSearchParams(location.search);
+    if (this.token) query.set("control", "");
+    this.socket = new WebSocket(`${scheme}://${location.host}/socket?${query}`);
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
       if (this.token) this.say({ kind: "hello", token: this.token });

@@ -61,8 +61,12 @@ function begin(message) {
   about ??= { byName: Object.fromEntries(message.channels.map((c) => [c.name, {}])) };
   Object.assign(about, message);
   addSingles(message.channels);
-  document.title = `${about.title} · gfmhil scope`;
+  document.title = `${[about.converter, about.title].filter(Boolean).join(" · ")} · gfmhil scope`;
   get("title").textContent = about.title;
+  const { converter, converters } = about;
+  get("converter").replaceChildren(...converters.map((name) => make("option", { value: name }, name)));
+  get("converter").value = converter;
+  get("converter").hidden = !converters.length;
   get("where").textContent = `${about.link}, ${about.mode}, T\u209B = ${span(about.T_s)}`;
   look.T_s = about.T_s;
   look.live = about.live;
@@ -311,6 +315,9 @@ function permit() {
   get("panel").classList.toggle("ended", !look.live && Boolean(summary?.reason));
   knobs.allow(!text);
 }
+
+// Each converter has an address of its own, for windows side by side.
+get("converter").onchange = ({ target }) => location.assign(`?of=${encodeURIComponent(target.value)}`);
 
 new Layouts(present, arrange);
 get("png").onclick = () => savePicture(strips, about.title,
