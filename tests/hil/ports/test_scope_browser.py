@@ -347,6 +347,7 @@ Q = 0.2
 """
 
 
+@pytest.mark.timeout(900)  # compiles the loops of a network
 def test_four_converters_of_a_network(tmp_path):
     """One scope of a run of four: the page shows the one that is chosen, and commands it."""
     with rig(tmp_path, NETWORK) as four, Browser() as page:
