@@ -90,6 +90,7 @@ _NET: _Arrays = {
     # column, -1: it is zero
     "n_sums": (int, ("n_sparse", 7)),
     "norm": (float, ("n_sparse",)),
+    "least": (float, ("n_sparse",)),
     "own_by": (float, ("n_sparse", 6, "n_converters")),
     "line_to": (int, ("n_sparse", "n_converters")),
     "state_at": (int, ("n_sparse", "n_w")),

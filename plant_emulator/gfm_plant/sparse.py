@@ -13,6 +13,10 @@ While sources turn at constant speeds, Taylor's series of x is exact to rounding
 
     c_(j+1) = h / (j + 1) (A c_j + B s_j),   s_(j+1) = j Omega h / (j + 1) s_j.
 
+It ends where all that is left out is below 1e-15 of x and s, by the root of the stored energy. The
+norm of A bounds how many terms that can take; near a steady state they fall as Omega h does, so
+that the sizes of the terms themselves end it sooner.
+
 Filters and lines of the converters, which are all alike, are vectors over the converters, which the
 compiler makes instructions of several numbers of; all else are rows of sums. In an unbalanced
 circuit the real parts of all space vectors, turned to its axis, have equations of their own and the
@@ -37,7 +41,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 from gfm_plant.circuit import GROUND, Branch, Circuit, check_parts
 from gfm_plant.layout import MOST_OF_SEVERAL, field
 from gfm_plant.records import I_F, N_OWN
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled, inlined, summing
 
 if TYPE_CHECKING:
     from gfm_plant.wiring import Wiring
@@ -52,6 +56,10 @@ DENSE = 200
 _SMALLEST = 1e-15  # p.u.; of the first term that is left out
 _MOST = 44  # terms
 _PER = np.array([1.0 / max(j, 1) for j in range(_MOST + 1)])  # 1 / j
+# an index without a sign: numba lets a negative one count from the end, and asks for each entry;
+# such a loop has no instructions of several numbers
+_U = np.uint64
+_0, _1, _2, _3, _4, _5 = (np.uint64(k) for k in range(6))
 ENOUGH = np.array([(_SMALLEST * math.factorial(j + 1)) ** (1 / (j + 1)) for j in range(_MOST)])
 
 
@@ -96,6 +104,7 @@ class Sparse:
     n_enter: int  # how many are on the way
     node: Mapping[str, int]  # column of the voltage of each node
     norm: float  # of the equations in energy coordinates, 1/s
+    least: float  # of the last term's square over that of x and s, as numbers in p.u.
     fastest: float  # without resistances, rad/s
 
 
@@ -235,13 +244,15 @@ def find_sparse(
             of[where[part]], by[where[part]] = at[name], factor
     enter, n_enter = _entering(circuit, where)
     lossless, norm = _norms(merged, circuit, solved, omega_b)
+    stores = [*(one.L for one in merged), *(cap.C for cap in circuit.capacitors)]
+    least = _SMALLEST**2 * min(stores) / max(stores)
     nodes = column | {node: columns[0] for node, columns in drives.items()}
     return Sparse(
         Sums.of(rows), n_x, len(resistive) + 2 * len(free),
         (sum(w < 3 for w in wide), wide.count(3), wide.count(4)),
         np.array([at[e] for e in extra], int),
         coefficients, line_to, np.array([where[name] for name in names]), of, by,
-        enter, n_enter, nodes, norm, lossless,
+        enter, n_enter, nodes, norm, least, lossless,
     )  # fmt: skip
 
 
@@ -483,7 +494,7 @@ def entries_of(wiring: Wiring) -> int:
 def _write(net: Any, which: int, one: Sparse) -> None:
     """Write the equations of a circuit to their place."""
     net["n_sums"][which] = one.n_x, one.n_u, len(one.extra), one.n_enter, *one.few
-    net["norm"][which] = one.norm
+    net["norm"][which], net["least"][which] = one.norm, one.least
     net["own_by"][which], net["line_to"][which] = one.own, one.line_to
     for name, values in (
         ("state_at", one.state), ("x_of", one.of), ("x_by", one.by), ("extra_at", one.extra),
@@ -582,30 +593,44 @@ def _series(n: Any, now: Any, c: int, axis: int, h: float) -> None:
     columns, end, middle = field(now, "columns"), field(now, "x_end"), field(now, "x_middle")
     s_now, speed = field(now, "s_now"), field(now, "source_speed")
     begin, column, value = field(n, "sum_begin"), field(n, "sum_column"), field(n, "sum_value")
-    blocked, halves = now.row - 1, 1.0
+    blocked, halves, size = now.row - 1, 1.0, 0.0
     for part in range(2):
         for k in range(n_x):
             columns[0, part, k] = middle[axis, part, k] = end[axis, part, k]
         for k in range(n_s):
             columns[0, part, n_x + k] = s_now[part, k]
-    for j in range(1, how_many(h * field(n, "norm")[c]) + 1):
+        size += _square(columns[0, part], 0, n_x + n_s)
+    least, norm_h = field(n, "least")[c] * size, h * field(n, "norm")[c]
+    for j in range(1, how_many(norm_h) + 1):
         x, y, d = columns[(j - 1) % 2], columns[j % 2], h * _PER[j]
         halves *= 0.5
         _sum(begin[c], column[c], value[c], 0, n_u, x, 1.0, x, n_x + n_s)
-        to = n_x + n_s + n_u
         for part in range(2):
-            _end_of_lines(field(n, "line_to")[c], x[part], to, N)
-            _slopes(field(n, "own_by")[c], x[part], y[part], d, N, n_x, to)
+            _slopes(field(n, "own_by")[c], field(n, "line_to")[c], x[part], y[part], d, N, n_x)
         _slopes_of_others(n, c, n_u, n_x - N_OWN * N, x, d, y, N_OWN * N)
         _add(n, now, c, n_u + n_x - N_OWN * N, n_extra, x, d, y)
         if blocked >= 0:
             y[0, blocked] = y[1, blocked] = 0.0
         _turn(speed, x, y, d, n_x, n_s)
+        size = 0.0
         for part in range(2):
-            _gather(end[axis, part], middle[axis, part], y[part], halves, n_x)
+            size += _gather(end[axis, part], middle[axis, part], y[part], halves, n_x)
+            size += _square(y[part], n_x, n_s)
+        # all further terms are together no larger: each is at most half of the one before
+        if size < least and 2.0 * norm_h < j + 1:
+            break
     for k in range(n_s):
         s = complex(s_now[0, k], s_now[1, k]) * turned(speed[k] * h)
         s_now[0, k], s_now[1, k] = s.real, s.imag
+
+
+@summing
+def _square(x: Any, begin: int, n: int) -> float:
+    """Return the square of n columns from ``begin`` on."""
+    first, size = _U(begin), 0.0
+    for k in range(_U(n)):
+        size += x[first + k] * x[first + k]
+    return size
 
 
 @compiled
@@ -615,17 +640,20 @@ def _sum(
     """Write d times the sums of rows from ``first`` on to columns of ``out`` from ``at`` on."""
     for row in range(rows):
         re = im = more_re = more_im = 0.0
-        e, last = begin[first + row], begin[first + row + 1]
-        while e + 1 < last:
-            re += value[e] * x[0, column[e]]
-            im += value[e] * x[1, column[e]]
-            more_re += value[e + 1] * x[0, column[e + 1]]
-            more_im += value[e + 1] * x[1, column[e + 1]]
-            e += 2
+        e, last = _U(begin[first + row]), _U(begin[first + row + 1])
+        while e + _1 < last:
+            i, j, a, b = _U(column[e]), _U(column[e + _1]), value[e], value[e + _1]
+            re += a * x[_0, i]
+            im += a * x[_1, i]
+            more_re += b * x[_0, j]
+            more_im += b * x[_1, j]
+            e += _2
         if e < last:
-            re += value[e] * x[0, column[e]]
-            im += value[e] * x[1, column[e]]
-        out[0, at + row], out[1, at + row] = d * (re + more_re), d * (im + more_im)
+            i, a = _U(column[e]), value[e]
+            re += a * x[_0, i]
+            im += a * x[_1, i]
+        to = _U(at + row)
+        out[_0, to], out[_1, to] = d * (re + more_re), d * (im + more_im)
 
 
 @compiled
@@ -636,46 +664,39 @@ def _slopes_of_others(
     come first, and each length has a loop without a branch."""
     begin, column, value = field(n, "sum_begin"), field(n, "sum_column"), field(n, "sum_value")
     few, col, val = field(n, "n_sums"), column[c], value[c]
-    e = begin[c, first]
-    for row in range(few[c, 4]):
-        i, j, a, b = col[e], col[e + 1], d * val[e], d * val[e + 1]
-        y[0, at + row] = a * x[0, i] + b * x[0, j]
-        y[1, at + row] = a * x[1, i] + b * x[1, j]
-        e += 2
-    at += few[c, 4]
-    for row in range(few[c, 5]):
-        i, j, k = col[e], col[e + 1], col[e + 2]
-        a, b, g = d * val[e], d * val[e + 1], d * val[e + 2]
-        y[0, at + row] = a * x[0, i] + b * x[0, j] + g * x[0, k]
-        y[1, at + row] = a * x[1, i] + b * x[1, j] + g * x[1, k]
-        e += 3
-    at += few[c, 5]
-    for row in range(few[c, 6]):
-        i, j, k, m = col[e], col[e + 1], col[e + 2], col[e + 3]
-        a, b, g, f = d * val[e], d * val[e + 1], d * val[e + 2], d * val[e + 3]
-        y[0, at + row] = (a * x[0, i] + b * x[0, j]) + (g * x[0, k] + f * x[0, m])
-        y[1, at + row] = (a * x[1, i] + b * x[1, j]) + (g * x[1, k] + f * x[1, m])
-        e += 4
+    e, to = _U(begin[c, first]), _U(at)
+    for _ in range(few[c, 4]):
+        i, j, a, b = _U(col[e]), _U(col[e + _1]), d * val[e], d * val[e + _1]
+        y[_0, to] = a * x[_0, i] + b * x[_0, j]
+        y[_1, to] = a * x[_1, i] + b * x[_1, j]
+        e, to = e + _2, to + _1
+    for _ in range(few[c, 5]):
+        i, j, k = _U(col[e]), _U(col[e + _1]), _U(col[e + _2])
+        a, b, g = d * val[e], d * val[e + _1], d * val[e + _2]
+        y[_0, to] = a * x[_0, i] + b * x[_0, j] + g * x[_0, k]
+        y[_1, to] = a * x[_1, i] + b * x[_1, j] + g * x[_1, k]
+        e, to = e + _3, to + _1
+    for _ in range(few[c, 6]):
+        i, j, k, m = _U(col[e]), _U(col[e + _1]), _U(col[e + _2]), _U(col[e + _3])
+        a, b, g, f = d * val[e], d * val[e + _1], d * val[e + _2], d * val[e + _3]
+        y[_0, to] = (a * x[_0, i] + b * x[_0, j]) + (g * x[_0, k] + f * x[_0, m])
+        y[_1, to] = (a * x[_1, i] + b * x[_1, j]) + (g * x[_1, k] + f * x[_1, m])
+        e, to = e + _4, to + _1
     short = few[c, 4] + few[c, 5] + few[c, 6]
-    at += few[c, 6]
-    _sum(begin[c], col, val, first + short, rows - short, x, d, y, at)
+    _sum(begin[c], col, val, first + short, rows - short, x, d, y, at + short)
 
 
 @compiled
-def _end_of_lines(line_to: Any, x: Any, to: int, N: int) -> None:
-    for k in range(N):
-        x[to + k] = x[line_to[k]]
-
-
-@compiled
-def _slopes(by: Any, x: Any, y: Any, d: float, N: int, n_x: int, to: int) -> None:
+def _slopes(by: Any, line_to: Any, x: Any, y: Any, d: float, N: int, n_x: int) -> None:
     """Write the next terms of the converters' filters and lines."""
-    for k in range(N):
-        y[k] = d * (by[0, k] * (x[n_x + k] - x[N + k]) - by[1, k] * x[k])
-    for k in range(N):
-        y[N + k] = d * (by[2, k] * (x[k] - x[2 * N + k]))
-    for k in range(N):
-        y[2 * N + k] = d * (by[3, k] * x[N + k] - by[4, k] * x[2 * N + k] - by[5, k] * x[to + k])
+    v, i_o, s = _U(N), _U(2 * N), _U(n_x)
+    for k in range(_U(N)):
+        y[k] = d * (by[_0, k] * (x[s + k] - x[v + k]) - by[_1, k] * x[k])
+    for k in range(_U(N)):
+        y[v + k] = d * (by[_2, k] * (x[k] - x[i_o + k]))
+    for k in range(_U(N)):
+        there = x[_U(line_to[k])]
+        y[i_o + k] = d * (by[_3, k] * x[v + k] - by[_4, k] * x[i_o + k] - by[_5, k] * there)
 
 
 @compiled
@@ -692,18 +713,23 @@ def _add(n: Any, now: Any, c: int, first: int, rows: int, x: Any, d: float, y: A
 @compiled
 def _turn(speed: Any, x: Any, y: Any, d: float, n_x: int, n_s: int) -> None:
     """Write the next terms of the sources."""
-    for k in range(n_s):
-        y[0, n_x + k] = -d * speed[k] * x[1, n_x + k]
-    for k in range(n_s):
-        y[1, n_x + k] = d * speed[k] * x[0, n_x + k]
+    first = _U(n_x)
+    for k in range(_U(n_s)):
+        y[_0, first + k] = -d * speed[k] * x[_1, first + k]
+    for k in range(_U(n_s)):
+        y[_1, first + k] = d * speed[k] * x[_0, first + k]
 
 
-@compiled
-def _gather(end: Any, middle: Any, y: Any, halves: float, n_x: int) -> None:
+@summing
+def _gather(end: Any, middle: Any, y: Any, halves: float, n_x: int) -> float:
+    """Add a term to where the series leads, and return its square."""
+    size = 0.0
     for k in range(n_x):
-        end[k] += y[k]
-    for k in range(n_x):
-        middle[k] += halves * y[k]
+        term = y[k]
+        size += term * term
+        end[k] += term
+        middle[k] += halves * term
+    return size
 
 
 @inlined

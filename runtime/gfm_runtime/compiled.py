@@ -126,6 +126,10 @@ compiled: Any = _decorator(**FREE)
 #: otherwise emit a call, pass every word of every array on the stack, and save registers
 inlined: Any = _decorator(**FREE, forceinline=True)
 
+#: decorator for a function whose sums may be taken in any order, so that they are taken of several
+#: numbers at a time; their last bits then depend on the processor
+summing: Any = _decorator(**FREE, fastmath={"reassoc"})
+
 
 def expanded(function: Callable[..., Any]) -> Any:
     """For a function that returns a view of its argument: numba puts it into its callers before it
