@@ -12,7 +12,7 @@ import numpy as np
 
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.crc import crc32
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 
 _RUN = 254  # bytes without a zero that one code byte covers
 _CRC = 4  # bytes, little-endian
@@ -31,6 +31,19 @@ def _is_greeting(message, size):
     return same
 
 
+@inlined
+def _put(byte, out, code_at, at):
+    """Write a byte of a message; returns where its code byte and the next byte stand."""
+    if byte == 0:
+        out[code_at] = at - code_at
+        return at, at + 1
+    out[at] = byte
+    if at - code_at == _RUN:
+        out[code_at] = _RUN + 1
+        return at + 1, at + 2
+    return code_at, at + 1
+
+
 @compiled
 def stuff(message, out):
     """Write a message as it goes to the line, with the zero that ends it; returns the bytes.
@@ -39,23 +52,14 @@ def stuff(message, out):
         message: at most ``LONGEST`` bytes.
         out: room for ``MOST`` + 1 bytes.
     """
-    size = len(message)
-    total, crc = size, np.int64(0)
-    if _is_greeting(message, size):
-        total, crc = size + _CRC, np.int64(crc32(message, size))
-    code_at, at, run = 0, 1, 1
-    for k in range(total):
-        byte = message[k] if k < size else np.uint8((crc >> (8 * (k - size))) & 0xFF)
-        if byte == 0:
-            out[code_at] = run
-            code_at, at, run = at, at + 1, 1
-            continue
-        out[at] = byte
-        at, run = at + 1, run + 1
-        if run == _RUN + 1:
-            out[code_at] = run
-            code_at, at, run = at, at + 1, 1
-    out[code_at], out[at] = run, 0
+    code_at, at = 0, 1
+    for byte in message:
+        code_at, at = _put(byte, out, code_at, at)
+    if _is_greeting(message, len(message)):
+        crc = np.int64(crc32(message, len(message)))
+        for k in range(_CRC):
+            code_at, at = _put(np.uint8((crc >> (8 * k)) & 0xFF), out, code_at, at)
+    out[code_at], out[at] = at - code_at, 0
     return at + 1
 
 
