@@ -113,7 +113,7 @@ def test_a_follower_that_ends_begins_again(port, scope, monkeypatch, caplog, att
 
     with connect(address(port)) as page:
         words(page, "events")
-        monkeypatch.setattr(scope.record, "events", events)
+        monkeypatch.setattr(scope._runs[""].record, "events", events)
         assert words(page, "events")["events"] == lines
     assert "Too many open files" in caplog.text and "not a log" in caplog.text
     attack_now("2 failures reported, the follower begins again, the event arrives")
@@ -127,7 +127,7 @@ def test_a_page_that_never_reads_is_dropped(port, scope, monkeypatch, caplog, at
         words(other, "events")
         for k in range(3):
             more = [{**big, "tick": k}]
-            monkeypatch.setattr(scope.record, "events", lambda more=more: more)
+            monkeypatch.setattr(scope._runs[""].record, "events", lambda more=more: more)
             assert words(other, "events")["events"][0]["tick"] == k
         wait_for(lambda: len(scope._sessions) == 1)
     assert "dropped" in caplog.text
