@@ -83,7 +83,7 @@ def rig(folder: Path, scenario: str = RIG) -> Iterator[Rig]:
         yield Rig(folder / "run", *addresses(iter(process.stderr)), process)
     finally:
         process.terminate()
-        process.wait()
+        process.wait(PATIENCE_S)
 
 
 def words(socket: Any, kind: str) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def call(options: argparse.Namespace) -> int:
             common.print_run(run, folder, why=True)
         common.show_page(options, folder / PAGE)
         for name, process in stay.items():
-            if process.poll() is None and run.status != "interrupted":
+            if process.poll() is None and "interrupted" not in run.status:  # of any converter
                 print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
                 with contextlib.suppress(KeyboardInterrupt):
                     process.wait()
