@@ -1,6 +1,7 @@
 """The scope in Chromium: a run is shown, commanded, trips, and is reset."""
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -72,6 +73,12 @@ def moves(page: Browser) -> None:
     wait_for(lambda: page.picture("power") != before and page.text("#time") != time)
 
 
+def value_now(page: Browser, strip: str) -> float:
+    """The newest value beside a strip; nan before the first."""
+    text = page.text(f"[data-strip={strip}] .now").replace("−", "-")
+    return float(text) if text.strip("–") else math.nan
+
+
 def test_drive(page):
     assert page.text("#title") == "A rig that is told what to do"
     assert "token" not in page.driver.current_url
@@ -82,7 +89,7 @@ def test_drive(page):
     page.click("#apply")
     assert "P_ref = 0.8 at tick" in wait_for(lambda: said(page, "Set-points").strip("…"))
     wait_for(lambda: page.text("#now-P_ref") == "0.800")
-    wait_for(lambda: abs(float(page.text("[data-strip=power] .now").replace("−", "-")) - 0.8) < 0.1)
+    wait_for(lambda: abs(value_now(page, "power") - 0.8) < 0.1)
 
     page.click("[data-law=mimo-gfm-deployable]")
     wait_for(lambda: page.text("#law") == "mimo-gfm-deployable")
@@ -167,7 +174,7 @@ def test_a_desk_of_ones_own(page, tmp_path):
         "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
     )
     page.click("#si")
-    wait_for(lambda: abs(float(page.text("[data-strip=voltage] .now")) - 380.0) < 20.0)
+    wait_for(lambda: abs(value_now(page, "voltage") - 380.0) < 20.0)
     page.click("#signals summary")
     for strip in ("power", "frequency", "dc", "inputs", "loop", "one-d_V_g"):
         page.click(f"#signal-list [data-strip={strip}]")
