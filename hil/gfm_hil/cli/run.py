@@ -98,11 +98,20 @@ def call(options: argparse.Namespace) -> int:
             common.print_run(run, folder, why=True)
         common.show_page(options, folder / PAGE)
         for name, process in stay.items():
-            if process.poll() is None and "interrupted" not in run.status:  # of any converter
+            if process.poll() is None and not _was_stopped(run):
                 print(f"the {name} stays open until Ctrl-C", file=sys.stderr, flush=True)
                 with contextlib.suppress(KeyboardInterrupt):
                     process.wait()
     return common.exit_code(run)
+
+
+def _was_stopped(run: Run | NetworkRun) -> bool:
+    """Whether an operator ended the run, or that of a converter: the other side of one that stops
+    first ends in SAFE."""
+    runs = run.runs.values() if isinstance(run, NetworkRun) else (run,)
+    return any(
+        one.status == "interrupted" or "stopped" in str(one.summary.get("reason")) for one in runs
+    )
 
 
 def _ports(options: argparse.Namespace, network: bool) -> dict[str, int]:
