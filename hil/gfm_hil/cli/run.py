@@ -106,11 +106,13 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _was_stopped(run: Run | NetworkRun) -> bool:
-    """Whether an operator ended the run, or that of a converter: the other side of one that stops
-    first ends in SAFE."""
-    runs = run.runs.values() if isinstance(run, NetworkRun) else (run,)
+    """Whether an operator ended the run; of a network, where the other side of a controller that is
+    told first ends in SAFE, that of any converter."""
+    if not isinstance(run, NetworkRun):
+        return run.status == "interrupted"
     return any(
-        one.status == "interrupted" or "stopped" in str(one.summary.get("reason")) for one in runs
+        one.status == "interrupted" or "was stopped" in str(one.summary.get("reason"))
+        for one in run.runs.values()
     )
 
 
