@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
+from gfm_hil.studies.conformity.shared_start import SharedStart, alike, first_event, judged
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
 from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import get_law, law_file
@@ -87,6 +89,7 @@ class Job:
     figures: bool  # whether to draw one
     # the model that computes u in place of the law, or None
     external: ControllerUnderTest | None = None
+    start: SharedStart | None = None  # that of a model's run, which others have too
 
     @property
     def name(self) -> str:
@@ -223,8 +226,9 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
     try:
         if workers > 1:
             compile_once(jobs, watch.notice)
-        with pool_of(workers) as pool:
-            run_tasks(run_part, jobs, pool, workers, keep, watch.stopped)
+        with pool_of(workers) as pool, scratch.temporary("gfmhil-starts-") as place:
+            started = share_starts(jobs, place, pool, workers, watch)
+            run_tasks(run_part, started, pool, workers, keep, watch.stopped)
     except WorkerLost as problem:
         lost = problem
     except KeyboardInterrupt:  # of a second signal: the runs under way are lost
@@ -234,6 +238,41 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
         done = f"{len(found)} of {len(jobs)} runs were done; there is no report"
         raise WorkerLost(f"{lost}; {done}") if lost else KeyboardInterrupt(f"interrupted; {done}")
     return found
+
+
+def share_starts(
+    jobs: Sequence[Job], place: Path, pool: Executor | None, workers: int, watch: Watch
+) -> list[Job]:
+    """The jobs, those of a model that begin alike with one start, which is run here.
+
+    Args:
+        place: folder for these starts, which lasts while jobs run.
+        pool, workers, watch: as of ``execute``.
+    """
+    groups: dict[str, list[tuple[int, Scenario]]] = {}
+    for k, job in enumerate(jobs):
+        if job.external is not None and job.part.cannot is None and _plot(job) is None:
+            with suppress(UserError):  # which the verdict will say
+                scenario = _scenario(job)
+                groups.setdefault(alike(scenario), []).append((k, scenario))
+    starts: list[tuple[SharedStart, Sequence[int]]] = []
+    for n, group in enumerate(group for group in groups.values() if len(group) > 1):
+        members, scenarios = zip(*group, strict=True)
+        ticks, external = min(map(first_event, scenarios)), jobs[members[0]].external
+        if ticks > 0 and external is not None:
+            start = SharedStart(scenarios[0], ticks, place / f"{n}", tuple(external.command))
+            starts.append((start, members))
+    if not starts:
+        return [*jobs]
+    shared = sum(len(members) for _, members in starts)
+    watch.notice(f"running what {shared} runs begin with, once …")
+    good = set[Path | None]()
+    begins = [start for start, _ in starts]
+    run_tasks(SharedStart.make, begins, pool, workers, good.add, watch.stopped)
+    if {start.folder for start in begins} - good and not watch.stopped():
+        watch.notice("the model does not go on from a snapshot: each of its runs settles anew")
+    of = {k: start for start, members in starts if start.folder in good for k in members}
+    return [replace(job, start=of.get(k)) for k, job in enumerate(jobs)]
 
 
 def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
@@ -269,29 +308,6 @@ def _scenario(job: Job) -> Scenario:
     return found.shifted(asked.settle_s).model_copy(update=changes)
 
 
-def _settled(run: Run, settle_s: float) -> Run:
-    """The part of a run after the first ``settle_s``, as a run of its own. Raises UserError: it did
-    not last so long."""
-    first = round(settle_s / run.scenario.T_s)
-    if run.ticks <= first:
-        reason = f"{run.status}: {run.summary['reason']}"
-        raise UserError(
-            f"the controller does not settle in {settle_s:g} s; the run ended as {reason}"
-        )
-    columns: dict[str, Any] = {name: column[first:] for name, column in run.columns.items()}
-    columns["tick"], columns["t"] = columns["tick"] - first, columns["t"] - settle_s
-    events = [
-        {
-            **line,
-            "tick": line["tick"] - first,
-            **({"t": line["t"] - settle_s} if "t" in line else {}),
-        }
-        for line in run.events
-        if line["tick"] >= first
-    ]
-    return replace(run, scenario=run.scenario.shifted(-settle_s), columns=columns, events=events)
-
-
 def run_part(job: Job) -> PartResult:
     """Run, judge and draw a part; what cannot be run cannot be judged. Raises RunFailed: an error
     of the program; the message names law and test."""
@@ -308,7 +324,7 @@ def _run_part(job: Job) -> PartResult:
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
         return PartResult(*names, "none", reason, cannot(criteria, reason))
-    external, plot = job.external, criteria[0] if isinstance(criteria[0], Plot) else None
+    external, plot = job.external, _plot(job)
     with ExitStack() as stack:
         try:
             scenario = _scenario(job)
@@ -351,6 +367,12 @@ def _run_part(job: Job) -> PartResult:
         return PartResult(*names, status, reason, verdicts, again_text, recording, figure)
 
 
+def _plot(job: Job) -> Plot | None:
+    """The plot by which a part is judged in place of a run, if it is."""
+    first = job.case.test.asked(job.part)[0]
+    return first if isinstance(first, Plot) else None
+
+
 def _again(scenario: str, plot: Plot | None, external: ControllerUnderTest | None) -> list[str]:
     """The command that repeats the run of a scenario file; none for the plot of a model."""
     if plot is not None:
@@ -367,11 +389,16 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     which a run of a model is read."""
     if job.external is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
-        run = run_scenario(scenario, folder, controller_command=job.external.command)
+        if job.start is None:
+            run = run_scenario(scenario, folder, controller_command=job.external.command)
+        else:
+            run = job.start.go_on(scenario, folder)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         settle_s = job.external.map.settle_s
-        return (_settled(run, settle_s) if settle_s else run), {}
+        if settle_s or job.start is not None:
+            run = judged(scenario, run, settle_s, job.start)
+        return run, {}
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)
