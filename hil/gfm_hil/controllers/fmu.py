@@ -133,8 +133,11 @@ class FmuController(MappedController):
 
     def restore(self, kept: State) -> None:
         super().restore(kept)
+        data = kept.get("FMUState")
+        if data is None:
+            raise UserError(f"{self.name}: the snapshot has nothing for its FMUState")
         try:
-            found = self._it.deserializeFMUState(kept["FMUState"].tobytes())
+            found = self._it.deserializeFMUState(data.tobytes())
             self._it.setFMUState(found)
             self._it.freeFMUState(found)
         except self._failed as problem:

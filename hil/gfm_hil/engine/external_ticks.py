@@ -85,7 +85,7 @@ class SteppedController:
         """Go on from a snapshot. Raises UserError: that is of another controller; ControllerError:
         it refuses."""
         if (was := str(kept.get("name", "none"))) != self.name:
-            raise UserError(f"start_from: its snapshot is of the controller {was}, not {self.name}")
+            raise UserError(f"its snapshot is of the controller {was}, not {self.name}")
         put_back(self.name, kept, "u", self._u)
         self._external.restore(kept)
 

@@ -23,7 +23,7 @@ from gfm_hil.engine.handshake import Meeting, Start, shake_hands
 from gfm_hil.engine.loop_records import FLAGS, WAKE
 from gfm_hil.engine.sd_notify import Watched, notify
 from gfm_hil.engine.setup import Bench, make_benches
-from gfm_hil.engine.snapshot import external_snapshot
+from gfm_hil.engine.snapshot import restore_external
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
 from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
@@ -107,7 +107,7 @@ def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
             external, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)
         )
         if scenario.start_from is not None:
-            found.restore(external_snapshot(scenario, bench))
+            restore_external(scenario, bench, found)
         return found
     except ControllerError as problem:
         raise UserError(str(problem)) from None

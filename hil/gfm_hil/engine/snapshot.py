@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.controllers import ControllerError
 from gfm_hil.controllers.external import State, put_back
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import open_file, replacing
@@ -24,6 +25,7 @@ from gfm_hil.scenario import Scenario
 from gfm_runtime.assembly import SPARE
 
 if TYPE_CHECKING:
+    from gfm_hil.engine.external_ticks import SteppedController
     from gfm_hil.engine.setup import Bench
 
 _LARGEST = 1 << 30  # bytes of a file
@@ -83,12 +85,16 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
         bench.before = int(bench.plant.st["tick"][0])
 
 
-def external_snapshot(scenario: Scenario, bench: Bench) -> State:
-    """What the controller that is not ours gave. Raises UserError: it cannot be read."""
-    own = _folder(Path(scenario.start_from or ""), bench)
-    kept = _read(_file(own, "controller"), f"start_from = {scenario.start_from!r}")
-    begin = "external_"
-    return {name.removeprefix(begin): x for name, x in kept.items() if name.startswith(begin)}
+def restore_external(scenario: Scenario, bench: Bench, external: SteppedController) -> None:
+    """Put a controller that is not ours where the snapshot has it. Raises UserError: it cannot be
+    read, or is of another controller; the message names the file."""
+    file = _file(_folder(Path(scenario.start_from or ""), bench), "controller")
+    kept, begin = _read(file, f"start_from = {scenario.start_from!r}"), "external_"
+    own = {name.removeprefix(begin): x for name, x in kept.items() if name.startswith(begin)}
+    try:
+        external.restore(own)
+    except (UserError, ControllerError) as problem:
+        raise UserError(f"start_from: {file}: {problem}") from None
 
 
 def _folder(folder: Path, bench: Bench) -> Path:

@@ -116,6 +116,16 @@ def test_a_model_goes_on_from_its_state(exported, kind, tmp_path):
             folder=tmp_path / "other", controller=exported("dll", "droop-5", "cascaded"),
             figures=False,
         )  # fmt: skip
+    name = "FMUState" if kind == "fmu" else "DoubleStates"
+    file = tmp_path / "cut" / "snapshot_controller.npz"
+    kept = {key: x for key, x in np.load(file).items() if key != f"external_{name}"}
+    np.savez(file, **kept)
+    with pytest.raises(UserError, match=f"{file}: .*the snapshot has nothing for its {name}") as no:
+        gfmhil.run(
+            {**given, "duration": 0.05, "start_from": str(tmp_path / "cut")},
+            folder=tmp_path / "less", controller=model, figures=False,
+        )  # fmt: skip
+    assert "\n" not in str(no.value)
 
 
 @compiles
