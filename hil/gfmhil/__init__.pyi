@@ -13,6 +13,7 @@ from gfm_hil.api.runs import recover as recover
 from gfm_hil.api.runs import run as run
 from gfm_hil.api.runs import run_network as run_network
 from gfm_hil.api.studies import campaign as campaign
+from gfm_hil.api.studies import certify as certify
 from gfm_hil.api.studies import clearing_time as clearing_time
 from gfm_hil.api.studies import conform as conform
 from gfm_hil.api.studies import identify as identify
@@ -23,6 +24,7 @@ from gfm_hil.recording.foreign import grid_profile as grid_profile
 from gfm_hil.scenario import Scenario as Scenario
 from gfm_hil.scenario import load_scenario as load_scenario
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
+from gfm_hil.studies.certificate import CertifiedLaws as CertifiedLaws
 from gfm_hil.studies.clearing import ClearingTime as ClearingTime
 from gfm_hil.studies.conformity.result import Conformity as Conformity
 from gfm_hil.studies.scan import FrequencyScan as FrequencyScan

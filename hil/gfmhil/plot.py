@@ -2,6 +2,7 @@
 
 from gfm_hil.api.plot import (
     bode,
+    certificate,
     clearing_times,
     impedance,
     nyquist,
@@ -17,6 +18,7 @@ from gfm_hil.studies.scan_figures import admittance, nfp, nyquist_on_grid, passi
 __all__ = [
     "admittance",
     "bode",
+    "certificate",
     "clearing_times",
     "impedance",
     "nfp",

@@ -30,6 +30,7 @@ from gfm_hil.results.figures import (
 )
 from gfm_hil.results.look import figure_of, look, own_colour, rc, with_look
 from gfm_hil.results.look import save as save
+from gfm_hil.studies.certificate import CertifiedLaws
 from gfm_hil.studies.clearing import OF_ANGLE, ClearingTime
 from gfm_hil.studies.linear_loop import title_of
 from gfm_hil.studies.margin_figures import NO_POINT, draw_sigma
@@ -239,6 +240,31 @@ def stability_map(stability: StabilityMap) -> Axes:
     axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
     if np.isnan(stability.sigma).any():
         axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
+    return axes
+
+
+@with_look
+def certificate(found: CertifiedLaws) -> Axes:
+    """Draw the margin of ``gfmhil.certify`` over Hz; where it is not positive, it is shaded.
+
+    Raises:
+        ValueError: a single converter is unstable already, so there is no certificate.
+    """
+    if found.certificate is None:
+        raise ValueError(f"no certificate: {found.unstable}")
+    (axes,) = pyplot_panels(1, (6.6, 3.2))
+    hz, margin = found.certificate.hz, found.certificate.margin
+    axes.stairs(margin, hz, color=COLOURS[0], lw=rc("lines.linewidth", 1.2))
+    for k, (low, high) in enumerate(found.certificate.void):
+        axes.axvspan(low, high, color=COLOURS[1], alpha=0.25, lw=0, label=None if k else "void")
+    axes.axhline(0.0, color="k", lw=0.6)
+    axes.set_xscale("log")
+    axes.set_yscale("symlog", linthresh=1e-3)
+    axes.set(xlabel="frequency in the dq frame [Hz]", ylabel="margin", xlim=(hz[0], hz[-1]))
+    if found.certificate.void:
+        axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+    grids = found.grids
+    dress(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
     return axes
 
 

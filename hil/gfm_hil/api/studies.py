@@ -7,14 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gfm_design.margins.certificate import GridClass
 from gfm_hil.api.law import Law, law_files
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
+from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.scenario.schema import laws_digest
 from gfm_hil.studies import clearing, envelopes
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
+from gfm_hil.studies.certificate import CertifiedLaws, certify_laws
 from gfm_hil.studies.clearing import ClearingTime
 from gfm_hil.studies.conformity import recorded
 from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
@@ -282,3 +285,43 @@ def clearing_time(
         scenario = load_scenario(on, in_process=True, **changes)
         made = clearing.clearing_time(scenario, longest, after, within, watch)
     return replace(made, law=law.name) if isinstance(law, Law) else made
+
+
+def certify(
+    laws: str | Path | Law | Sequence[str | Path | Law],
+    on: str | Path | Scenario = "pref_step",
+    *,
+    scr: tuple[float, float] = (1.5, 20.0),
+    x_over_r: tuple[float, float] = (3.0, 20.0),
+    powers: Sequence[float] = (0.0, 0.5, 1.0),
+    loads: bool = False,
+    watch: Watch = SILENT,
+    **changes: Any,
+) -> CertifiedLaws:
+    """Say whether every network of a class is stable with any number of converters under laws.
+
+    The class: R-L lines between converters and an ideal grid. docs/identification.md has the
+    condition, and where it is void.
+
+    Args:
+        laws: names, law files or ``Law``.
+        on: scenario of one converter: its plant, inner stage, T_s and other references.
+        scr: least and largest generalised short-circuit ratio at the filter capacitors.
+        x_over_r: of the lines, least and largest.
+        powers: P_ref of the operating points, p.u.
+        loads: whether resistors and R-L loads may be at any node.
+        watch: told the grids tried.
+        changes: keys of the scenario, as for ``run``, e.g. ``inner="virtual-stator"``.
+
+    Raises:
+        UserError: one line a mistake.
+        LawError: a law is none.
+    """
+    several = [laws] if isinstance(laws, str | Path | Law) else list(laws)
+    scenario = load_scenario(on, in_process=True, **changes)
+    try:
+        grids = GridClass(*scr, x_over_r, loads, nominal_frequency(scenario))
+    except ValueError as problem:
+        raise UserError(str(problem)) from None
+    with law_files(several) as files:
+        return certify_laws(scenario, [str(file) for file in files.values()], grids, powers, watch)

@@ -45,6 +45,7 @@ from gfm_design.margins.admittance import (
     line_impedance,
     passivity,
 )
+from gfm_design.margins.certificate import Certificate, GridClass, certify
 from gfm_design.model.dead_time import with_dead_time
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
@@ -175,6 +176,24 @@ class FrequencyScan:
         """
         here = self._impedance(*self.line)
         return grid_stability(self.frequency, self.Y, self.grid(scr, x_over_r), here)
+
+    def certificate(self, grids: GridClass) -> Certificate:
+        """Whether every network of a class is stable with any number of such converters at this
+        operating point, from the measured Y alone, between its frequencies.
+
+        Raises:
+            UserError: the grid of the measurement, on which the loop is stable, is not of the
+                class.
+        """
+        R, L = self.line
+        scr, x_over_r = 1.0 / math.hypot(R, L), L / R if R else math.inf
+        low, high = grids.x_over_r
+        if not (grids.weakest <= scr <= grids.stiffest and low <= x_over_r <= high):
+            raise UserError(
+                f"grids: that of the measurement (SCR {scr:.4g}, X/R {x_over_r:.4g}) must be one "
+                "of the class"
+            )
+        return certify(grids, self.frequency, [self.Y])
 
     def eigenloci(self, scr: float, x_over_r: float) -> Response:
         """The eigenvalues of Z Y for a grid, shape (K, 2); arguments and errors as ``grid``."""

@@ -1,0 +1,138 @@
+"""gfmhil certify: the class of grids in which converters are stable, whoever else is there."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+
+from gfm_hil.api.plot import certificate as draw
+from gfm_hil.api.studies import certify
+from gfm_hil.cli.common import add_inner, watching
+from gfm_hil.cli.design.loop import save_figure
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.report import finite
+from gfm_hil.results.table import Table
+from gfm_hil.scenario import load_scenario
+from gfm_hil.studies.certificate import CertifiedLaws, Strength, counter_run, strength_of
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "laws", nargs="+", metavar="LAW",
+        help="catalogue names or law files: any number of converters with each of them",
+    )  # fmt: skip
+    command.add_argument(
+        "--scr", metavar="LOW:HIGH", type=_range, default=(1.5, 20.0),
+        help="generalised short-circuit ratios of the class, at the filter capacitor "
+        "(default: 1.5:20)",
+    )  # fmt: skip
+    command.add_argument("--x-over-r", metavar="LOW:HIGH", type=_range, default=(3.0, 20.0),
+                         help="of its lines (default: 3:20)")  # fmt: skip
+    command.add_argument("--power", metavar="LIST", type=_powers, default=(0.0, 0.5, 1.0),
+                         help="P_ref of the operating points, p.u. (default: 0,0.5,1)")  # fmt: skip
+    command.add_argument("--loads", action="store_true",
+                         help="resistors and R-L loads may be at any node")  # fmt: skip
+    add_inner(command)
+    command.add_argument(
+        "--scenario", default="pref_step",
+        help="plant, T_s and the other references; pref_step by default",
+    )  # fmt: skip
+    command.add_argument(
+        "--network", action="append", default=[], metavar="SCENARIO",
+        help="say whether this network belongs to the class; may be repeated",
+    )  # fmt: skip
+    command.add_argument("-o", "--out", type=Path, metavar="FILE",
+                         help="figure: .png, .svg or .pdf")  # fmt: skip
+    command.add_argument("--json", action="store_true", help="as JSON")
+    command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+
+
+def _range(text: str) -> tuple[float, float]:
+    low, _, high = text.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be LOW:HIGH, e.g. 1.5:20") from None
+
+
+def _powers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(one) for one in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be numbers by commas, 0,0.5,1") from None
+
+
+def call(options: argparse.Namespace) -> int:
+    """Print what holds; exit code 1 with a counter-example, 4 if neither is known."""
+    networks = {name: strength_of(load_scenario(name)) for name in options.network}
+    scenario = load_scenario(options.scenario, inner=options.inner)
+    with watching("certify", options.quiet) as watch:
+        found = certify(
+            options.laws, scenario, scr=options.scr, x_over_r=options.x_over_r,
+            powers=options.power, loads=options.loads, watch=watch,
+        )  # fmt: skip
+    if options.out:
+        if found.certificate is None:
+            raise UserError(f"--out: there is no certificate to draw; {found.unstable}")
+        save_figure(options.out, lambda: draw(found))
+    run = counter_run(scenario, found.unstable) if found.unstable else ""
+    if options.json:
+        print(json.dumps(finite(_plain(found, networks, run)), indent=2))
+    else:
+        _print(found, networks, run, options.out)
+    return 0 if found.holds else 1 if found.unstable else 4
+
+
+def _plain(found: CertifiedLaws, networks: dict[str, Strength], run: str) -> dict[str, Any]:
+    grids = found.grids
+    worst = None if found.certificate is None else float(found.certificate.margin.min())
+    return {
+        "laws": found.laws,
+        "holds": found.holds,
+        "weakest": grids.weakest,
+        "stiffest": grids.stiffest,
+        "x_over_r": grids.x_over_r,
+        "loads": grids.loads,
+        "powers": found.powers,
+        "margin": worst,
+        "void_hz": [] if found.certificate is None else found.certificate.void,
+        "unstable": None if found.unstable is None else str(found.unstable),
+        "its_run": run,
+        "networks": {name: s.within(grids) for name, s in networks.items()},
+    }
+
+
+def _print(
+    found: CertifiedLaws, networks: dict[str, Strength], run: str, figure: Path | None
+) -> None:
+    console, grids = terminal(highlight=False), found.grids
+    low, high = grids.x_over_r
+    console.print(
+        f"[bold]{escape(', '.join(found.laws))}[/] · strength {grids.weakest:g} to "
+        f"{grids.stiffest:g}, X/R {low:g} to {high:g}, "
+        f"{'with' if grids.loads else 'without'} loads, P_ref "
+        + ", ".join(f"{P:g}" for P in found.powers),
+        soft_wrap=True,
+    )
+    if found.unstable is not None:
+        console.print(f"counter-example: {found.unstable}", soft_wrap=True)
+        if run:
+            console.print(f"a run of it after a phase jump of 0.5 degrees ends as {run}")
+    elif found.certificate is not None and found.holds:
+        console.print("certified: every network of this class is stable", style="bold")
+    elif found.certificate is not None:
+        bands = ", ".join(f"{a:.4g} to {b:.4g} Hz" for a, b in found.certificate.void)
+        console.print(f"void at {bands}: such networks may be stable or not", soft_wrap=True)
+    if networks:
+        rows = [
+            [name, s.weakest, s.stiffest, f"{s.x_over_r[0]:.3g} to {s.x_over_r[1]:.3g}",
+             "yes" if s.loads else "no", "yes" if s.within(grids) else "no"]
+            for name, s in networks.items()
+        ]  # fmt: skip
+        heads = ["network", "weakest", "stiffest", "X/R", "loads", "in the class"]
+        console.print(Table(heads, rows, text=1))
+    if figure:
+        console.print(f"figure: {figure}", soft_wrap=True)
