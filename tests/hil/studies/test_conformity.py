@@ -42,6 +42,7 @@ from gfm_hil.studies.conformity.sets import (
     shipped_sets,
     under_test_file,
 )
+from gfm_hil.studies.conformity.shared_start import judged
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     CONSISTENT,
@@ -885,6 +886,20 @@ def test_the_firmware_of_a_law_gets_the_verdicts_of_the_law(lab, target):
         gfmhil.conform("vsg-2", lab, controller=name, ports="map.toml")
     with pytest.raises(UserError, match="controller pil:z80: must be pil: and one of"):
         gfmhil.conform("vsg-2", lab, controller="pil:z80")
+
+
+def test_of_a_model_that_commands_phases_the_bridge_s_voltage_is_judged(miso):
+    """The frame turns at 60 Hz for ever; the voltage of the bridge follows the grid at 59.7 Hz."""
+    _, scenario = miso
+    t = np.arange(scenario.ticks) * scenario.T_s
+    away = 2 * math.pi * 0.3 * t
+    run = run_of(scenario, p=np.full(len(t), 0.5), delta=0.2 + away, omega_u=np.ones(len(t)))
+    run.columns.update(u_E_u=0.9 * np.cos(-away), u_E_q=0.9 * np.sin(-away))
+    found = judged(scenario, run, 1.0, None)
+    np.testing.assert_allclose(found.signals["f_hz"], 59.7, atol=1e-9)
+    np.testing.assert_allclose(found.signals["delta"], 0.2, atol=1e-8)
+    assert (found.ticks, found.scenario.duration) == (run.ticks - 10000, scenario.duration - 1.0)
+    assert [e.t for e in found.scenario.events] == [t - 1.0 for t in JUMPS]
 
 
 def nfp_of(**more: Any) -> Nfp:

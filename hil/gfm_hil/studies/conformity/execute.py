@@ -395,10 +395,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
             run = job.start.go_on(scenario, folder)
         if run.status == "interrupted":
             raise KeyboardInterrupt
-        settle_s = job.external.map.settle_s
-        if settle_s or job.start is not None:
-            run = judged(scenario, run, settle_s, job.start)
-        return run, {}
+        return judged(scenario, run, job.external.map.settle_s, job.start), {}
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)

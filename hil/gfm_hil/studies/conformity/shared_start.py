@@ -9,7 +9,7 @@ start.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.run import Run
+from gfm_hil.recording.run import Run, bases
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import Scenario
 
@@ -101,6 +101,8 @@ def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | N
     }
     columns["tick"] = np.arange(ticks - first)
     columns["t"] = columns["tick"] * scenario.T_s
+    if "u_E_q" in columns and len(columns["t"]) > 1 and not np.ptp(columns["true_omega_u"]):
+        columns |= _of_bridge(columns, scenario)
     events = [
         line
         for k, (piece, a, b, by) in enumerate(pieces)
@@ -113,6 +115,17 @@ def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | N
     return replace(
         run, scenario=shifted, columns=columns, events=events, summary=summary, timing={}
     )
+
+
+def _of_bridge(columns: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """Angle and frequency of the bridge's voltage, in place of the frame's: a controller that
+    commands phases has the frame turn at one speed, and they show nothing of it."""
+    angle = np.unwrap(np.arctan2(columns["u_E_q"], columns["u_E_u"]))
+    speed = np.gradient(angle, bases(scenario).omega_b * scenario.T_s)
+    return {
+        "true_delta": columns["true_delta"] + angle,
+        "true_omega_u": columns["true_omega_u"] + speed,
+    }
 
 
 def _moved(lines: Sequence[dict[str, Any]], by: int, T_s: float) -> Iterator[dict[str, Any]]:
