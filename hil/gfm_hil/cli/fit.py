@@ -44,7 +44,8 @@ def call(options: argparse.Namespace) -> int:
         for name, (low, high) in ((name, found.interval[name]) for name in _UNITS)
     ]
     console.print(Table(["", "", "95 %", ""], rows, text=None))
-    console.print("REGFM_A1 has mp, TPf and X_L = X_eff; REGFM_B1 without D1 and D2 mp, H and X_L")
+    console.print("REGFM_A1: mp, TPf and X_L = X_eff; REGFM_B1: X_L = X_eff, 1/mp + D1 = D and")
+    console.print("H + D2/(2 omega_D) + TPf D/2 = H, which one jump does not part")
     console.print(
         f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}"
     )

@@ -38,7 +38,7 @@ class UnitFit:
     """D, H and X_eff, and how well they are known.
 
     WECC's models with this swing equation, by the names of their records: REGFM_A1 with mp, TPf and
-    X_L = X_eff, and REGFM_B1 with mp, H and X_L = X_eff, where D1 and D2 are 0.
+    X_L = X_eff, and REGFM_B1 with X_L = X_eff, 1/mp + D1 = D and H + D2/(2 omega_D) + TPf D/2 = H.
 
     Attributes:
         D, H, X_eff: p.u./p.u., s, p.u.; noise may leave an X_eff below 0.

@@ -79,6 +79,23 @@ def test_the_fit_of_a_run_without_noise_is_its_law(run):
     assert fit.noise < 1e-9 and fit.left < 1e-5
 
 
+@pytest.mark.parametrize(
+    ("model", "mp", "H", "X_L"),
+    [
+        ("regfm_a1", 0.01, 0.01 / (2 * 0.01), 0.15),  # TPf/(2 mp)
+        ("regfm_b1", 0.02, 0.5 + 100 / (2 * 50) + 0.02 / (2 * 0.02), 0.10),
+    ],
+)
+def test_the_fit_of_wecc_s_models_has_the_numbers_of_their_records(model, mp, H, X_L):
+    """As far as a swing equation has them: of B1 the inertia that H, D2/(s + omega_D) and TPf make
+    of slow swings. The voltage's control, which the equation has not, moves them."""
+    jump = {"type": "grid-phase-jump", "t": 1.0, "degrees": 1.0}
+    fit = envelopes.fit_run(gfmhil.run(model, duration=4.0, events=[jump]))
+    assert fit.mp == pytest.approx(mp, rel=0.05)
+    assert pytest.approx(H, rel=0.15) == fit.H
+    assert fit.X_eff == pytest.approx(X_L, rel=0.2)
+
+
 def test_the_command_fits_a_recording(run, tmp_path, capsys):
     record(run, tmp_path, 1, 0.01, 5e-4)
     (tmp_path / "jump.toml").write_text(tomlkit.dumps(SCENARIO))
