@@ -22,6 +22,7 @@ from gfm_hil.studies.clearing import ClearingTime
 from gfm_hil.studies.conformity import recorded
 from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
 from gfm_hil.studies.conformity.hashes import file_hashes
+from gfm_hil.studies.conformity.in_network import NetworkUnderTest
 from gfm_hil.studies.conformity.recorded import part_of
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test, under_test_file
@@ -83,6 +84,8 @@ def conform(
     converter: str | Path | None = None,
     controller: str | None = None,
     ports: str | Path | None = None,
+    network: str | Path | None = None,
+    judged: str | None = None,
     workers: int = 1,
     figures: bool = True,
     watch: Watch = SILENT,
@@ -90,7 +93,8 @@ def conform(
     """Run the published tests of grid-forming converters, and judge them clause by clause.
 
     Args:
-        law: name, law file or ``Law``, or several of them; none with a controller.
+        law: name, law file or ``Law``, or several of them; none with a controller, and with a
+            network the judged converter's own if none.
         against: shipped sets, ``all`` of them, or paths of your own.
         folder: where to write the report with figures, as a page and, if reportlab is installed,
             as PDF, results.json and junit.xml; None writes nothing.
@@ -100,6 +104,11 @@ def conform(
             begins at the operating point of the first law, or of ``mimo-gfm`` without any. Or
             ``pil:TARGET``: that law as firmware on a processor.
         ports: file of the map of the model's ports.
+        network: scenario of a network, name or path, over which the tests of one converter are
+            laid: ``network.grid`` is the point of connection, with the line and the grid of the
+            test behind it. Of ``converter`` only what its owner declares counts then.
+        judged: the converter of the network that gets law and stage, and is judged; the first if
+            None. The references of a test go to all.
         workers: as for ``campaign``.
         figures: draw one of each run.
         watch: of the runs.
@@ -111,8 +120,15 @@ def conform(
         KeyboardInterrupt: the watch stopped it.
     """
     check_workers(workers)
+    over = None if network is None else NetworkUnderTest.load(network, judged)
+    if over is None and judged is not None:
+        raise UserError(f"--judged {judged}: is of a --network, and none is given")
+    if over is not None and controller is not None:
+        raise UserError(f"--controller {controller}: is one controller; a network has several")
     given = [law] if isinstance(law, str | Path | Law) else list(law)
     external = external_controller(controller, ports)
+    if not given and over is not None:
+        given = [over.own.law]
     if not given and external is None:
         raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
@@ -120,20 +136,26 @@ def conform(
     if place is not None:
         check_empty(place)
     cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
+    if over is not None:
+        under = under.model_copy(update={"plant": over.plant})
     if inner is not None:
         named_inner(inner)
     with law_files(given) as files, tempfile.TemporaryDirectory() as temporary:
         for file in files.values():
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"
-        jobs = make_jobs(files, cases, inner, under, converters, place, figures, external)
+        jobs = make_jobs(files, cases, inner, under, converters, place, figures, external, over)
         found = execute(jobs, workers, watch)
         digests = {name: laws_digest([file], inner) for name, file in files.items()}
         own = under_test_file(converter)
         droops = {job.law: job.under.droop for job in jobs}
-        hashes = file_hashes(files, inner, own, under.plant.converter, cases, external)
+        path = None if over is None else over.path
+        hashes = file_hashes(files, inner, own, under.plant.converter, cases, external, (), path)
     names = [*files, *([external.name] if external else [])]
-    made = Conformity(names, inner, under, cases, found, place, hashes, digests, droops)
+    words = over.words() if over else ""
+    made = Conformity(
+        names, inner, under, cases, found, place, hashes, digests, droops, network=words
+    )
     if place is not None:
         made.write(place, watch.notice)
     return made

@@ -25,6 +25,7 @@ from gfm_hil.realtime.priority import processors
 from gfm_hil.results.report import PAGE
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
+from gfm_hil.studies.conformity.execute import PartResult
 from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, Case, all_limits, counted, load_cases, shipped_sets
 from gfm_hil.studies.conformity.verdict import (
@@ -96,6 +97,16 @@ def add(command: argparse.ArgumentParser) -> None:
         "--converter", metavar="FILE", help="the converter under test; the shipped one by default"
     )
     command.add_argument(
+        "--network", metavar="SCENARIO",
+        help="lay the tests over this network: network.grid is the point of connection, with line "
+        "and grid of the test behind it; of --converter what its owner declares counts",
+    )  # fmt: skip
+    command.add_argument(
+        "--judged", metavar="NAME",
+        help="of the --network: the converter that gets the --law and is judged; its first one, "
+        "with its own law, if not given",
+    )  # fmt: skip
+    command.add_argument(
         "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
     )
     command.add_argument(
@@ -126,7 +137,7 @@ def call(options: argparse.Namespace) -> int:
         return 0
     if options.recording is not None:
         return _recording(options)
-    if not options.law and options.controller is None:
+    if not options.law and options.controller is None and options.network is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
     laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
     folder = new_folder(options.out, "conform")
@@ -135,6 +146,7 @@ def call(options: argparse.Namespace) -> int:
         found = conform(
             laws, against, folder, inner=options.inner, converter=options.converter,
             controller=options.controller, ports=options.map,
+            network=options.network, judged=options.judged,
             workers=options.workers, figures=not options.no_figures, watch=watch,
         )  # fmt: skip
     if options.json:
@@ -147,8 +159,8 @@ def call(options: argparse.Namespace) -> int:
 
 def _recording(options: argparse.Namespace) -> int:
     """Judge a recording; returns the exit code."""
-    for name, given in (("law", options.law), ("controller", options.controller)):
-        if given:
+    for name in ("law", "controller", "network", "judged"):
+        if getattr(options, name):
             raise UserError(f"--{name}: goes not with --recording, which has no controller of ours")
     if options.map is None:
         raise UserError("--map: missing; it says what the channels of --recording are")
@@ -203,6 +215,13 @@ def _plain(case: Case) -> dict[str, Any]:
     return {"test": case.id, "runs": runs, "title": case.test.title, "source": source}
 
 
+def _why(part: PartResult) -> list[tuple[str, ...]]:
+    """Clause and text of all that is wrong, each once; the reason alone if there was no run."""
+    if part.status == "none":
+        return [(part.reason,)]
+    return [*dict.fromkeys((v.clause, v.text) for v in part.wrong)] or [(part.reason,)]
+
+
 def _print(result: Conformity, wall_s: float) -> None:
     """The short table that ends the command."""
     console = terminal()
@@ -214,7 +233,7 @@ def _print(result: Conformity, wall_s: float) -> None:
                 ": ".join(filter(None, [f.part, *said]))
                 for f in result.of(result.laws[0], case.id)
                 if f.verdict == verdict != PASS
-                for said in dict.fromkeys((v.clause, v.text) for v in f.wrong) or [(f.reason,)]
+                for said in _why(f)
             ]
             rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
         console.print(Table(("test", "", "why"), rows, text=None))
@@ -228,6 +247,8 @@ def _print(result: Conformity, wall_s: float) -> None:
     count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
     console.print(f"{told}; {runs}", highlight=False)
-    if not result.under.plant.model_fields_set - {"converter"}:
+    if result.network:
+        console.print(f"judged: {result.network}", highlight=False, soft_wrap=True)
+    elif not result.under.plant.model_fields_set - {"converter"}:
         text = f"converter under test: {result.under.plant.converter}, {result.under.instruments}"
         console.print(text, highlight=False, soft_wrap=True)

@@ -33,6 +33,7 @@ from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge, own_droop
 from gfm_hil.studies.conformity.criteria.plot import Plot
+from gfm_hil.studies.conformity.in_network import NetworkUnderTest
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
 from gfm_hil.studies.conformity.saturation import marked
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
@@ -90,6 +91,12 @@ class Job:
     # the model that computes u in place of the law, or None
     external: ControllerUnderTest | None = None
     start: SharedStart | None = None  # that of a model's run, which others have too
+    network: NetworkUnderTest | None = None  # over which the test is laid, or None
+
+    @property
+    def judged(self) -> str:
+        """In a network: the converter whose signals are judged; the first one if empty."""
+        return self.network.judged if self.network is not None else self.case.test.judged or ""
 
     @property
     def name(self) -> str:
@@ -179,6 +186,7 @@ def make_jobs(
     folder: Path | None,
     figures: bool,
     external: ControllerUnderTest | None = None,
+    network: NetworkUnderTest | None = None,
 ) -> list[Job]:
     """A job for each part of each test under each law, and then under the model, which begins at
     the operating point of the first law or, without laws, of that which a scenario has by default.
@@ -191,7 +199,19 @@ def make_jobs(
         each.append((external.name, start, external))
     declared = {file: declared_for(under, file) for _, file, _ in each}
     return [
-        Job(law, file, case, part, inner, declared[file], converters, folder, figures, model)
+        Job(
+            law,
+            file,
+            case,
+            part,
+            inner,
+            declared[file],
+            converters,
+            folder,
+            figures,
+            model,
+            network,
+        )
         for law, file, model in each
         for case in cases
         for part in case.test.runs()
@@ -296,7 +316,10 @@ def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
 
 def _scenario(job: Job) -> Scenario:
     """The scenario of a job. Raises UserError: it cannot be run."""
-    found = scenario_of(job.case, job.part, job.under, job.file, job.inner, job.converters)
+    about = job.file, job.inner, job.converters
+    if job.network is not None:
+        return job.network.scenario_of(job.case, job.part, *about)
+    found = scenario_of(job.case, job.part, job.under, *about)
     if job.external is None:
         return found
     if found.network is not None:
@@ -399,5 +422,5 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     if scenario.network is None:
         return run_in_memory(scenario), {}
     runs = run_network_in_memory(scenario)
-    name = job.case.test.judged or scenario.converters[0]
+    name = job.judged or scenario.converters[0]
     return runs[name], {other: run for other, run in runs.items() if other != name}

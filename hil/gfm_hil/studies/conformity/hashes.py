@@ -19,6 +19,7 @@ def file_hashes(
     cases: Iterable[Case],
     external: ControllerUnderTest | None,
     recorded: Iterable[Path] = (),
+    network: Path | None = None,
 ) -> dict[str, str]:
     """SHA-256 by what each file is.
 
@@ -29,6 +30,7 @@ def file_hashes(
         cases: the tests.
         external: a model beside the laws, or None.
         recorded: files of a recording that is judged.
+        network: scenario of the network over which the tests are laid, or None.
     """
 
     def each() -> Iterator[tuple[str, bytes]]:
@@ -43,6 +45,8 @@ def file_hashes(
             yield f"map {external.ports.name}", external.ports.read_bytes()
         for path in recorded:
             yield f"recording {path.name}", path.read_bytes()
+        if network is not None:
+            yield f"network {network.name}", network.read_bytes()
         yield f"converter under test {under_test.name}", under_test.read_bytes()
         yield f"converter {converter}", _named(converter, "gfm_plant", "converters")
         for case in cases:

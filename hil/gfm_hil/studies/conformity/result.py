@@ -64,6 +64,7 @@ class Conformity:
             which the two sides of a link compare as well.
         droops: by law, the droop that its clauses ask for, p.u./p.u.; inf: none.
         recordings: by what was recorded in place of a run of a law, how it was read.
+        network: which converter of which network is judged, in words; empty of one alone.
     """
 
     laws: list[str]
@@ -76,6 +77,7 @@ class Conformity:
     digests: dict[str, str] = field(default_factory=dict)
     droops: dict[str, float | None] = field(default_factory=dict)
     recordings: dict[str, str] = field(default_factory=dict)
+    network: str = ""
 
     @property
     def passed(self) -> bool:
@@ -120,6 +122,7 @@ class Conformity:
             "version": version("gfmhil"),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "inner": self.inner,
+            "network": self.network,
             "under_test": self.under.model_dump(mode="json", exclude_unset=True),
             "passed": self.passed,
             "machine": self.machine,
@@ -179,6 +182,7 @@ class Conformity:
         return [
             *own,
             ("inner stage", "the law's own" if self.inner is None else self.inner),
+            *([("network", self.network)] if self.network else []),
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),

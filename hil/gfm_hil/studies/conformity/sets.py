@@ -166,7 +166,7 @@ def _load_case(path: Path) -> Case:
     case = Case(f"{path.resolve().parent.name}/{path.stem}", path, test)
     for part in test.runs():
         if part.cannot is None:
-            content = _content(case, part, {})
+            content = content_of(case, part, {})
             _checked(path, Scenario, content, "scenario.")
             wrong = _mistakes(test, part, content)
             if wrong:
@@ -286,20 +286,20 @@ def scenario_of(
     run; one line a mistake."""
     test = case.test
     plant = under.plant.model_dump(mode="json", exclude_unset=True)
-    content = _content(case, part, plant)
+    content = content_of(case, part, plant)
     given = str(plant.get("converter", under.plant.converter))
-    content["plant"]["converter"] = _converter(given, test.f_n, 1.0, converters)
+    content["plant"]["converter"] = converter_at(given, test.f_n, 1.0, converters)
     members = content.get("network", {}).get("converters", {})
     for name, member in members.items():
         own = _merged({k: v for k, v in content["plant"].items() if k != "grid"},
                       member.get("plant", {}))  # fmt: skip
-        own["converter"] = _converter(given, test.f_n, test.ratings.get(name, 1.0), converters)
+        own["converter"] = converter_at(given, test.f_n, test.ratings.get(name, 1.0), converters)
         member["plant"] = own
     content |= {"law": law} | ({} if inner is None else {"inner": inner})
     return check_scenario(content, str(case.path))
 
 
-def _content(case: Case, part: TestPart, plant: dict[str, Any]) -> dict[str, Any]:
+def content_of(case: Case, part: TestPart, plant: dict[str, Any]) -> dict[str, Any]:
     """The scenario of a part as plain data, without a law."""
     base = _merged({"plant": plant, "link": {"type": "inproc"}}, case.test.scenario)
     content = _merged(base, part.scenario)
@@ -320,7 +320,7 @@ def _merged(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return made
 
 
-def _converter(given: str, f_n: float, rating: float, folder: Path) -> str:
+def converter_at(given: str, f_n: float, rating: float, folder: Path) -> str:
     """A converter at a nominal frequency and rating: itself, or a file in the folder."""
     nominal = load_converter(given)
     f_own = nominal.omega_n / (2 * math.pi)

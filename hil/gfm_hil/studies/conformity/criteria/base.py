@@ -137,6 +137,7 @@ class Clause(StrictSchema):
 
     whole_run: ClassVar[bool] = False  # it is about the whole run, whatever its events
     of_cut_run: ClassVar[bool] = False  # a run that ended early can be judged too
+    alone: ClassVar[str] = ""  # why it judges a converter alone only, and none of a network
     explains: ClassVar[int] = 2  # the failure of one with a smaller number explains those of others
     #: the verdicts that hold of a recording too coarse for more: of samples up to two cycles apart
     coarse: ClassVar[tuple[Outcome, ...]] = ()

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -26,6 +26,8 @@ class InEnvelope(Windowed):
     of the declared damping, inertia and reactance is expected to do. If none are declared they are
     measured, and p that stays inside is only ``consistent with itself``. The event at the time is a
     phase jump, a ramp of the grid's frequency or a jump of its short-circuit ratio."""
+
+    alone: ClassVar[str] = "an envelope is that of a converter alone behind its line"
 
     kind: Literal["in_envelope"] = Field(description="kind of criterion")
     longest_s: float = Field(0.0, ge=0, description="s that p may be beyond, in one piece")

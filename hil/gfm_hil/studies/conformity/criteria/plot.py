@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ class PlotPanel:
 class Plot(Clause):
     """A plot over frequency, measured by small sines of the grid. A part with such a criterion has
     no other one, and no events count."""
+
+    alone: ClassVar[str] = "a plot is the frequency scan of a converter alone"
 
     from_hz: float = Field(1.0, ge=0.01, description="lowest frequency of the plot, Hz")
     to_hz: float = Field(100.0, gt=0, description="highest frequency of the plot, Hz")
