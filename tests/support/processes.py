@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,14 +51,17 @@ def wait_for(what: Callable[[], Any], process: subprocess.Popen[str] | None = No
 
 
 @contextmanager
-def running(folder: Path, scenario: str, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """A run of a scenario's text into ``folder``, which takes commands; ends it as Ctrl-C does."""
+def running(
+    folder: Path, scenario: str, *options: str, converters: Sequence[str] = ("",)
+) -> Iterator[subprocess.Popen[str]]:
+    """A run of a scenario's text into ``folder``, which takes commands, of a network at all of its
+    ``converters``; ends it as Ctrl-C does."""
     file = folder.with_suffix(".toml")
     file.write_text(scenario, encoding="utf-8")
     command = [*GFMHIL, "run", str(file), "--out", str(folder), "--quiet", "--no-figures"]
     process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL, text=True)
     try:
-        wait_for(lambda: takes_commands(folder), process)
+        wait_for(lambda: all(takes_commands(folder / name) for name in converters), process)
         yield process
     finally:
         process.send_signal(signal.SIGINT)

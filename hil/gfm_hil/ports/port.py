@@ -72,14 +72,19 @@ class BesideRun:
         """Whether the port is to end at once."""
         return self._interrupt.came
 
+    @property
+    def places(self) -> dict[str, Path]:
+        """The run folders of a network's converters by their names, or that of one alone as ""."""
+        return {n: self.folder / n for n in converters_of(self.folder)} or {"": self.folder}
+
     def over(self) -> bool:
-        """Whether neither role is alive any more, or the port is to end. What cannot be examined
+        """Whether no role is alive any more, or the port is to end. What cannot be examined
         is reported, and not over."""
         now = time.monotonic()
         if not self._gone and now >= self._next_look:
             self._next_look = now + _LOOK_S
             try:
-                self._gone = not present(self.folder)
+                self._gone = not any(map(present, self.places.values()))
             except (OSError, UserError) as problem:
                 report("the look whether the run goes on", problem)
                 self._next_look = now + PAUSE_S
@@ -89,16 +94,16 @@ class BesideRun:
         """With ``--wait`` wait until the run records or, if it needs them, takes ``commands``.
         Raises KeyboardInterrupt: the port is to end."""
         there = present if commands else recorded
-        while self._patient and not there(self.folder):
+        while self._patient and not all(map(there, self.places.values())):
             if self.interrupted:
                 raise KeyboardInterrupt
             time.sleep(_LOOK_S)
         with contextlib.suppress(OSError):
             os.nice(_NICENESS)
 
-    def operator(self) -> Operator:
-        """An operator of the run. Raises UserError: no run is in progress."""
-        operator = Operator(self.folder, self._through)
+    def operator(self, place: Path) -> Operator:
+        """An operator of one of the places. Raises UserError: no run is in progress."""
+        operator = Operator(place, self._through)
         self._resources.callback(operator.close)
         return operator
 

@@ -64,7 +64,7 @@ async def ended(streams: Streams) -> bool:
 @asynccontextmanager
 async def served(bench: Bench):
     """A server of a simulated run; connects a client at each call."""
-    server = make_server(bench.device, ("127.0.0.1", 0))
+    server = make_server([bench.device], ("127.0.0.1", 0))
     await server.serve_forever(background=True)
     async with AsyncExitStack() as stack:
 
@@ -235,7 +235,7 @@ def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, a
 
     monkeypatch.setattr("gfm_hil.ports.port.present", lambda folder: look("look"))
     with Interrupt() as interrupt, BesideRun(tmp_path, "modbus", False, interrupt) as run:
-        run.serve_until(supervised("the clock", lambda: tick(Stub(), time.monotonic())))
+        run.serve_until(supervised("the clock", lambda: tick([Stub()], time.monotonic())))
     assert caplog.text.count("Too many open files") == 5
     attack_now("5 of 5 reported; clock and look go on to the end of the run")
 

@@ -276,7 +276,7 @@ def test_a_follower_that_fails_goes_on(tmp_path, monkeypatch, caplog, attack_now
 
     monkeypatch.setattr(RolePart, "open", sometimes)
     with Publisher("127.0.0.1", 0, 0) as publisher:
-        sent = publisher.follow(follower, 500.0, stopped)
+        sent = publisher.follow([follower], 500.0, stopped)
     assert sent == ticks
     assert "Too many open files" in caplog.text and "a mistake of ours" in caplog.text
     attack_now(f"2 of 2 reported; {sent} of {ticks} ticks sent on")

@@ -94,7 +94,7 @@ def recorded(tmp_path: Path) -> Follower:
 
 
 def test_quantiles_are_of_the_last_ten_seconds(recorded):
-    with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
+    with serve_metrics(RunCollector([recorded]), "127.0.0.1", 0) as port:
         found = scraped(port)
     assert found["gfmhil_ticks_total", "plant"] == 300_000
     assert found["gfmhil_misses_total", ""] == 500
@@ -110,7 +110,7 @@ def test_quantiles_are_of_the_last_ten_seconds(recorded):
 def test_a_run_without_a_tick_has_no_quantiles(tmp_path):
     (tmp_path / "scenario.toml").write_text('T_s = 1e-4\nmode = "realtime"\n', encoding="utf-8")
     RolePart.create(tmp_path, "plant", 10)
-    families = {m.name: m.samples for m in RunCollector(Follower(tmp_path)).collect()}
+    families = {m.name: m.samples for m in RunCollector([Follower(tmp_path)]).collect()}
     assert families["gfmhil_slack_seconds"] == families["gfmhil_round_trip_seconds"] == []
     assert [s.value for s in families["gfmhil_ticks"]] == [0.0]
 
@@ -121,7 +121,7 @@ def test_before_a_run_there_is_nothing_to_collect():
 
 
 def test_what_is_missing_is_said(capsys, refused, monkeypatch, recorded):
-    with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
+    with serve_metrics(RunCollector([recorded]), "127.0.0.1", 0) as port:
         words = ["stream", str(recorded.folder), "--port", "0", "--prometheus", str(port)]
         assert main(words) == 2
     assert f"--prometheus {port}: 127.0.0.1: Address already in use" in capsys.readouterr().err
@@ -173,7 +173,7 @@ def test_one_scraper_s_flood_leaves_room_for_another(recorded, spawn, monkeypatc
     monkeypatch.setattr(
         prometheus, "_times", lambda run: computed.append(time.monotonic()) or times(run)
     )
-    with serve_metrics(RunCollector(recorded), "127.0.0.1", 0) as port:
+    with serve_metrics(RunCollector([recorded]), "127.0.0.1", 0) as port:
         flood = spawn("-c", _FLOOD, str(port), "300")
         assert flood.stdout is not None and flood.stdout.readline() == "on\n"
         time.sleep(1.0)

@@ -61,7 +61,7 @@ CLIENT: ContextVar[Client | None] = ContextVar("client", default=None)
 
 
 class Device:
-    """A SunSpec device for one run.
+    """A SunSpec device for one run, of a network for that of one converter.
 
     Args:
         scenario: of the run.
@@ -70,6 +70,7 @@ class Device:
         command: sends a command to the run; called in a separate thread.
         heartbeat_ms: timeout of a client's heartbeat, 0: none.
         elapsed_s: time since the device was started, s.
+        unit: under which the device answers.
 
     Attributes:
         local: the bench commands; clients are refused.
@@ -83,7 +84,9 @@ class Device:
         command: Command,
         heartbeat_ms: int,
         elapsed_s: Callable[[], float],
+        unit: int = 1,
     ) -> None:
+        self.unit = unit
         self._look, self._command, self._elapsed_s = look, command, elapsed_s
         gains, self._measures = LawDroops(laws), Measures(scenario)
         rating = load_converter(scenario.plant.converter).bases.S_n
@@ -101,7 +104,7 @@ class Device:
         for group in self._groups:
             models |= group.layout
         self.image = Image(dict(sorted(models.items())))
-        self._show(self._measures.plate(laws))
+        self._show(self._measures.plate(laws, unit))
         self._lock = asyncio.Lock()
         self._was_safe = False
         self._beats, self._seen, self._second = 0, -1, 0

@@ -161,8 +161,8 @@ class Measures:
             VENDOR: {"ID": VENDOR, "NLaw": len(laws), "Laws": [{} for _ in laws]},
         }  # fmt: skip
 
-    def plate(self, laws: Sequence[str]) -> dict[str, Value]:
-        """The points that never change."""
+    def plate(self, laws: Sequence[str], unit: int) -> dict[str, Value]:
+        """The points that never change, of the device of a unit."""
         b = self._bases
         names = {f"{VENDOR}.Laws{k}.Nm": Path(name).name for k, name in enumerate(laws, 1)}
         island = self._scenario.plant.grid.load_R is not None
@@ -171,7 +171,8 @@ class Measures:
             "1.Md": "grid-forming converter, emulated",
             "1.Vr": version("gfmhil"),
             "1.SN": self._scenario.digest(),
-            "1.DA": 1.0,
+            "1.DA": float(unit),
+            "1.Opt": self._scenario.converter or "",
             "701.ACType": float(_THREE_PHASE),
             "701.DERMode": float(_GRID_FORMING),
             "702.VNomRtg": b.V_n,

@@ -12,6 +12,7 @@ import logging
 import ssl
 import struct
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ _LOOK_S = 0.1  # poll interval of what changes rarely
 _LOOKS = 10  # such polls per update of the slack
 _TIMER = Identity(through="modbus", name="timer")
 
-UNIT = 1
+MOST_UNITS = 247  # of Modbus; those of a network's converters count from 1, in their order
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), length of the rest, unit
 _LONGEST = 1024  # of unit and PDU; the specification allows 254, longer ones get an error answer
 _BUFFER = 64 * 1024
@@ -63,7 +64,7 @@ class ModbusPort(OperatorPort):
         "--anyone-may-command",
         "listen without TLS: every client that reaches the port can command the bench",
     )
-    commands = True
+    commands = networks = True
 
     def options(self, command: argparse.ArgumentParser) -> None:
         folder = next(a for a in command._actions if a.dest == "folder")
@@ -109,29 +110,21 @@ class ModbusPort(OperatorPort):
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
         run.wait()
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # clients get the errors
-        operator = run.operator()
-        scenario = load_scenario(str(run.folder / "scenario.toml"))
-        watcher = Watcher(operator, scenario.T_s)
-        run.first(watcher.look)
+        places = run.places
+        if len(places) > MOST_UNITS:
+            raise UserError(
+                f"{run.folder}: {len(places)} converters: Modbus has {MOST_UNITS} units"
+            )
         began = time.monotonic()
-
-        def command(event: dict[str, Any]) -> None:
-            client = CLIENT.get()
-            by = _TIMER if client is None else client.identity
-            if event["type"] == "stop":
-                operator.stop(by)
-            else:
-                operator.command(event, by)
-            watcher.forget()
-
-        device = Device(
-            scenario, operator.snapshot()["laws"], watcher.look, command, options.heartbeat,
-            lambda: time.monotonic() - began,
-        )  # fmt: skip
+        served = [
+            _served(run, place, unit, options.heartbeat, began)
+            for unit, place in enumerate(places.values(), 1)
+        ]
+        devices, units = [device for device, _ in served], [*enumerate(places, 1)]
 
         async def serve() -> None:
             try:
-                server = make_server(device, (options.host, options.port), self.tls)
+                server = make_server(devices, (options.host, options.port), self.tls)
                 await server.serve_forever(background=True)
             except (RuntimeError, OSError):
                 where = f"--host {options.host} --port {options.port}"
@@ -139,12 +132,13 @@ class ModbusPort(OperatorPort):
             try:
                 kind = "Modbus/TCP with TLS" if self.tls else "Modbus/TCP"
                 where = f"{options.host}:{server.peers.port}"
-                say(f"{kind} on {where}, unit {UNIT}, SunSpec from {BASE}")
+                named = (f"{unit} ({name})" if name else f"{unit}" for unit, name in units)
+                say(f"{kind} on {where}, unit {', '.join(named)}, SunSpec from {BASE}")
                 await asyncio.gather(
-                    supervised("the clock of the Modbus server", lambda: tick(device, began)),
+                    supervised("the clock of the Modbus server", lambda: tick(devices, began)),
                     supervised(
                         "the Modbus server's look at the run",
-                        lambda: watch(run.folder, device, watcher, server),
+                        lambda: watch(run.folder, served, server),
                     ),
                 )
             finally:
@@ -154,10 +148,41 @@ class ModbusPort(OperatorPort):
         return 0
 
 
+def _served(
+    run: BesideRun, place: Path, unit: int, heartbeat_ms: int, began: float
+) -> tuple[Device, Watcher]:
+    """The device of one place of a run, and what it sees of it. Raises UserError: no run is in
+    progress there."""
+    operator = run.operator(place)
+    scenario = load_scenario(str(place / "scenario.toml"))
+    watcher = Watcher(operator, scenario.T_s)
+    run.first(watcher.look)
+
+    def command(event: dict[str, Any]) -> None:
+        client = CLIENT.get()
+        by = _TIMER if client is None else client.identity
+        if event["type"] == "stop":
+            operator.stop(by)
+        else:
+            operator.command(event, by)
+        watcher.forget()
+
+    device = Device(
+        scenario, operator.snapshot()["laws"], watcher.look, command, heartbeat_ms,
+        lambda: time.monotonic() - began, unit,
+    )  # fmt: skip
+    return device, watcher
+
+
 def make_server(
-    device: Device, address: tuple[str, int], tls: ssl.SSLContext | None = None
+    devices: Sequence[Device], address: tuple[str, int], tls: ssl.SSLContext | None = None
 ) -> Server:
-    """The server of a device; raises OSError if the address cannot be bound."""
+    """The server of devices; raises OSError if the address cannot be bound."""
+    return Server([_registers(device) for device in devices], address, tls)
+
+
+def _registers(device: Device) -> SimDevice:
+    """A device as pymodbus serves it."""
 
     async def action(
         code: int, first: int, at: int, count: int, registers: list[int], written: Any
@@ -170,24 +195,28 @@ def make_server(
         return refused
 
     block = SimData(BASE, values=device.image.registers, datatype=DataType.REGISTERS)
-    return Server(SimDevice(id=UNIT, simdata=[block], action=action), address, tls)
+    return SimDevice(id=device.unit, simdata=[block], action=action)
 
 
-async def tick(device: Device, began: float) -> None:
-    """Let the device's clock tick; one tick makes up for those that were missed."""
+async def tick(devices: Sequence[Device], began: float) -> None:
+    """Let the devices' clocks tick; one tick makes up for those that were missed."""
     k = 0
     while True:
-        await device.clock()
+        for device in devices:
+            await device.clock()
         k = max(k + 1, int((time.monotonic() - began) / TICK_S))
         await asyncio.sleep(began + k * TICK_S - time.monotonic())
 
 
-async def watch(folder: Path, device: Device, watcher: Watcher, server: Server) -> None:
+async def watch(folder: Path, served: Sequence[tuple[Device, Watcher]], server: Server) -> None:
     """Poll what changes rarely; the clock does not depend on it."""
     while True:
-        device.slack = watcher.slack()
+        for device, watcher in served:
+            device.slack = watcher.slack()
         for _ in range(_LOOKS):
-            device.take((folder / LOCAL).exists())
+            local = (folder / LOCAL).exists()
+            for device, _watcher in served:
+                device.take(local)
             server.peers.reap()
             await asyncio.sleep(_LOOK_S)
 
@@ -279,14 +308,14 @@ class Connection(ServerRequestHandler):
 
     async def _answer(self, unit: int, frame: bytes) -> ModbusPDU:
         code = frame[0]
-        if unit != UNIT:
+        if unit not in self.server.units:
             return ExceptionResponse(code & 0x7F, ExcCodes.GATEWAY_NO_RESPONSE)
         if code not in (READ, WRITE_ONE, WRITE_MANY):
             return ExceptionResponse(code & 0x7F, ExcCodes.ILLEGAL_FUNCTION)
         request = self.framer.decoder.decode(frame)
         if request is None or (code != WRITE_MANY and len(frame) != 5):
             return ExceptionResponse(code, ExcCodes.ILLEGAL_VALUE)
-        answer = await request.datastore_update(self.server.context, UNIT)
+        answer = await request.datastore_update(self.server.context, unit)
         if code == WRITE_ONE and not answer.isError():  # echo the request, not the new value
             answer.address, *answer.registers = struct.unpack(">HH", frame[1:])
         if code != READ and not answer.isError():
@@ -295,7 +324,7 @@ class Connection(ServerRequestHandler):
 
 
 class Server(ModbusTcpServer):
-    """pymodbus' server of a device at a host and port, with these connections.
+    """pymodbus' server of devices at a host and port, with these connections.
 
     ``tls`` is a context that requires a certificate from clients; None: plain TCP.
 
@@ -304,9 +333,10 @@ class Server(ModbusTcpServer):
     """
 
     def __init__(
-        self, device: SimDevice, address: tuple[str, int], tls: ssl.SSLContext | None
+        self, devices: list[SimDevice], address: tuple[str, int], tls: ssl.SSLContext | None
     ) -> None:
-        super().__init__(device, address=address)
+        super().__init__(devices, address=address)
+        self.units = {device.id for device in devices}
         self.peers = Listener(*address, CLIENTS, HALF_OPEN_S, IDLE_S)
         # TLS carries the same frames; pymodbus' own TLS server takes one per record instead
         self.call_create = partial(

@@ -1,6 +1,7 @@
 """What a stream sends of new rows: samples of a few ticks, and blocks of all of them.
 
-A message has two parts, topic (``gfmhil/plant`` or ``gfmhil/controller``) and payload.
+A message has two parts, topic and payload. The topic is ``gfmhil/plant`` or ``gfmhil/controller``;
+in a network the name of the converter comes between, as in ``gfmhil/A/plant``.
 
 - A sample, in the format that PlotJuggler's ZeroMQ subscriber reads by default, is a JSON object
   whose numbers become series named by their path, such as ``gfmhil/plant/y/p``. Its number
@@ -46,11 +47,22 @@ class NewRows:
     # shape (n, columns), the units of the recording; NaN in ticks never recorded
     signals: NDArray[np.float64]
     times: NDArray[np.int64]  # shape (n, columns), int64, ns
+    converter: str = ""  # of a network: its name
+
+    @property
+    def topic(self) -> bytes:
+        """Under which messages of them are sent."""
+        return f"{_topic(self.converter)}{self.role}".encode()
 
     @property
     def columns(self) -> Columns:
         """The same by the names of the columns in a run folder."""
         return named(self.role, self.signals, self.times)
+
+
+def _topic(converter: str) -> str:
+    """How the topics of a network's converter begin, or of a run without a network."""
+    return f"{_TOPIC}{converter}/" if converter else _TOPIC
 
 
 @cache
@@ -95,7 +107,7 @@ class Sampler:
                 if math.isfinite(least):
                     sample["slack_us"] = round(least, 3)
                 self._least, begin = math.nan, k + 1
-            out.append([f"{_TOPIC}{rows.role}".encode(), json.dumps(sample).encode()])
+            out.append([rows.topic, json.dumps(sample).encode()])
         if plant:
             self._least = float(np.fmin.reduce(slack[begin:], initial=self._least))
         return out
@@ -131,7 +143,7 @@ def block_messages(rows: NewRows) -> list[list[bytes]]:
     for first in range(0, len(whole), _MOST):
         file = io.BytesIO()
         np.save(file, whole[first : first + _MOST], allow_pickle=False)
-        out.append([f"{_TOPIC}{rows.role}".encode(), file.getvalue()])
+        out.append([rows.topic, file.getvalue()])
     return out
 
 
@@ -141,6 +153,7 @@ class TickBlock:
 
     role: str  # ``"plant"`` or ``"controller"``
     rows: NDArray[np.void]  # record array, shape (n,); ``rows["tick"]`` shows gaps
+    converter: str = ""  # of a network: its name
 
 
 class BlockReader:
@@ -149,16 +162,19 @@ class BlockReader:
     Args:
         endpoint: the endpoint of blocks that ``gfmhil stream`` prints.
         role: ``"plant"`` or ``"controller"``; both if empty.
+        converter: of a network, one of its converters; all of them if both are empty.
     """
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, role: str = "") -> None:
+    def __init__(
+        self, endpoint: str = DEFAULT_ENDPOINT, role: str = "", converter: str = ""
+    ) -> None:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.set(zmq.RCVHWM, ROOM)
         self._socket.set(
             zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s, True).itemsize for s in ROLES)
         )
-        self._socket.subscribe(f"{_TOPIC}{role}")
+        self._socket.subscribe(f"{_topic(converter)}{role}")
         self._socket.connect(endpoint)
 
     def __enter__(self) -> BlockReader:
@@ -173,4 +189,5 @@ class BlockReader:
             return None
         topic, payload = self._socket.recv_multipart()
         rows = np.load(io.BytesIO(payload), allow_pickle=False)
-        return TickBlock(topic.decode().removeprefix(_TOPIC), rows)
+        converter, _, role = topic.decode().removeprefix(_TOPIC).rpartition("/")
+        return TickBlock(role, rows, converter)

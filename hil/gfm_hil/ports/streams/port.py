@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import zmq
@@ -23,7 +23,7 @@ from gfm_hil.recording.timing import ROUND_TRIP, SLACK, count_misses
 _LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
 _LOOK_S = 0.02
 _LINGER_MS = 500  # to send the last messages
-_LONGEST = 256  # bytes of a subscription; ours have 17
+_LONGEST = 256  # bytes of a subscription; ours have 17 and the name of a converter
 _WAITING = 100  # queued subscription messages per subscriber
 
 #: of Prometheus: label, if any, and meaning of each metric
@@ -42,6 +42,10 @@ METRICS = {
 class Follower:
     """Reads what a run records from now on.
 
+    Args:
+        folder: of the run.
+        converter: whose it is, in a network.
+
     Attributes:
         run: all that it has recorded.
         over: nothing will be recorded any more.
@@ -50,12 +54,12 @@ class Follower:
         UserError: it is not a run folder, or the run is over.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, converter: str = "") -> None:
         if (folder / "summary.json").is_file():
             raise UserError(f"{folder}: the run is over, see gfmhil export")
         if not begun(folder):
             raise UserError(f"{not_running(folder)}; --wait waits for one")
-        self.folder, self.run = folder, LiveRun(folder)
+        self.folder, self.converter, self.run = folder, converter, LiveRun(folder)
         self.T_s = self.run.T_s
         self._next = {role: self.run.done(role) for role in ROLES}
         self.over = False
@@ -69,7 +73,8 @@ class Follower:
         for role, part in self.run.parts.items():
             first, done = self._next[role], self.run.done(role) - (0 if over else _LAST)
             if done > first:
-                found.append(NewRows(role, first, part.signals[first:done], part.times[first:done]))
+                rows = part.signals[first:done], part.times[first:done]
+                found.append(NewRows(role, first, *rows, self.converter))
         self.over = over
         self._next |= {rows.role: rows.first + len(rows.signals) for rows in found}
         return found
@@ -111,27 +116,36 @@ class Publisher:
     def __exit__(self, *_: object) -> None:
         self._context.destroy(linger=_LINGER_MS)
 
-    def follow(self, follower: Follower, rate: float, stopped: Callable[[], bool]) -> int:
-        """Send a run's rows, and ``rate`` samples per second, until it ends or ``stopped()``;
-        returns how many ticks of the plant (without a plant: of the controller) were sent."""
-        sampler = Sampler(follower.T_s, rate, follower.misses_before())
+    def follow(
+        self, followers: Sequence[Follower], rate: float, stopped: Callable[[], bool]
+    ) -> int:
+        """Send the rows of a run, or of all converters of a network, and of each ``rate`` samples
+        per second, until all end or ``stopped()``; returns how many ticks of the plant (without a
+        plant: of the controller) were sent in all."""
+        samplers = {one: Sampler(one.T_s, rate, one.misses_before()) for one in followers}
         count: dict[Role, int] = dict.fromkeys(ROLES, 0)
         looked = time.monotonic()
 
         def look() -> None:
             nonlocal looked
             before, looked = looked, time.monotonic()
-            for rows in follower.news():
-                count[rows.role] += len(rows.signals)
-                for message in sampler.messages(rows, looked - before):
-                    self._samples.send_multipart(message)
-                for message in block_messages(rows):
-                    self._blocks.send_multipart(message)
+            for follower in (one for one in followers if not one.over):
+                for rows in follower.news():
+                    count[rows.role] += len(rows.signals)
+                    for message in samplers[follower].messages(rows, looked - before):
+                        self._samples.send_multipart(message)
+                    for message in block_messages(rows):
+                        self._blocks.send_multipart(message)
 
-        while not follower.over and not stopped():
+        while not all(one.over for one in followers) and not stopped():
             time.sleep(_LOOK_S)
             attempt("the stream's look at the run", look)
         return count["plant"] or count["controller"]
+
+
+def _followers(run: BesideRun) -> list[Follower]:
+    """Of all places of a run. Raises UserError: as ``Follower``."""
+    return [Follower(place, name) for name, place in run.places.items()]
 
 
 def _bind(
@@ -160,6 +174,7 @@ class StreamPort(OperatorPort):
     risk = "unencrypted"
     opens = "--plain", "listen beyond this machine: everybody there can read, nobody can command"
     early = 2
+    networks = True
 
     def options(self, command: argparse.ArgumentParser) -> None:
         command.add_argument(
@@ -184,7 +199,7 @@ class StreamPort(OperatorPort):
         super().check(options)
 
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
-        follower = None if options.wait else Follower(run.folder)
+        followers = [] if options.wait else _followers(run)
         following = options.port + 1 if options.port else 0
         blocks = following if options.blocks is None else options.blocks
         with contextlib.ExitStack() as stack:
@@ -199,9 +214,9 @@ class StreamPort(OperatorPort):
                 metrics = serve_metrics(collector, options.host, options.prometheus)
                 say(f"metrics: http://{options.host}:{stack.enter_context(metrics)}/metrics")
             run.wait(commands=False)
-            follower = follower or Follower(run.folder)
+            followers = followers or _followers(run)
             if collector is not None:
-                collector.follower = follower
-            ticks = publisher.follow(follower, options.rate, lambda: run.interrupted)
+                collector.followers = followers
+            ticks = publisher.follow(followers, options.rate, lambda: run.interrupted)
         print(f"{ticks} ticks sent on", file=sys.stderr)
         return INTERRUPTED if run.interrupted else 0

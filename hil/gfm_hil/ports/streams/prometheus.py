@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from socketserver import BaseServer, ThreadingMixIn
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
@@ -28,31 +28,40 @@ _QUEUE = 128  # connections that the kernel keeps until they are accepted
 _WINDOW_S = 10.0  # window of the quantiles, in the run's time
 
 
+_Family = CounterMetricFamily | GaugeMetricFamily
+_Values = tuple[str, Iterable[tuple[str, float]]]  # of a metric by name, by what its label says
+
+
 class RunCollector(Collector):
-    """The metrics of one run, for scrapes in any thread.
+    """The metrics of a run, of a network with the label ``converter``; for scrapes in any thread.
 
     Attributes:
-        follower: of the run; None before the run begins: there is nothing to collect.
+        followers: of the run, or of each converter; none before the run begins: there is nothing to
+            collect.
     """
 
-    def __init__(self, follower: Follower | None = None) -> None:
-        self.follower = follower
-        self._operator: Operator | None = None
+    def __init__(self, followers: Sequence[Follower] = ()) -> None:
+        self.followers = followers
+        self._operators: dict[Follower, Operator] = {}
         self._lock = threading.Lock()
         self._found: list[Metric] = []
         self._until = 0.0
 
     def close(self) -> None:
         """Close what ``collect`` has opened."""
-        if self._operator is not None:
-            self._operator.close()
+        for operator in self._operators.values():
+            operator.close()
 
     def collect(self) -> Iterator[Metric]:
         """The metrics, at most ``_FRESH_S`` old."""
         with self._lock:
-            if self.follower is not None and time.monotonic() > self._until:
-                of = self.follower
-                self._found = [*_counts(of.run), *_times(of.run), *_words(self._seen(of))]
+            if self.followers and time.monotonic() > self._until:
+                families: dict[str, _Family] = {}
+                for of in self.followers:
+                    seen = self._seen(of)
+                    for name, values in (*_counts(of.run), *_times(of.run), *_words(seen)):
+                        _put(families, name, values, of.converter)
+                self._found = [*families.values()]
                 self._until = time.monotonic() + _FRESH_S
             yield from self._found
 
@@ -60,8 +69,9 @@ class RunCollector(Collector):
         """The newest tick in words; laws by index if no command server gives their names."""
         seen: dict[str, Any] = {}
         with contextlib.suppress(UserError):  # no command server, or none yet
-            self._operator = self._operator or Operator(follower.folder)
-            seen = self._operator.snapshot()
+            if follower not in self._operators:
+                self._operators[follower] = Operator(follower.folder)
+            seen = self._operators[follower].snapshot()
         done = follower.run.done("controller")
         if done and not seen:
             row = follower.run.row("controller", done - 1)
@@ -69,22 +79,24 @@ class RunCollector(Collector):
         return seen
 
 
-def _metric(name: str, values: Iterable[tuple[str, float]]) -> Metric:
-    """A metric with its values by what its label says."""
+def _put(
+    families: dict[str, _Family], name: str, values: Iterable[tuple[str, float]], converter: str
+) -> None:
+    """Add values of a metric, by what its label says, and in a network by the converter."""
     label, text = METRICS[name]
     kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
-    metric = kind(name, text, labels=[label] if label else [])
+    labels = [*filter(None, ("converter" if converter else "", label))]
+    metric = families.setdefault(name, kind(name, text, labels=labels))
     for what, value in values:
-        metric.add_metric([what] if label else [], float(value))
-    return metric
+        metric.add_metric([converter] * bool(converter) + [what] * bool(label), float(value))
 
 
-def _counts(run: LiveRun) -> Iterator[Metric]:
-    yield _metric("gfmhil_ticks_total", [(role, run.done(role)) for role in run.parts])
-    yield _metric("gfmhil_misses_total", [("", run.misses)] if "plant" in run.parts else [])
+def _counts(run: LiveRun) -> Iterator[_Values]:
+    yield "gfmhil_ticks_total", [(role, run.done(role)) for role in run.parts]
+    yield "gfmhil_misses_total", [("", run.misses)] if "plant" in run.parts else []
 
 
-def _times(run: LiveRun) -> Iterator[Metric]:
+def _times(run: LiveRun) -> Iterator[_Values]:
     """Quantiles of slack and round trip over the newest ticks; in lockstep no slack."""
     if "plant" not in run.parts:
         return
@@ -96,15 +108,15 @@ def _times(run: LiveRun) -> Iterator[Metric]:
     ):
         found = duration.spread(run.columns, run.T_s, *window)
         values = [(f"{q:g}", found.percentile(100 * q) * 1e-9) for q in quantiles if found]
-        yield _metric(name, values)
+        yield name, values
 
 
-def _words(seen: dict[str, Any]) -> Iterator[Metric]:
+def _words(seen: dict[str, Any]) -> Iterator[_Values]:
     if "state" in seen:
-        yield _metric("gfmhil_state", [(name, name == seen["state"]) for name in STATES])
+        yield "gfmhil_state", [(name, name == seen["state"]) for name in STATES]
     for label, key in (("law", "law_title"), ("reason", "reason"), ("trip", "trip")):
         if key in seen:
-            yield _metric(f"gfmhil_{label}_info", [(str(seen[key]), 1.0)])
+            yield f"gfmhil_{label}_info", [(str(seen[key]), 1.0)]
 
 
 class _Request(WSGIRequestHandler):

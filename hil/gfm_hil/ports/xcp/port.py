@@ -229,7 +229,7 @@ class XcpPort(OperatorPort):
 
     def serve(self, run: BesideRun, options: argparse.Namespace) -> int:
         run.wait()
-        operator = run.operator()
+        operator = run.operator(run.folder)
 
         def now() -> dict[str, Any] | None:
             snapshot = operator.snapshot()
