@@ -106,14 +106,11 @@ def call(options: argparse.Namespace) -> int:
 
 
 def _was_stopped(run: Run | NetworkRun) -> bool:
-    """Whether an operator ended the run; of a network, where the other side of a controller that is
-    told first ends in SAFE, that of any converter."""
-    if not isinstance(run, NetworkRun):
-        return run.status == "interrupted"
-    return any(
-        one.status == "interrupted" or "was stopped" in str(one.summary.get("reason"))
-        for one in run.runs.values()
-    )
+    """Whether an operator ended the run; of a network a side of any converter, whose other side may
+    have ended in SAFE by that."""
+    if isinstance(run, NetworkRun):
+        return bool(run.summary["stopped"])
+    return run.status == "interrupted"
 
 
 def _ports(options: argparse.Namespace, network: bool) -> dict[str, int]:

@@ -189,6 +189,12 @@ def worst(lines: list[dict[str, Any]], outside: Outcome | None) -> Outcome:
     return next((o for o in found if o.reason.startswith(f"{first.reason}: ")), first)
 
 
+def was_stopped(lines: Sequence[dict[str, Any]]) -> bool:
+    """Whether somebody stopped a role, and not only the other one left it."""
+    ends = [e for e in lines if e["event"] == "end"]
+    return any(e["status"] == "interrupted" and e["reason"] not in _SECONDARY for e in ends)
+
+
 def unmet(
     scenario: Scenario, outcome: Outcome, log: Sequence[dict[str, Any]], done: int
 ) -> list[str]:

@@ -57,6 +57,7 @@ class NetworkRun(Mapping[str, Run]):
         return {
             "title": self.scenario.title,
             "status": self.status,
+            "stopped": any(run.summary.get("stopped", False) for run in self.values()),
             "unmet": [f"{n}: {part}" for n, run in self.items() for part in run.summary["unmet"]],
             "converters": {name: run.summary for name, run in self.items()},
         }

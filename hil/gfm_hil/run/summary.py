@@ -13,7 +13,7 @@ import numpy as np
 
 from gfm_hil.core.roles import OUR_CONTROLLER, Role, target_of
 from gfm_hil.recording.columns import INSTRUCTIONS, ColumnLike, Columns, pieces
-from gfm_hil.recording.log import Outcome, cause, unmet
+from gfm_hil.recording.log import Outcome, cause, unmet, was_stopped
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.recording.timing import ROUND_TRIP, DurationHistogram, count_misses
 from gfm_hil.run.doctor import verdict
@@ -109,6 +109,7 @@ def summarise(
         "title": scenario.title,
         "status": outcome.status,
         "reason": outcome.reason,
+        "stopped": was_stopped(log),
         "expected": scenario.expect,
         "unmet": unmet(scenario, outcome, log, done),
         "controller": controller,

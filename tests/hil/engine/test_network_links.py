@@ -127,7 +127,7 @@ def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path):
     assert "the controller of B was ended by SIGKILL" in said
     assert lost[0]["reason"] == "the controller's process is gone"
     a, b = signals(folder / "A"), signals(folder / "B")
-    assert summary(folder / "B")["status"] == "safe"
+    assert summary(folder / "B")["status"] == "safe" and not summary(folder / "B")["stopped"]
     assert len(a["y_p"]) == len(b["y_p"]) > before + 1000
     after = slice(before + 500, before + 1000)
     assert np.abs(b["true_i"][after]).max() == 0.0
@@ -173,9 +173,11 @@ def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path):
         a.stop()
         code, *_ = end(process)
         a.close(), b.close()
-    assert code == 130
+    assert code == 130 and summary(folder)["stopped"]
     for name in "AB":
-        assert summary(folder / name)["status"] == "interrupted"
+        assert (
+            summary(folder / name)["status"] == "interrupted" and summary(folder / name)["stopped"]
+        )
         (line,) = log(folder / name, "breaker")
         assert (line["tick"], line["by"]) == (closed["tick"], "operator")
     assert not log(folder / "A", "reference")
