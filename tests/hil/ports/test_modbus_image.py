@@ -72,7 +72,7 @@ def test_a_fault_of_ours_is_an_exception_for_the_client_and_not_silence(caplog):
 
     async def ask() -> bytes:
         block = SimData(BASE, values=[0] * 4, datatype=DataType.REGISTERS)
-        server = Server(SimDevice(id=1, simdata=[block], action=broken), ("127.0.0.1", 0), None)
+        server = Server([SimDevice(id=1, simdata=[block], action=broken)], ("127.0.0.1", 0), None)
         await server.serve_forever(background=True)
         reader, writer = await asyncio.open_connection("127.0.0.1", server.peers.port)
         writer.write(struct.pack(">HHHBBHH", 5, 0, 6, 1, 3, BASE, 2))
