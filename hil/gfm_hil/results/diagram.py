@@ -5,7 +5,6 @@ lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,28 +14,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
-from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.results.figures import as_svg, in_a_page
+from gfm_hil.results.single_line import Bar, bars_of, converters_of, give_rows
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
-from gfm_runtime import law_titles
 
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
 #: places of a report: the curves of one converter, and those of some beside each other
 OF, ONLY = "of-", "only="
-
-
-@dataclass
-class _Bar:
-    """A node: which converters come from the left, and what hangs on its right."""
-
-    column: int = 0
-    converters: list[str] = field(default_factory=list)
-    right: list[tuple[str, str, bool]] = field(default_factory=list)  # symbol, text, closed
-    rows: list[int] = field(default_factory=list)
 
 
 def draw_diagram(
@@ -71,10 +59,10 @@ def fill_diagram(
         leads_to: what the link of a converter has before its name: its chapter, or ``ONLY`` its
             curves among those of all.
     """
-    plants, laws, nodes = _converters(scenario)
-    bars, lines = _bars(scenario, nodes)
+    plants, laws, nodes = converters_of(scenario)
+    bars, lines = bars_of(scenario, nodes)
     faults = [event for event in scenario.events if isinstance(event, Fault)]
-    top = _give_rows(bars, lines)
+    top = give_rows(bars, lines)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
     figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -128,90 +116,7 @@ def _area(axes: Axes, x: tuple[float, float], y: float, url: str) -> None:
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 
 
-def _converters(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
-    """The plant, what results call the law, and the node of each converter, by its name."""
-    if scenario.network is None:
-        return {"": scenario.plant}, {"": law_titles([scenario.law])[scenario.law]}, {"": ""}
-    each = {name: scenario.of(name) for name in scenario.converters}
-    nodes = {name: member.node for name, member in scenario.network.converters.items()}
-    titles = law_titles(s.law for s in each.values())
-    laws = {name: titles[s.law] for name, s in each.items()}
-    return {name: s.plant for name, s in each.items()}, laws, nodes
-
-
-_Lines = dict[str, tuple[int, str, str, str, str, bool]]  #: row, start, end, symbol, text, closed
-
-
-def _bars(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, _Bar], _Lines]:
-    """The nodes with what is at them, and the lines between them."""
-    bars: dict[str, _Bar] = {}
-    for converter, node in nodes.items():
-        bars.setdefault(node, _Bar()).converters.append(converter)
-    grid, network = scenario.plant.grid, scenario.network
-    lines: _Lines = {}
-    at_grid: str | None = next(iter(bars))
-    if network is None:
-        if grid.load_R is not None:
-            text = f"local load\nR {grid.load_R:g} Ω, L {1e3 * (grid.load_L or 0.0):g} mH"
-            bars[next(iter(bars))].right.append(("load", text, True))
-    else:
-        at_grid = network.grid
-        each = [(name, one, getattr(one, "closed", True)) for _, name, one in network.components()]
-        for name, one, closed in each:
-            if hasattr(one, "start") and hasattr(one, "end"):
-                lines[name] = 0, one.start, one.end, one.symbol, one.label(), closed
-        for _, start, end, *_ in lines.values():
-            for node in (start, end):
-                bars.setdefault(node, _Bar())
-        for name, one, closed in sorted(each, key=lambda item: item[1].symbol == "capacitor"):
-            if hasattr(one, "node"):  # banks below the others
-                hanging = one.symbol, f"{name}\n{one.label()}", closed
-                bars.setdefault(one.node, _Bar()).right.append(hanging)
-    if at_grid is not None:
-        kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
-        f_g = grid.omega_g * nominal_frequency(scenario)
-        text = f"grid, {kind}\n$V_g$ {grid.V_g:g} p.u., {f_g:g} Hz"
-        bars.setdefault(at_grid, _Bar()).right.insert(0, ("~", text, True))
-    _give_columns(bars, lines, at_grid)
-    return bars, lines
-
-
-def _give_columns(bars: Mapping[str, _Bar], lines: _Lines, last: str | None) -> None:
-    """Put every node left of its neighbours on the way to the grid, which is last; those that a
-    line connects are in different columns."""
-    first = last or next(iter(bars))
-    away, front = {first: 0}, [first]
-    for here in front:
-        for _, start, end, *_ in lines.values():
-            other = {start: end, end: start}.get(here)
-            if other is not None and other not in front:
-                front.append(other)
-    for k, name in enumerate(front[1:], 1):
-        ends = [{start: end, end: start}.get(name) for _, start, end, *_ in lines.values()]
-        away[name] = 1 + max(away[other] for other in front[:k] if other in ends)
-    for name, bar in bars.items():
-        bar.column = max(away.values()) - away.get(name, 0)
-
-
-def _give_rows(bars: Mapping[str, _Bar], lines: _Lines) -> int:
-    """Give every node, and every line, rows of its own; returns how many there are.
-
-    Nodes at the right come first, so that wires to them pass above the others.
-    """
-    row, done = 0, set[str]()
-    for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
-        for line, (_, start, end, symbol, text, closed) in lines.items():
-            if {start, end} & done and name in (start, end):
-                lines[line] = row, start, end, symbol, text, closed
-                row += 1
-        count = max(1, len(bar.converters), len(bar.right))
-        bar.rows = [*range(row, row + count)]
-        row += count
-        done.add(name)
-    return row
-
-
-def _at(bar: _Bar) -> float:
+def _at(bar: Bar) -> float:
     return _BARS + _COLUMN * bar.column
 
 
@@ -328,7 +233,7 @@ def _fault(
     axes: Axes,
     scenario: Scenario,
     event: Fault,
-    bars: Mapping[str, _Bar],
+    bars: Mapping[str, Bar],
     spots: Mapping[str, tuple[float, float, float]],
 ) -> None:
     """A flash where the event puts its fault."""

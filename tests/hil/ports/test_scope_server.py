@@ -132,8 +132,11 @@ def test_a_page_asks_for_a_converter_of_a_network(tmp_path):
         "network": {
             "converters": {"A": {"node": "bus", "references": {"P_ref": 0.2}},
                            "B": {"node": "bus", "references": {"P_ref": 0.4}}},
-            "loads": {"base": {"node": "bus", "P": 0.6, "Q": 0.0}},
+            "loads": {"base": {"node": "bus", "P": 0.6, "Q": 0.0},
+                      "step": {"node": "bus", "P": 0.1, "closed": False},
+                      "other": {"node": "bus", "P": 0.1, "closed": False}},
         },
+        "events": [{"t": 0.05, "type": "breaker", "name": "step", "closed": True}],
     }  # fmt: skip
     run = gfmhil.run_network(given, tmp_path / "run", figures=False)
     scope = Scope([open_recording(run.folder / name) for name in run], Access())
@@ -142,6 +145,17 @@ def test_a_page_asks_for_a_converter_of_a_network(tmp_path):
             with connect(f"ws://127.0.0.1:{port}/socket{query}") as socket:
                 about = words(socket, "about")
                 assert (about["converter"], about["converters"]) == (name, ["A", "B"])
+                (bar,) = words(socket, "network")["bars"]
+                assert (bar["name"], bar["converters"]) == ("bus", ["A", "B"])
+                flows = words(socket, "flows")
+                for other, seen in flows["converters"].items():
+                    last = {key: run[other].signals[f"y_{key}"][-1] for key in ("p", "q", "V")}
+                    assert {key: seen[key] for key in last} == pytest.approx(last, abs=1e-5)
+                    f_hz = 50 * run[other].signals["y_omega_u"][-1]
+                    assert seen["omega_u"] == pytest.approx(f_hz, abs=1e-5)
+                    assert seen["state"] == "RUNNING"
+                closed = {"A": True, "B": True, "base": True, "step": True, "other": False}
+                assert flows["closed"] == closed
                 socket.send(json.dumps({**LOOK, "start": 0.0, "span": 0.1}))
                 frame = next(f for f in iter(lambda: socket.recv(10), None) if isinstance(f, bytes))
                 values = np.frombuffer(frame, "<f4", 2 * 63, 8 * len(HEAD)).reshape(2, 63)

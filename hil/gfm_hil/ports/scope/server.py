@@ -21,9 +21,11 @@ from websockets.http11 import Request, Response
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.supervised import supervised
 from gfm_hil.ports.listener import Listener
+from gfm_hil.ports.scope.flows import Flows
 from gfm_hil.ports.scope.recording import Recording
-from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session
+from gfm_hil.ports.scope.session import HEADERS, SEND_S, Access, Session, in_words
 from gfm_hil.ports.scope.watched import WatchedRun
+from gfm_runtime import LawError
 
 FRAMES_PER_S = 30
 _LOG_S = 0.25  # poll interval of the event log
@@ -73,6 +75,10 @@ class Scope:
         self._runs = {
             name: WatchedRun(record, others) for name, record in zip(names, records, strict=True)
         }
+
+        self._flows: Flows | None = None
+        with contextlib.suppress(LawError):  # its file may be gone
+            self._flows = Flows(self._runs) if others else None
 
     @property
     def _sessions(self) -> list[Session]:
@@ -157,6 +163,9 @@ class Scope:
             try:
                 await session.say("about", **run.about())
                 await session.say("events", **run.happened())
+                if self._flows is not None:
+                    await session.say("network", **self._flows.diagram)
+                    await session.say("flows", **self._flows.now())
                 await session.run()
             finally:
                 run.sessions.discard(session)
@@ -175,10 +184,14 @@ class Scope:
             await asyncio.sleep(due - loop.time())
 
     async def _follow_log(self) -> None:
-        """Send new events to the pages, and detect the ends of the runs."""
+        """Send new events, and what a network does, to the pages; detect the ends of the runs."""
         while True:
             for run in self._runs.values():
                 await run.follow_log()
+            if self._flows is not None and (sessions := self._sessions):
+                now = in_words("flows", **self._flows.now())
+                for session in sessions:
+                    session.post("flows", now)
             await asyncio.sleep(_LOG_S)
 
 

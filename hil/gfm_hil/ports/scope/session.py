@@ -154,7 +154,7 @@ class Session:
         self._rate = Rate("this page", PER_S, BURST)
         self._shown: ScopePicture | None = None
         self._played: tuple[float, float, float] | None = None  # start [ticks], speed, begin
-        self._news: str | None = None
+        self._news: dict[str, str] = {}  # by kind
         self._picture: bytes | None = None
         self._wake = asyncio.Event()
 
@@ -196,9 +196,9 @@ class Session:
         if self._picture is not None:
             self._wake.set()
 
-    def post(self, news: str) -> None:
-        """Queue a message; a newer one replaces one that has not been sent yet."""
-        self._news = news
+    def post(self, kind: str, news: str) -> None:
+        """Queue a message of a kind; a newer one replaces one that has not been sent yet."""
+        self._news[kind] = news
         self._wake.set()
 
     async def say(self, kind: str, **content: Any) -> None:
@@ -228,9 +228,9 @@ class Session:
         with contextlib.suppress(ConnectionClosed):
             while await self._wake.wait():
                 self._wake.clear()
-                news, self._news = self._news, None
-                if news is not None:
-                    await self._send(news)
+                news, self._news = self._news, {}
+                for text in news.values():
+                    await self._send(text)
                 if self._picture is not None:
                     await self._send(self._picture)
                     self._picture = None

@@ -50,7 +50,7 @@ class WatchedRun:
         if now != self._said:
             news = in_words("events", **now)
             for session in list(self.sessions):
-                session.post(news)
+                session.post("events", news)
         self._said = now
 
     def happened(self) -> dict[str, Any]:

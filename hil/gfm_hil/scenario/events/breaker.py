@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -12,6 +13,9 @@ from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario
+
+
+_WORDS = {"on": True, "off": False, "closes": True, "opens": False}  # with which a label ends
 
 
 class SynchroCheck(StrictSchema):
@@ -98,6 +102,21 @@ class LineBreaker(Switch):
 
     def switch(self, plant: gfm_plant.Network) -> None:
         gfm_plant.line_breaker(plant, self.name, self.closed, self.clearing)
+
+
+GRID = "grid"  # what `switched` calls the breaker of the grid
+
+
+def switched(line: Mapping[str, Any]) -> tuple[str, bool] | None:
+    """The part whose breaker a line of a run's log has switched, and whether it is closed now, by
+    the words of ``label`` and of the end of a synchro-check; None of any other line."""
+    if line.get("event", line.get("type")) not in ("breaker", "grid-breaker"):
+        return None
+    label = str(line.get("label", "")).removesuffix(", synchronous")
+    name, _, word = label.rpartition(" ")
+    if "refused" in line or word not in _WORDS:
+        return None
+    return (GRID if name == "grid breaker" else name), _WORDS[word]
 
 
 class GridBreaker(Switch):

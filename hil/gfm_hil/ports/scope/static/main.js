@@ -3,6 +3,7 @@
 import { Cursors } from "./cursors.js";
 import { Layouts, savePicture, saveTable } from "./desk.js";
 import { Events, OverviewMap } from "./events.js";
+import { Diagram } from "./diagram.js";
 import { decode, times } from "./frame.js";
 import { Knobs, WATCHED } from "./knobs.js";
 import { Link } from "./link.js";
@@ -19,6 +20,7 @@ const RATE_S = 2; // of the run, over which misses are counted for their rate
 
 const events = new Events(document.querySelector("#log ol"));
 let si = false, counted = []; // counted: [ticks done, misses] of late
+let diagram = null; // of a network
 let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
 let summary = null, reason = "", control = false, pictures = 0, told = 0, later = 0;
 
@@ -51,6 +53,12 @@ function heard(message) {
     permit();
     why();
     redraw();
+  } else if (message.kind === "network") {
+    diagram = new Diagram(message, about.converter);
+    get("network").lastElementChild.replaceChildren(diagram.element);
+    get("network").hidden = false;
+  } else if (message.kind === "flows") {
+    diagram?.show(message);
   } else if (message.kind === "error") {
     console.error(message.text);
   }

@@ -1,0 +1,75 @@
+"""What the scope's diagram of a network shows: its parts, what the converters do now, and which
+breakers are closed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from gfm_hil.ports.scope.watched import WatchedRun
+from gfm_hil.results.single_line import bars_of, converters_of, give_rows
+from gfm_hil.scenario.events.breaker import GRID, switched
+from gfm_runtime.states import STATES
+
+_SHOWN = ("p", "q", "V", "omega_u")  # channels; the last as a frequency, Hz
+
+
+class Flows:
+    """The diagram of a network and its newest tick.
+
+    Args:
+        runs: of its converters, by name.
+
+    Raises:
+        LawError: a law cannot be read, by whose title the diagram calls it.
+    """
+
+    def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
+        self._runs = runs
+        _, laws, nodes = converters_of(self._scenario)
+        bars, lines = bars_of(self._scenario, nodes)
+        rows = give_rows(bars, lines)
+        self._closed = {name: True for name in nodes} | {n: line[-1] for n, line in lines.items()}
+        found: list[dict[str, Any]] = []
+        for name, bar in bars.items():
+            hanging = []
+            for symbol, text, closed in bar.right:
+                part = text.partition("\n")[0] if symbol != "~" else GRID
+                self._closed[part] = closed
+                hanging.append({"name": part, "symbol": symbol})
+            found.append({
+                "name": name, "column": bar.column, "rows": bar.rows,
+                "converters": bar.converters, "right": hanging,
+            })  # fmt: skip
+        self.diagram = {
+            "rows": rows, "bars": found, "laws": laws,
+            "lines": [
+                {"name": name, "row": row, "start": start, "end": end, "symbol": symbol}
+                for name, (row, start, end, symbol, *_) in lines.items()
+            ],
+        }  # fmt: skip
+
+    @property
+    def _scenario(self) -> Any:
+        return next(iter(self._runs.values())).record.scenario
+
+    def now(self) -> dict[str, Any]:
+        """The newest tick of each converter, and whether the breaker of each part is closed."""
+        converters = {name: _newest(run) for name, run in self._runs.items()}
+        closed = dict(self._closed)
+        for line in next(iter(self._runs.values())).happened()["events"]:
+            if (change := switched(line)) is not None:
+                closed[change[0]] = change[1]
+        return {"converters": converters, "closed": closed}
+
+
+def _newest(run: WatchedRun) -> dict[str, Any]:
+    """What a converter does now: p, q, V in p.u. and f in Hz, the state and the misses so far; what
+    is not recorded is left out."""
+    pyramid, done = run.pyramid, run.pyramid.done
+    if not done:
+        return {}
+    values = {name: float(pyramid.values(name, done - 1, done)[0]) for name in _SHOWN}
+    found: dict[str, Any] = {name: round(x, 5) for name, x in values.items() if x == x}
+    state = run.record.columns.get("state")
+    if state is not None and 0 <= (code := float(state[done - 1 : done][0])) < len(STATES):
+        found["state"] = STATES[int(code)]
+    return found | {"misses": pyramid.misses(done)}

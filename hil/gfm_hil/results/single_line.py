@@ -1,0 +1,102 @@
+"""Where the parts of a single-line diagram stand: nodes in columns, each with its rows."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.scenario import Scenario
+from gfm_plant import Plant
+from gfm_runtime import law_titles
+
+
+@dataclass
+class Bar:
+    """A node: which converters come from the left, and what hangs on its right."""
+
+    column: int = 0
+    converters: list[str] = field(default_factory=list)
+    right: list[tuple[str, str, bool]] = field(default_factory=list)  # symbol, text, closed
+    rows: list[int] = field(default_factory=list)
+
+
+def converters_of(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
+    """The plant, what results call the law, and the node of each converter, by its name."""
+    if scenario.network is None:
+        return {"": scenario.plant}, {"": law_titles([scenario.law])[scenario.law]}, {"": ""}
+    each = {name: scenario.of(name) for name in scenario.converters}
+    nodes = {name: member.node for name, member in scenario.network.converters.items()}
+    titles = law_titles(s.law for s in each.values())
+    laws = {name: titles[s.law] for name, s in each.items()}
+    return {name: s.plant for name, s in each.items()}, laws, nodes
+
+
+Lines = dict[str, tuple[int, str, str, str, str, bool]]  #: row, start, end, symbol, text, closed
+
+
+def bars_of(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, Bar], Lines]:
+    """The nodes with what is at them, and the lines between them."""
+    bars: dict[str, Bar] = {}
+    for converter, node in nodes.items():
+        bars.setdefault(node, Bar()).converters.append(converter)
+    grid, network = scenario.plant.grid, scenario.network
+    lines: Lines = {}
+    at_grid: str | None = next(iter(bars))
+    if network is None:
+        if grid.load_R is not None:
+            text = f"local load\nR {grid.load_R:g} Ω, L {1e3 * (grid.load_L or 0.0):g} mH"
+            bars[next(iter(bars))].right.append(("load", text, True))
+    else:
+        at_grid = network.grid
+        each = [(name, one, getattr(one, "closed", True)) for _, name, one in network.components()]
+        for name, one, closed in each:
+            if hasattr(one, "start") and hasattr(one, "end"):
+                lines[name] = 0, one.start, one.end, one.symbol, one.label(), closed
+        for _, start, end, *_ in lines.values():
+            for node in (start, end):
+                bars.setdefault(node, Bar())
+        for name, one, closed in sorted(each, key=lambda item: item[1].symbol == "capacitor"):
+            if hasattr(one, "node"):  # banks below the others
+                hanging = one.symbol, f"{name}\n{one.label()}", closed
+                bars.setdefault(one.node, Bar()).right.append(hanging)
+    if at_grid is not None:
+        kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
+        f_g = grid.omega_g * nominal_frequency(scenario)
+        text = f"grid, {kind}\n$V_g$ {grid.V_g:g} p.u., {f_g:g} Hz"
+        bars.setdefault(at_grid, Bar()).right.insert(0, ("~", text, True))
+    _give_columns(bars, lines, at_grid)
+    return bars, lines
+
+
+def _give_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> None:
+    """Put every node left of its neighbours on the way to the grid, which is last; those that a
+    line connects are in different columns."""
+    first = last or next(iter(bars))
+    away, front = {first: 0}, [first]
+    for here in front:
+        for _, start, end, *_ in lines.values():
+            other = {start: end, end: start}.get(here)
+            if other is not None and other not in front:
+                front.append(other)
+    for k, name in enumerate(front[1:], 1):
+        ends = [{start: end, end: start}.get(name) for _, start, end, *_ in lines.values()]
+        away[name] = 1 + max(away[other] for other in front[:k] if other in ends)
+    for name, bar in bars.items():
+        bar.column = max(away.values()) - away.get(name, 0)
+
+
+def give_rows(bars: Mapping[str, Bar], lines: Lines) -> int:
+    """Give every node, and every line, rows of its own; returns how many there are.
+
+    Nodes at the right come first, so that wires to them pass above the others.
+    """
+    row, done = 0, set[str]()
+    for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
+        for line, (_, start, end, symbol, text, closed) in lines.items():
+            if {start, end} & done and name in (start, end):
+                lines[line] = row, start, end, symbol, text, closed
+                row += 1
+        count = max(1, len(bar.converters), len(bar.right))
+        bar.rows = [*range(row, row + count)]
+        row += count
+        done.add(name)
+    return row
