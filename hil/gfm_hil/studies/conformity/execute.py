@@ -200,18 +200,9 @@ def make_jobs(
     declared = {file: declared_for(under, file) for _, file, _ in each}
     return [
         Job(
-            law,
-            file,
-            case,
-            part,
-            inner,
-            declared[file],
-            converters,
-            folder,
-            figures,
-            model,
-            network,
-        )
+            law, file, case, part, inner, declared[file], converters, folder, figures, model,
+            network=network,
+        )  # fmt: skip
         for law, file, model in each
         for case in cases
         for part in case.test.runs()
