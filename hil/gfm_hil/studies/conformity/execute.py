@@ -200,7 +200,16 @@ def make_jobs(
     declared = {file: declared_for(under, file) for _, file, _ in each}
     return [
         Job(
-            law, file, case, part, inner, declared[file], converters, folder, figures, model,
+            law,
+            file,
+            case,
+            part,
+            inner,
+            declared[file],
+            converters,
+            folder,
+            figures,
+            model,
             network=network,
         )  # fmt: skip
         for law, file, model in each
