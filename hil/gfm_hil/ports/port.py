@@ -60,6 +60,7 @@ class BesideRun:
         self._interrupt = interrupt
         self._resources = contextlib.ExitStack()
         self._gone, self._next_look = False, 0.0
+        self._places: dict[str, Path] = {}  # once the scenario is there
 
     def __enter__(self) -> BesideRun:
         return self
@@ -75,7 +76,10 @@ class BesideRun:
     @property
     def places(self) -> dict[str, Path]:
         """The run folders of a network's converters by their names, or that of one alone as ""."""
-        return {n: self.folder / n for n in converters_of(self.folder)} or {"": self.folder}
+        if not self._places and (self.folder / "scenario.toml").is_file():
+            names = converters_of(self.folder) or [""]
+            self._places = {name: self.folder / name for name in names}
+        return self._places or {"": self.folder}
 
     def over(self) -> bool:
         """Whether no role is alive any more, or the port is to end. What cannot be examined

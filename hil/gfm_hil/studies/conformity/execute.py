@@ -211,7 +211,7 @@ def make_jobs(
             figures,
             model,
             network=network,
-        )  # fmt: skip
+        )
         for law, file, model in each
         for case in cases
         for part in case.test.runs()
