@@ -11,31 +11,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gfm_runtime.catalogue import LawSet
-from gfm_runtime.controller import (
-    MAX_STAGES,
-    control,
-    follow_plant,
-    make_controller,
-    missed,
-    set_reference,
-)
+from gfm_runtime.controller import MAX_STAGES, control, make_controller, set_reference
 from gfm_runtime.counts import begin_counts, calibrate_with
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
 from gfm_runtime.inner import settle
 from gfm_runtime.kernel import pack_law, state_dtype
-from gfm_runtime.signals import (
-    COUNTS,
-    INNER,
-    NU,
-    NU_COUNTS,
-    NU_INNER,
-    NY,
-    NY_COUNTS,
-    NY_INNER,
-    PLAIN,
-    REF_NAMES,
-)
+from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES
 from gfm_runtime.states import BAD_SENSOR, OK, READY, RUNNING, SAFE, STATES
 from gfm_runtime.tustin import DiscreteLaw, discretise
 
@@ -234,15 +216,3 @@ class Controller:
         """One tick from Python: y (5,) in, u (3,) in and out, p.u.; (11,) and (4,) with an inner
         stage, (21,) and (7,) with counts."""
         control(self.ctl, self.laws, self.states, self.est, y, u)
-
-
-def warm_up(controller: Controller) -> None:
-    """Compile every function of a tick, on copies, so that nothing compiles during a run."""
-    ctl, states = controller.ctl.copy(), controller.states.copy()
-    ctl["state"], ctl["request"] = RUNNING, ctl["active"]
-    follow_plant(ctl, False)
-    sizes = (NY, NU), (NY_INNER, NU_INNER), (NY_COUNTS, NU_COUNTS)
-    for n_y, n_u in sizes[: 1 + controller.inner]:
-        y, u = np.ones(n_y), np.ones(n_u)
-        control(ctl, controller.laws, states, controller.est.copy(), y, u)
-    missed(ctl)

@@ -16,11 +16,14 @@ the types of the process. The records of two sizes of plants, compiled by two pr
 have one name: a third process that loads both would call either for both. ``_Named`` adds what the
 arguments hold to the name.
 
-Both act on the functions that are decorated here and on no others: a program that imports us keeps
+A wheel may carry what numba would compile; ``_Cache`` looks there first (``wheel_code``).
+
+All act on the functions that are decorated here and on no others: a program that imports us keeps
 numba as it is.
 """
 
 import hashlib
+import inspect
 from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
@@ -32,6 +35,7 @@ from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 
 from gfm_runtime.deferred import DeferredDispatcher, Deferring, KeptResult
+from gfm_runtime.wheel_code import WheelCode, name_of
 
 #: where compiled functions, and constants that they contain, come from
 _PLACES = {
@@ -54,7 +58,7 @@ class _Named(Deferring):
 
 
 @cache
-def _digest() -> bytes:
+def sources() -> bytes:
     """A digest of all that may be compiled into a function."""
     digest = hashlib.sha256()
     for package, rooms in _PLACES.items():
@@ -65,6 +69,12 @@ def _digest() -> bytes:
                     if file.relative_to(folder).parts[0] not in _TEXT_ONLY:
                         digest.update(file.read_bytes())
     return digest.digest()
+
+
+@cache
+def wheel_code() -> WheelCode:
+    """The machine code that the wheel carries."""
+    return WheelCode(sources().hex())
 
 
 class _Index(IndexDataCacheFile):
@@ -82,11 +92,26 @@ class _Cache(FunctionCache):
     """numba's cache of a function, current as long as all our compiled code is the same."""
 
     _impl_class = KeptResult
+    links = False  # numba compiles a caller, into which it links the function
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        stamp = (self._impl.locator.get_source_stamp(), _digest())
+        source = self._impl.locator.get_source_stamp()
+        self._from = Path(inspect.getfile(function)).parent.name, self._impl.filename_base, source
+        stamp = (source, sources())
         self._cache_file = _Index(self._cache_path, self._impl.filename_base, stamp)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """As numba asks for it: from the wheel, or from its own cache."""
+        if self._enabled and not self.links:
+            key = self._index_key(sig, target_context.codegen())
+            kept = wheel_code().load(name_of(*self._from, key))
+            if kept is not None:
+                target_context.refresh()
+                found = self._impl.rebuild(target_context, kept)
+                found.entry_point.linkable = False
+                return found
+        return super().load_overload(sig, target_context)
 
 
 #: options of numba; a division by 0 gives infinity or NaN as in C, and no branch

@@ -124,6 +124,7 @@ class UnlinkedCode:
     def __init__(self, library: Any, fndesc: Any, env: Any, nrt: bool) -> None:
         self.library, self.fndesc, self.env, self.nrt = library, fndesc, env, nrt
         self.function: Any = None
+        self.linkable = True  # not what a wheel carries, which is machine code alone
 
     def make(self) -> None:
         """Make the machine code, with a function that takes the arguments from Python."""
@@ -223,6 +224,7 @@ class DeferredDispatcher(CPUDispatcher):
     _inside = False  # numba compiles a caller
     _insert: Any  # numba's, in C
     _cache: Any
+    _replaced: tuple[Any, ...] = ()  # Python goes on to call them
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """As numba asks for it where a function that it compiles calls this one."""
@@ -243,12 +245,15 @@ class DeferredDispatcher(CPUDispatcher):
     def compile(self, sig: Any) -> Any:
         """Compile for a signature, with machine code unless a compiled function asks."""
         with global_compiler_lock:
-            inside = self._inside
+            inside = self._cache.links = self._inside
+            args, _ = normalize_signature(sig)
+            found: Any = self.overloads.get(tuple(args))
+            if inside and found is not None and not found.entry_point.linkable:
+                self._replaced += (self.overloads.pop(tuple(args)),)
             entry: Any = super().compile(sig)
             if inside:
                 return entry
             if entry.function is None:
-                args, _ = normalize_signature(sig)
                 cres = self.overloads[tuple(args)]
                 entry.make()
                 self.add_overload(cres)

@@ -38,10 +38,10 @@ def test_any_change_of_compiled_code_makes_numba_compile_again():
     """A compiled function contains its callees, so its cache is as old as the oldest of them."""
     from gfm_hil.engine.plant_ticks import plant_ticks
     from gfm_plant import plant_sample
-    from gfm_runtime.compiled import _digest
+    from gfm_runtime.compiled import sources
     from gfm_runtime.kernel import step
 
-    digest = _digest()
+    digest = sources()
     stamps = [f._cache._cache_file._source_stamp for f in (plant_ticks, plant_sample, step)]
     assert [of_all for _, of_all in stamps] == [digest] * 3
     assert len({own for own, _ in stamps}) == 3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gfm_runtime import LawError, LawSet, discretise, get_law, law_names, load_law
-from gfm_runtime.assembly import Controller, warm_up
+from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import make_controller, missed, set_reference
 from gfm_runtime.signals import NU, NY, REF_NAMES, SIGNALS, Y_NAMES, group
 from gfm_runtime.states import (
@@ -307,11 +307,3 @@ def test_a_tick_is_the_kernels_step(name):
     for _ in range(10):
         c.step(y, u)
         np.testing.assert_array_equal(u, bare.step(REF, y))
-
-
-@pytest.mark.parametrize("real", [np.float64, np.float32])
-def test_warm_up_changes_nothing(real):
-    c = Controller([load_law("vsg-2"), load_law("dvoc")], T_S, list(REF), real=real)
-    before = [a.tobytes() for a in (c.ctl, c.laws, c.states, c.est)]
-    warm_up(c)
-    assert [a.tobytes() for a in (c.ctl, c.laws, c.states, c.est)] == before

@@ -23,6 +23,7 @@ from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
+from gfm_runtime.compiled import wheel_code
 
 #: a name for people, and what compiles the functions, or loads them from the cache
 Set = tuple[str, Callable[[], object]]
@@ -44,7 +45,8 @@ class _Listener(event.Listener):
 
 
 def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
-    """Compile sets of functions; ``notice`` is told of each set that numba has not in its cache.
+    """Compile sets of functions; ``notice`` is told of each set that numba has not in its cache,
+    and before the first of them why the wheel's code does not serve, where it has some.
 
     Returns:
         How many sets those were.
@@ -52,6 +54,8 @@ def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
     compiled = 0
     for k, (name, compile_set) in enumerate(sets, 1):
         text = f"compiling {name} ({k} of {len(sets)}, once a machine) …"
+        if not compiled and (why := wheel_code().unfit):
+            text = f"the code in this wheel is not used ({why})\n{text}"
         listener = _Listener(lambda text=text: notice(text))  # type: ignore[misc]
         with event.install_listener("numba:compile", listener):
             compile_set()

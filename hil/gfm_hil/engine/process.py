@@ -26,7 +26,7 @@ from gfm_hil.engine.setup import Bench, make_benches
 from gfm_hil.engine.snapshot import restore_external
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, open_link, pump
-from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter, judge
+from gfm_hil.links.frame import DATA_IDS, FrameReader, FrameWriter
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.realtime.prevent_idle import prevent_idle
 from gfm_hil.realtime.priority import (
@@ -38,11 +38,8 @@ from gfm_hil.realtime.priority import (
 )
 from gfm_hil.recording.log import SEVERITY, Outcome
 from gfm_hil.recording.parts import RolePart, keep_in_memory
-from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.scenario import Scenario, write_scenario
 from gfm_hil.scenario.events.gains import gains_of
-from gfm_plant import plant_command, plant_sample, plant_step
-from gfm_runtime.assembly import warm_up
 from gfm_runtime.signals import carried
 
 
@@ -268,23 +265,11 @@ def _meet(
 
 
 def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
-    """Compile (or load from cache) every function that a tick calls, on copies."""
-    bench, part = benches[0], parts[0]
-    plant, y, u = bench.plant.copy().records, bench.y.copy(), bench.u.copy()
-    plant_sample(plant, 0, y)
-    plant_step(plant)
-    plant_command(plant, 0, u)
-    warm_up(bench.controller)
+    """Compile (or load from cache) every function that Python calls for a side; those that only
+    these call become part of them."""
+    inner = benches[0].inner
     for group in DATA_IDS:
-        values = np.zeros(len(carried(group, bench.inner)))
-        reader, writer = FrameReader(group, bench.inner), FrameWriter(group, bench.inner)
-        reader.unpack(writer.pack(0, 0, 0, values), values)
-        judge(reader.record, False, False)
+        values = np.zeros(len(carried(group, inner)))
+        FrameReader(group, inner).unpack(FrameWriter(group, inner).pack(0, 0, 0, values), values)
     compile_loops(role, benches, parts)
     pump.warm_up()
-    if role == "plant":
-        record_sample(part.signals[0].copy(), y, plant, 0)
-        record_command(part.signals[0].copy(), u)
-    else:
-        c = bench.controller
-        record_controller(part.signals[0].copy(), c.ctl, c.states, c.est)

@@ -1,0 +1,78 @@
+"""A wheel with compiled code and an sdist, built, checked, and installed where nothing else is."""
+
+import os
+import platform
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from gfm_runtime.wheel_code import TARGETS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+pytestmark = [
+    pytest.mark.systems,
+    pytest.mark.timeout(1500),  # it compiles and installs; 2 minutes where nothing else runs
+    pytest.mark.skipif(platform.machine() not in TARGETS, reason="no wheel is for it"),
+]
+
+
+def _done(*command: object, **environment: str) -> str:
+    done = subprocess.run(
+        list(map(str, command)), cwd=ROOT, env={**os.environ, **environment}, check=False,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A wheel that carries what pref_step calls."""
+    folder = tmp_path_factory.mktemp("dist")
+    _done(ROOT / ".ci" / "wheel", folder, "pref_step", PYTHON=sys.executable)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def test_the_wheel_is_for_one_python_and_machine_and_its_metadata_is_good(built):
+    python = f"cp{sys.version_info.major}{sys.version_info.minor}"
+    assert built.name.endswith(f"-{python}-{python}-manylinux_2_27_{platform.machine()}.whl")
+    _done(sys.executable, "-m", "twine", "check", "--strict", built)
+    names = zipfile.ZipFile(built).namelist()
+    assert "gfm_runtime/wheel_code.bin" in names
+    assert not [name for name in names if name.endswith((".so", ".pyc", ".nbi", ".nbc"))]
+
+
+def test_the_sdist_builds_the_wheel_for_every_python(tmp_path):
+    _done(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path)
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    _done(sys.executable, "-m", "twine", "check", "--strict", sdist)
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "out", filter="data")
+    (source,) = (tmp_path / "out").iterdir()
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name.endswith("-py3-none-any.whl")
+
+
+def test_in_a_fresh_environment_the_first_run_compiles_nothing(built, tmp_path):
+    _done(sys.executable, "-m", "venv", tmp_path / "venv")
+    python = tmp_path / "venv" / "bin" / "python"
+    lock = ROOT / "requirements" / "container.txt"
+    _done(python, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", lock)
+    _done(python, "-m", "pip", "install", "--quiet", "--no-deps", built)
+    _done(python, "-m", "pip", "check")
+    cache, gfmhil = tmp_path / "cache", [python, "-P", "-m", "gfm_hil"]
+    said = _done(*gfmhil, "run", "pref_step", "-o", tmp_path / "run", NUMBA_CACHE_DIR=str(cache))
+    assert "completed" in said and "compiling" not in said
+    assert not list(cache.rglob("*.nb[ic]"))
+    said = _done(*gfmhil, "run", "pref_step", "-o", tmp_path / "again",
+                 NUMBA_CACHE_DIR=str(cache), NUMBA_CPU_NAME="generic")  # fmt: skip
+    assert "not used (NUMBA_CPU_NAME asks for generic)" in said and "compiling the plant" in said
