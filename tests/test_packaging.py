@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -92,6 +93,12 @@ def test_a_plain_install_has_all_that_the_plant_imports():
         names - set(sys.stdlib_module_names) - {"gfm_plant", "gfm_runtime", *OF_THE_SAME_PROJECT}
     )
     assert {canonicalize_name(name) for name in foreign} <= installed
+
+
+def test_the_citation_names_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    said = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert (said["version"], said["license"]) == (project["version"], project["license"])
 
 
 @pytest.mark.parametrize("package", FOLDERS)

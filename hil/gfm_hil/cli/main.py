@@ -122,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in _EARLIER:
         now = _EARLIER[given[0]]
-        note = f"is gfmhil {now} now; this name goes with version 0.3"
+        note = f"is gfmhil {now} now; this name goes with version 2"
         print(f"gfmhil {given[0]}: {note}", file=sys.stderr)
         given[0] = now
     for text in given:

@@ -88,6 +88,10 @@ class _TripEntry(_Said):
     reason: str
 
 
+class _Written(_Said):
+    version: str = "0.1"  # the first one did not say it
+
+
 class Summary(_Said):
     """What summary.json must be, as far as anything relies on it."""
 
@@ -167,6 +171,12 @@ def read_summary(folder: Path, ticks: int) -> dict[str, Any]:
     """The content of the summary.json of a run of so many ticks. Raises FileNotFoundError: the run
     is not over, or was killed; UserError: the file is not a summary."""
     return read_json(folder / "summary.json", Summary, most_bytes(ticks))
+
+
+def written_by(folder: Path) -> str:
+    """The version of gfmhil that wrote a run's folder. Raises as ``read_summary``."""
+    said = read_json(folder / "summary.json", _Written, most_bytes(0))
+    return str(said.get("version", "0.1"))
 
 
 def cause(reasons: list[str]) -> str:

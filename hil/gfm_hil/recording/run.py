@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -29,11 +30,12 @@ from gfm_hil.recording.columns import (
     describe,
     pieces,
 )
-from gfm_hil.recording.log import most_bytes, read_events, read_summary
+from gfm_hil.recording.log import most_bytes, read_events, read_summary, written_by
 from gfm_hil.recording.npz import Column, open_npz
 from gfm_hil.recording.waveforms import three_phase
 from gfm_hil.scenario import Scenario, look_beside
 from gfm_plant import CONNECTION, Bases, load_converter
+from gfm_runtime.errors import printable
 from gfm_runtime.toml_file import read_toml
 
 _NOT_METRICS = ("t", "tick", "type", "label")
@@ -134,9 +136,17 @@ class Run:
         """A run from its folder; no column is read yet.
 
         Raises:
-            UserError: it is no run folder, the run is not over, or a file is damaged.
+            UserError: it is no run folder, the run is not over, or a file is damaged or of an
+                earlier version that cannot be read any more.
         """
         folder = Path(folder)
+        try:
+            return cls._loaded(folder)
+        except UserError as problem:
+            raise UserError(f"{problem}{_written_by_another(folder)}") from None
+
+    @classmethod
+    def _loaded(cls, folder: Path) -> Self:
         try:
             columns, timing, laws = read_recording(folder)
             ticks = len(columns["tick"])
@@ -329,6 +339,15 @@ def bases(scenario: Scenario) -> Bases:
 def nominal_frequency(scenario: Scenario) -> float:
     """Nominal frequency of the scenario's converter, Hz; raises as ``bases``."""
     return bases(scenario).omega_b / (2 * math.pi)
+
+
+def _written_by_another(folder: Path) -> str:
+    """What a refusal adds if another version of gfmhil has written the folder."""
+    try:
+        then, now = printable(written_by(folder))[:40], version("gfmhil")
+    except (OSError, UserError):
+        return ""
+    return "" if then == now else f"; gfmhil {then} has written it, and this is {now}"
 
 
 def read_scenario(folder: Path) -> Scenario:

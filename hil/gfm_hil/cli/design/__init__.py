@@ -5,7 +5,7 @@ import argparse
 from gfm_hil.cli.design import clearing, gains, latency, loop, margins, sweep
 from gfm_hil.core.errors import UserError
 
-#: commands of version 0.1 that are scripts of the repository now; the note goes with version 0.3
+#: commands of version 0.1 that are scripts of the repository now; the note goes with version 2
 _MOVED = {"compare": "law_comparison", "box": "deployable check", "deploy": "deployable tune"}
 
 
