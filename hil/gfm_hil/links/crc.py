@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from llvmlite import binding, ir
 from numba import types
+from numba.core import config
 
 from gfm_hil.realtime.atomics import intrinsic, load32, load64
 from gfm_runtime.compiled import inlined
@@ -116,5 +117,13 @@ def crc32_by_folding(message, count):
     return crc ^ _four(np.uint32(high), 4) ^ _four(np.uint32(high >> _HALF), 0) ^ _ONES
 
 
-#: the variant for this processor; numba's cache is per processor too
-crc32: Any = crc32_by_folding if binding.get_host_cpu_features().get("pclmul") else crc32_by_tables
+def _folds() -> bool:
+    """Whether numba compiles for a processor with PCLMULQDQ; its cache is per processor too."""
+    asked: str | None = vars(config)["CPU_FEATURES"]  # NUMBA_CPU_FEATURES; empty for a generic one
+    if asked is not None:
+        return "+pclmul" in asked.split(",")
+    return bool(binding.get_host_cpu_features().get("pclmul"))
+
+
+#: the variant for this processor
+crc32: Any = crc32_by_folding if _folds() else crc32_by_tables

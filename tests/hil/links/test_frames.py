@@ -1,5 +1,8 @@
 """Frames: each arrives unchanged or not at all, every fault counts under its name; their CRC."""
 
+import os
+import subprocess
+import sys
 import zlib
 from importlib.resources import files
 
@@ -162,3 +165,12 @@ def test_the_header_for_c_is_of_this_signal_table():
     header = files("gfm_hil.controllers").joinpath("gfmhil_frames.h").read_text("utf-8")
     assert f"GFMHIL_TABLE_VERSION = {TABLE_VERSION}," in header
     assert f'#define GFMHIL_TABLE "\\"{table_hash()}\\""' in header
+
+
+def test_the_crc_is_that_of_the_processor_that_numba_compiles_for():
+    code = "from gfm_hil.links import crc; print(crc.crc32 is crc.crc32_by_tables)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "NUMBA_CPU_NAME": "generic"},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == "True\n"
