@@ -1,7 +1,8 @@
 """Files that earlier versions of gfmhil have written: they are opened, or one line says why not.
 
 ``tests/files/earlier`` holds them as the commits of November 2026 left them; that run folder is of
-commit 99fa589a, whose recording lacked a column of today's.
+commit 99fa589a, whose recording lacked a column of today's. ``run-of-1.0.0`` is of that
+version; its digest is the one it had then.
 """
 
 import json
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import gfmhil
+from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import Run
 from gfm_hil.scenario.loading import load_scenario
@@ -47,3 +49,12 @@ def test_a_run_that_cannot_be_read_is_refused_with_both_versions(tmp_path, then)
 def test_an_export_refuses_it_in_one_line(refused, tmp_path):
     out = str(tmp_path / "run.csv")
     assert "gfmhil 0.1 has written it" in refused("export", str(RUN), "--out", out)
+
+
+def test_a_run_of_1_0_0_opens_and_is_exported(tmp_path):
+    run = Run.load(EARLIER / "run-of-1.0.0")
+    assert run.summary["version"] == "1.0.0" and len(run.columns["tick"]) == 500
+    assert run.digest == "0328340864f8ad4cfcd1bcc24cd9f7da3c7f8c6e0083dadfbc0d6d0afb342202"
+    out = tmp_path / "run.csv"
+    assert main(["export", str(run.folder), "--out", str(out)]) == 0
+    assert "p" in out.read_text().splitlines()[0]
