@@ -18,6 +18,7 @@ from gfm_hil.scenario.events.breaker import SynchroCheck
 from gfm_hil.scenario.expectation import END_REASONS
 from gfm_plant import options
 from gfm_plant.components import COMPONENTS, FiniteGrid
+from gfm_plant.components.synchronous_machine import ROLES
 from gfm_runtime import inner, law, lawfile
 
 
@@ -46,6 +47,11 @@ NETWORK_TABLES: tuple[tuple[str, type[BaseModel]], ...] = (
     ("[network]", scenario.NetworkSettings),
     ("[network.converters.NAME]", scenario.NetworkConverter),
     *((f"[network.{table}.NAME]", kind) for table, kind in COMPONENTS.items()),
+    *(
+        (f"{role} of [network.synchronous_machines.NAME], type {kind.kind()}", kind)
+        for role, (_, kinds) in ROLES.items()
+        for kind in kinds
+    ),
 )
 CHECK = ("check", SynchroCheck)
 OVERLOAD = ("[[plant.protection.overload]]", options.Overload)

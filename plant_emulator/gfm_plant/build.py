@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from gfm_plant.bridge import TOPOLOGIES, bands
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.line import Line
 from gfm_plant.components.part import Component, Dynamic, Fed, emf
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.swing import pack_swing
@@ -142,7 +144,7 @@ def _make(
         tuple(units),
         (*branches, *(part for part in passive if isinstance(part, Branch))),
         tuple(part for part in passive if isinstance(part, Shunt)),
-        tuple(part for part in passive if isinstance(part, Capacitor)),
+        _together(each, grid_node),
         tuple(fed),
         grid_node,
         opened=opened,
@@ -179,6 +181,22 @@ def _make(
     now["V_g"] = now["V_g_to"] = grid.V_g
     network.connect(wiring)
     return network
+
+
+def _together(
+    each: Sequence[tuple[str, str, Component]], grid_node: str | None
+) -> tuple[Capacitor, ...]:
+    """One capacitor for all at a node, with the name of the first; the charging of lines at the
+    node of the grid changes nothing there."""
+    found: dict[str, Capacitor] = {}
+    for _, name, part in each:
+        for one in part.elements(name):
+            if isinstance(one, Capacitor) and not (
+                isinstance(part, Line) and one.node == grid_node
+            ):
+                before = found.get(one.node)
+                found[one.node] = one if before is None else replace(before, C=before.C + one.C)
+    return tuple(found.values())
 
 
 def _network(

@@ -117,6 +117,13 @@ def with_synchronous_machine(place: Path | None = None) -> Scenario:
     return island(**{**MACHINE, **parts})
 
 
+def with_controls(place: Path | None = None) -> Scenario:
+    saturated = {"E_1": 1.0, "S_E1": 0.04, "E_2": 2.0, "S_E2": 0.33}
+    controls = {"avr": {"type": "IEEET1", **saturated}, "governor": {"D_t": 0.1}, "pss": {}}
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, **controls}
+    return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
+
+
 def with_finite_grid(place: Path) -> Scenario:
     return scenario({**THREE, "grid": "far"}, plant={"grid": {**FINITE, "V_g": 1.02}})
 
@@ -154,7 +161,16 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
 
 @pytest.mark.full  # compiles the loop of several converters
 @pytest.mark.parametrize(
-    "of", [island, two_islands, with_machine, with_synchronous_machine, with_finite_grid, with_pll]
+    "of",
+    [
+        island,
+        two_islands,
+        with_machine,
+        with_synchronous_machine,
+        with_controls,
+        with_finite_grid,
+        with_pll,
+    ],
 )
 @pytest.mark.parametrize("reference", ["P_ref", "V_ref"])
 def test_a_step_is_that_of_the_nonlinear_bench(of, reference, tmp_path):

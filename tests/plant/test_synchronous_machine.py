@@ -7,18 +7,25 @@ import pytest
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.signal import tf2ss
 
 from gfm_plant import Network, NetworkParts, Plant, make_network, plant_command, plant_step
 from gfm_plant.components import SynchronousMachine
-from gfm_plant.components.synchronous_machine import E_FD, V_M
+from gfm_plant.components.synchronous_machine import AVR
 from gfm_plant.grid import fault, line_breaker
 from gfm_plant.model import DELTA, V_DC
 from gfm_plant.names import TRIPS
 from gfm_plant.steady_state import NoEquilibrium
 
 OFF = {name: {"enabled": False} for name, *_ in TRIPS}
-DATA = {"node": "m", "S": 2.0, "H": 0.8, "P": 0.4, "V": 1.01, "D": 0.5, "T_gov": 0.2, "R": 0.004}
-AVR = {"K": 20.0, "T_A": 0.4, "T_B": 1.5}
+DATA = {"node": "m", "S": 2.0, "H": 0.8, "P": 0.4, "V": 1.01, "D": 0.5, "R": 0.004}
+SEXS = {"K": 20.0, "T_A": 0.4, "T_B": 1.5}
+# every control by its standard names; the exciter saturates at this rest
+CONTROLLED: dict[str, Any] = {
+    "avr": {"type": "IEEET1", "E_1": 1.0, "S_E1": 0.04, "E_2": 2.0, "S_E2": 0.33},
+    "governor": {"R": 0.04, "T1": 0.2, "T2": 0.6, "T3": 2.0, "D_t": 0.1},
+    "pss": {"T6": 0.01, "A1": 0.02, "A2": 2e-4},
+}
 
 
 def make(T_s: float = 1e-4, **more: Any) -> Network:
@@ -91,6 +98,61 @@ class Windings:
         ])  # fmt: skip
 
 
+class Simple:
+    """SEXS, or a constant excitation, and the governor of one lag: states P, V_m, x, E_fd."""
+
+    def __init__(self, one: SynchronousMachine, E_fd: float, P: float) -> None:
+        self.avr, self.P = one.avr, P
+        ahead = E_fd / self.avr.K if self.avr else 0.0
+        self.V_set, self.start = 1.01 + ahead, [P, 1.01, ahead, E_fd]
+
+    def given(self, c: np.ndarray, w: float) -> tuple[float, float, float]:
+        """V_m, E_fd and the torque of the turbine."""
+        return c[1], c[3], c[0]
+
+    def slope(self, c: np.ndarray, V: float, w: float) -> list[float]:
+        P, V_m, x, E_fd = c
+        if not (avr := self.avr):
+            return [(self.P - w / 0.05 - P) / 0.2, 0.0, 0.0, 0.0]
+        off = self.V_set - V_m
+        return [
+            (self.P - w / 0.05 - P) / 0.2, (V - V_m) / avr.T_R, (off - x) / avr.T_B,
+            (avr.K * (x + avr.T_A / avr.T_B * (off - x)) - E_fd) / avr.T_E,
+        ]  # fmt: skip
+
+
+class Standard:
+    """CONTROLLED, the stabiliser as one transfer function: states of IEEET1, TGOV1 and that."""
+
+    def __init__(self, one: SynchronousMachine, E_fd: float, P: float) -> None:
+        # the parabola b (E - a)^2 that passes both points
+        first, second = np.sqrt(1.0 * 0.04), np.sqrt(2.0 * 0.33)
+        self.b, self.a = (second - first) ** 2, 1.0 - first / (second - first)
+        num, den = [20.0 * 10.0, 0.0], [10.0, 1.0]
+        for lead, lag in (([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]), ([1], [0.01, 1]),
+                          ([1], [2e-4, 0.02, 1])):  # fmt: skip
+            num, den = np.polymul(num, lead), np.polymul(den, lag)
+        self.pss = tf2ss(num, den)
+        V_R = E_fd + self.b * (E_fd - self.a) ** 2
+        self.V_set, self.P = 1.01 + V_R / 20.0, P
+        self.start = [1.01, V_R, E_fd, E_fd, P, P, *np.zeros(len(den) - 1)]
+
+    def given(self, c: np.ndarray, w: float) -> tuple[float, float, float]:
+        return c[0], c[2], c[5] + 0.6 / 2.0 * (c[4] - c[5]) - 0.1 * w
+
+    def slope(self, c: np.ndarray, V: float, w: float) -> list[float]:
+        V_m, V_R, E_fd, behind, valve, P = c[:6]
+        A, B, C, D = self.pss
+        V_s = float((C @ c[6:] + D[:, 0] * w)[0])
+        assert abs(V_s) < 0.2  # its limits do not act
+        back = (E_fd - behind) / 0.35
+        return [
+            (V - V_m) / 0.02, (20.0 * (self.V_set + V_s - V_m - 0.063 * back) - V_R) / 0.2,
+            (V_R - E_fd - self.b * (E_fd - self.a) ** 2) / 0.314, back,
+            (self.P - w / 0.04 - valve) / 0.2, (valve - P) / 2.0, *(A @ c[6:] + B[:, 0] * w),
+        ]  # fmt: skip
+
+
 def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.ndarray]:
     """After a step of the converter's voltage and speed: currents and voltages, speed, power of
     the turbine, measured voltage and excitation, of the plant and of DOP853."""
@@ -107,16 +169,16 @@ def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.nd
     assert abs(s_0[4] - 2.0 * i_0) < 1e-12
     windings = Windings(machine, w_b)
     psi_0, angle_0, E_fd_0 = windings.start(i_0, 1.01)
-    avr = machine.avr
-    ahead = E_fd_0 / avr.K if avr else 0.0
     P_0 = float((np.conj(i_0) * (1.01 + 0.004 * i_0)).real)
+    controls = (Standard if "governor" in more else Simple)(machine, E_fd_0, P_0)
     u[0, 2] += 0.05
     u[0, 1] += 1e-3
 
     def slope(t: float, s: np.ndarray) -> np.ndarray:
         i_f, v, i_o, i_z, v_m = s[:5]
         psi = s[5:11].real
-        angle, omega, P, V_m, x, E_fd = s[11:].real
+        angle, omega = s[11:13].real
+        _, E_fd, P = controls.given(s[13:].real, omega - 1)
         turn = np.exp(1j * angle)
         e = u[0, 2] * np.exp(1j * (delta + w_b * (u[0, 1] - 1) * t))
         i = windings.current(psi)
@@ -131,39 +193,39 @@ def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.nd
         torque = psi[0] * i.imag - psi[3] * i.real
         out[11] = w_b * (omega - 1)
         out[12] = (P - torque - 0.5 * (omega - 1)) / (2 * 0.8)
-        out[13] = (P_0 - (omega - 1) / 0.05 - P) / 0.2
-        if avr:
-            off = 1.01 + ahead - V_m
-            out[14], out[15] = (abs(v_m) - V_m) / avr.T_R, (off - x) / avr.T_B
-            out[16] = (avr.K * (x + avr.T_A / avr.T_B * (off - x)) - E_fd) / avr.T_E
+        out[13:] = controls.slope(s[13:].real, abs(v_m), omega - 1)
         return out
 
-    start = np.concatenate([s_0[[0, 1, 2, 3, 5]], psi_0, [angle_0, 1.0, P_0, 1.01, ahead, E_fd_0]])
+    start = np.concatenate([s_0[[0, 1, 2, 3, 5]], psi_0, [angle_0, 1.0], controls.start])
     end = solve_ivp(slope, (0, duration), start, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
     for _ in range(round(duration / T_s)):
         plant_command(plant.records, 0, u[0])
         plant_step(plant.records)
     i = 2.0 * windings.current(end[5:11].real) * np.exp(1j * end[11])
-    exact = [*end[:4], i, end[4], end[12], end[13], end[14], end[16]]
+    V_m, E_fd, P = controls.given(end[13:].real, end[12].real - 1)
+    exact = [*end[:4], i, end[4], end[12], P, V_m, E_fd]
     assert abs(end[12] - 1) > 1e-5  # it swings
-    assert avr is None or abs(end[16] - E_fd_0) > 1e-3  # and the regulator acts
+    assert machine.avr is None or abs(E_fd - E_fd_0) > 1e-3  # and the regulator acts
     assert now["omega_g"] == one["omega"]  # there is no other grid
-    mine = [*now["w"][:6], one["omega"], one["P_turbine"], one["x"][V_M], one["x"][E_FD]]
+    turbine = one["P_turbine"] if machine.governor is None else one["turbine"]
+    regulator = one["x"][[AVR, AVR + 2]] if machine.avr else [1.01, E_fd_0]
+    mine = [*now["w"][:6], one["omega"], turbine, *regulator]
     return np.array(mine), np.array(exact)
 
 
 @pytest.mark.full  # compiles the plant for several converters
-@pytest.mark.parametrize("regulated", [True, False])
-def test_a_step_against_the_windings(regulated):
-    mine, exact = stepped(1e-4, 0.3, avr=AVR if regulated else None)
+@pytest.mark.parametrize("controls", [{"T_gov": 0.2}, {"T_gov": 0.2, "avr": SEXS}, CONTROLLED])
+def test_a_step_against_the_windings(controls):
+    mine, exact = stepped(1e-4, 0.3, **controls)
     error = np.abs(mine - exact)
     assert error[:6].max() < 2e-5  # currents and voltages
     assert error[6:9].max() < 5e-8 and error[9] < 1e-6
 
 
 @pytest.mark.full
-def test_its_error_falls_with_the_square_of_the_step():
-    errors = [np.abs(np.subtract(*stepped(T_s, 0.1, avr=AVR))).max() for T_s in (2e-4, 1e-4)]
+@pytest.mark.parametrize("controls", [{"avr": SEXS, "T_gov": 0.2}, CONTROLLED])
+def test_its_error_falls_with_the_square_of_the_step(controls):
+    errors = [np.abs(np.subtract(*stepped(T_s, 0.1, **controls))).max() for T_s in (2e-4, 1e-4)]
     assert 3.0 < errors[0] / errors[1] < 6.0
 
 
@@ -201,22 +263,26 @@ def test_a_bolted_short_circuit():
 
 @pytest.mark.full
 def test_a_machine_that_is_lost_runs_up_by_itself():
-    plant = make(avr=AVR)
+    plant = make(avr=SEXS)
     u = rest(plant, 0.4 + 0j)
     line_breaker(plant, "g", closed=False, clearing="instant")
     (one,) = plant.of(SynchronousMachine)
-    P, E_fd = float(one["P_turbine"]), float(one["x"][E_FD])
+    P, E_fd = float(one["P_turbine"]), float(one["x"][AVR + 2])
     for _ in range(200):
         plant_command(plant.records, 0, u[0])
         plant_step(plant.records)
     assert plant.now[0]["w"][plant.wiring.order.index("g")] == 0.0
     assert one["omega"] - 1 == pytest.approx(P * 0.02 / (2 * 0.8), rel=0.1)
-    assert one["x"][E_FD] < E_fd  # without load its voltage rises, and the regulator takes it back
+    assert (
+        one["x"][AVR + 2] < E_fd
+    )  # without load its voltage rises, and the regulator takes it back
 
 
 def test_a_rest_that_the_regulator_cannot_hold():
-    plant = make(avr=AVR | {"E_max": 1.2})
-    with pytest.raises(NoEquilibrium, match=r"needs an excitation of .*; its regulator gives 0 to"):
+    plant = make(avr=SEXS | {"E_max": 1.2})
+    with pytest.raises(
+        NoEquilibrium, match=r"its avr, SEXS, needs E_fd = .*; its limits are 0 and 1.2"
+    ):
         rest(plant, 0.4 - 0.15j)
 
 
@@ -238,6 +304,8 @@ def test_data_of_no_machine(more, message):
     [
         ({"T_d20": 5e-4}, r"network.synchronous_machines.g: T_d20 = 0.0005: must be >= 0.001 s"),
         ({"avr": {"T_R": 5e-4}}, r"synchronous_machines.g: avr.T_R = 0.0005: must be >="),
+        ({"governor": {"T3": 5e-4}}, r"machines.g: governor.T3 = 0.0005: must be >= 0.001 s"),
+        ({"avr": {}, "pss": {"T2": 5e-4}}, r"machines.g: pss.T2 = 0.0005: must be >="),
         ({"H": 1e-4}, r"synchronous_machines.g: it swings at .* rad/s; allowed are"),
     ],
 )

@@ -89,7 +89,7 @@ def network_from(
     Each bus with generators gets one synchronous machine of order 6 with a voltage regulator and a
     governor, or the converter that is named for it, which has the rating and the operating point
     of what it replaces. Loads become constant impedances that draw at the case's voltage what they
-    draw there, the charging of lines capacitors at the buses.
+    draw there, the charging of transformers capacitors at the buses.
 
     Args:
         case: a net of pandapower, the name of one of its cases (case9, case39, ...), or the path
@@ -192,7 +192,8 @@ class _Build:
                 )
             ends = {"start": self._node(branch.start), "end": self._node(branch.end)}
             if not branch.transformer:
-                self._put("lines", name, {**ends, "L": X, "R": R})
+                line = {**ends, "L": X, "R": R, "B": branch.B * self.scale}
+                self._put("lines", name, line)
                 continue
             earthed = "both"
             if branch.end in feeding or branch.start in feeding:  # the side of a machine is a delta
@@ -201,12 +202,12 @@ class _Build:
             self._put("transformers", name, {**ends, **values})
 
     def _load(self, k: int) -> None:
-        """Load, shunt, and the charging of lines at a bus, as what draws the same there."""
+        """Load, shunt, and the charging of transformers at a bus, as what draws the same there."""
         bus = self.flow.buses[k]
         charging = sum(
             b.B / 2 / (b.ratio**2 if b.start == k else 1.0)
             for b in self.flow.branches
-            if k in (b.start, b.end)
+            if b.transformer and k in (b.start, b.end)
         )
         drawn = bus.load / abs(bus.V) ** 2 * self.scale
         shunt = (bus.shunt + 1j * charging) * self.scale

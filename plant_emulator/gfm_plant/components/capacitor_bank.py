@@ -15,7 +15,6 @@ class CapacitorBank(Component):
     title: ClassVar = "Capacitor bank"
     symbol: ClassVar = "capacitor"
     example: ClassVar = {"capacitors": {"x": {"node": "bus", "Q": 0.1}}}
-    how_many: ClassVar = "one a node"
 
     node: str = Field(min_length=1, description="where it is")
     Q: Positive = Field(

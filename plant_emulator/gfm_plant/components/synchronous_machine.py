@@ -1,5 +1,4 @@
-"""A synchronous machine of order 6 with a voltage regulator: the equations of GENROU, without
-saturation, and the regulator SEXS.
+"""A synchronous machine of order 6 with its controls: the equations of GENROU, without saturation.
 
 All of it is in p.u. of the machine's rating and in the frame of its rotor, whose q axis is 90
 degrees ahead of its d axis; i flows out of the machine. X'' is that of both axes, so that the
@@ -13,18 +12,18 @@ stator is a voltage behind one branch, R and X'', of the circuit that is solved 
     T_d0'   d E_q'/dt = E_fd - E_q' - (X_d - X_d') (i_d - g_d (X_d' - X'') / (X_d' - X_l)^2),
     T_q0'   d E_d'/dt =      - E_d' + (X_q - X_q') (i_q - g_q (X_q' - X'') / (X_q' - X_l)^2).
 
-Its torque, psi_d'' i_q - psi_q'' i_d, drives the swing equation. The regulator measures the size V
-of its terminals' voltage:
-
-    T_R dV_m/dt = V - V_m,    T_B dx/dt = V_set - V_m - x,
-    T_E dE_fd/dt = K (x + (V_set - V_m - x) T_A / T_B) - E_fd,    E_min <= E_fd <= E_max.
+Its torque, psi_d'' i_q - psi_q'' i_d, drives the swing equation. The exciter gives E_fd by the size
+V of its terminals' voltage, the governor the torque of the turbine and the stabiliser a voltage by
+its speed: see `controls`.
 
 Within a tick e'' is held, in the rotor's frame, at its value in the middle of the tick,
-extrapolated, and rotor and regulator go on by Heun's rule under the currents at both ends: the
-error falls with the square of T_s. V is the mean over a tick, which e'', R and X'' give.
+extrapolated, and rotor and controls go on by Heun's rule under currents and speed at both ends: the
+error falls with the square of T_s. V is the mean over a tick, which e'', R and X'' give, and the
+torque of a turbine with a governor its value in the middle, extrapolated.
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
@@ -32,6 +31,22 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from gfm_plant.circuit import Branch
+from gfm_plant.components.controls import (
+    EXCITERS,
+    GOVERNORS,
+    MOST_NUMBERS,
+    OF_EXCITER,
+    OF_GOVERNOR,
+    OF_STABILISER,
+    STABILISERS,
+    AnyExciter,
+    AnyGovernor,
+    AnyStabiliser,
+    excite,
+    govern,
+    stabilise,
+)
+from gfm_plant.components.controls.control import Control
 from gfm_plant.components.machine import SPEED, Rotating
 from gfm_plant.components.part import LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
@@ -44,32 +59,42 @@ from gfm_plant.components.swing import (
     swing_matrix,
 )
 from gfm_plant.layout import field
-from gfm_plant.parameters import NonNegative, Options, Positive
+from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import drive, state
 from gfm_plant.steady_state import NoEquilibrium
 from gfm_runtime.compiled import compiled
 
-E_Q, E_D, PSI_KD, PSI_KQ, V_M, LEAD, E_FD = range(7)
-"""The states of rotor and regulator."""
-N_STATES = 7
+E_Q, E_D, PSI_KD, PSI_KQ = range(4)
+"""The states of the rotor, before those of the controls."""
+AVR = 4
+GOVERNOR = AVR + OF_EXCITER
+PSS = GOVERNOR + OF_GOVERNOR
+N_STATES = PSS + OF_STABILISER
+ROLES = {"avr": (AVR, EXCITERS), "governor": (GOVERNOR, GOVERNORS), "pss": (PSS, STABILISERS)}
+"""Of each control the place of its first state, and its kinds."""
 _LAG = 10.0  # shortest time constant, in sampling periods
 _NUDGE = 1e-6  # of a derivative by differences
 
 
 @compiled
-def _rates(one: Any, x: Any, V: float, i: complex, out: Any) -> None:
-    """Write d/dt of the states x, (7,), 1/s, at a terminal voltage of size V and a current i."""
+def _windings(one: Any, x: Any, E_fd: float, i: complex, out: Any) -> None:
+    """Write d/dt of the rotor's states, 1/s, at a current i."""
     g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
     g_q = x[PSI_KQ] + one.X_ql * i.imag + x[E_D]
-    out[E_Q] = (x[E_FD] - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d)) / one.T_d10
+    out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d)) / one.T_d10
     out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q)) / one.T_q10
     out[PSI_KD], out[PSI_KQ] = -g_d / one.T_d20, -g_q / one.T_q20
-    out[V_M] = out[LEAD] = out[E_FD] = 0.0
-    if one.K > 0.0:
-        off = one.V_set - x[V_M]
-        out[V_M], out[LEAD] = (V - x[V_M]) / one.T_R, (off - x[LEAD]) / one.T_B
-        ahead = x[LEAD] + one.T_A / one.T_B * (off - x[LEAD])
-        out[E_FD] = (one.K * ahead - x[E_FD]) / one.T_E
+
+
+@compiled
+def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
+    """Write d/dt of the states x, (N_STATES,), 1/s, at a terminal voltage of size V, a speed of
+    1 + w and a current i; returns the torque of the turbine, if it has a governor."""
+    V_s = stabilise(one.pss, one.pss_p, x, PSS, w, one.pss_set, out)
+    E_fd = excite(one.avr, one.avr_p, x, AVR, V, one.avr_set + V_s, out)
+    _windings(one, x, E_fd, i, out)
+    turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, w, one.governor_set, out)
+    return turbine
 
 
 @compiled
@@ -123,18 +148,22 @@ def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     v = one.E_middle - complex(one.R, one.omega_middle * one.X_2) * (0.5 * (first + last))
     v -= (last - first) * (one.X_2 / (n.omega_b * n.T_s))
     V = math.sqrt(v.real * v.real + v.imag * v.imag)
-    _rates(one, one.x, V, first, one.rate)
+    w_first = one.omega - 1.0
+    w = swing(one, n.T_s, w_first)
+    one.omega = 1.0 + w
+    _rates(one, one.x, V, w_first, first, one.rate)
     for k in range(N_STATES):
         one.guess[k] = one.x[k] + n.T_s * one.rate[k]
-    _rates(one, one.guess, V, last, one.guess_rate)
+    _rates(one, one.guess, V, w, last, one.guess_rate)
     for k in range(N_STATES):
         one.x[k] += 0.5 * n.T_s * (one.rate[k] + one.guess_rate[k])
-    one.x[E_FD] = min(max(one.x[E_FD], one.E_min), one.E_max)
-    w = swing(one, n.T_s, one.omega - 1.0)
-    one.omega = 1.0 + w
+    for k in range(AVR, N_STATES):
+        one.x[k] = min(max(one.x[k], one.least[k]), one.most[k])
+    turbine = _rates(one, one.x, V, w, last, one.rate)
+    if one.governor > 0:
+        one.P_turbine = turbine
     psi = _flux(one, one.x)
     one.slope, _ = slopes(one, w, one.P_turbine, -_torque(psi, unit, i) / one.S)
-    _rates(one, one.x, V, last, one.rate)
     psi_slope = _flux(one, one.rate)
     bend = (psi_slope - one.psi_slope) * (1.0 / n.T_s)
     one.psi_slope = psi_slope
@@ -143,6 +172,9 @@ def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.E_middle = one.E + 0.5 * n.T_s * E_slope
     one.psi_middle = psi + 0.5 * n.T_s * psi_slope
     one.omega_middle = one.omega + 0.5 * n.T_s * one.slope
+    if one.governor > 0:
+        one.P_turbine += 0.5 * (turbine - one.turbine)
+        one.turbine = turbine
     one.begins = 1
     field(now, "emf")[one.source] = one.E
     lead(now, one)
@@ -152,33 +184,15 @@ def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 def _at_rest(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     torque = _torque(one.psi_middle, field(now, "unit")[one.source], field(now, "w")[one.sees])
     swing_at_rest(one, one.omega - 1.0, -torque)
+    one.turbine = one.P_turbine
     one.slope = 0.0
 
 
-class Regulator(Options):
-    """A voltage regulator with its exciter, SEXS. Its set-point is what the voltage at the start
-    needs."""
-
-    K: Positive = Field(200.0, description="gain, p.u. of excitation by p.u. of voltage")
-    T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
-    T_A: NonNegative = Field(1.0, description="lead, s")
-    T_B: Positive = Field(10.0, description="lag, s")
-    T_E: Positive = Field(0.05, description="lag of the exciter, s")
-    E_min: float = Field(0.0, ge=-100.0, le=100.0, description="least excitation E_fd, p.u.")
-    E_max: float = Field(5.0, ge=-100.0, le=100.0, description="largest excitation E_fd, p.u.")
-
-    @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.E_min < self.E_max:
-            raise ValueError(f"E_min = {self.E_min:g}: must be less than E_max, {self.E_max:g}")
-        return self
-
-
 class SynchronousMachine(Rotating):
-    """A synchronous machine with transient and subtransient reactances, a voltage regulator and a
-    governor: field and damper windings of order 6, the subtransient reactance the same in both
-    axes. It has no saturation and no stabiliser. The defaults are those of the machines of
-    Kundur's two areas (Power System Stability and Control, example 12.6)."""
+    """A synchronous machine with transient and subtransient reactances and its controls: field and
+    damper windings of order 6, the subtransient reactance the same in both axes, without
+    saturation. The defaults are those of the machines of Kundur's two areas (Power System Stability
+    and Control, example 12.6)."""
 
     title: ClassVar = "Synchronous machine of order 6"
     example: ClassVar = {
@@ -187,7 +201,12 @@ class SynchronousMachine(Rotating):
     more_states: ClassVar = (
         *Rotating.more_states,
         ("E_q', E_d', ψ_kd, ψ_kq", "p.u. of its rating", "of field and damper windings"),
-        ("V_m, x, E_fd", "p.u. of its rating", "of the voltage regulator"),
+        *(
+            (f"{name} of {kind.kind()}", unit, meaning)
+            for _, kinds in ROLES.values()
+            for kind in kinds
+            for name, unit, meaning in kind.states
+        ),
     )
     unknowns: ClassVar = 4  # its current, p.u. of its rating, and the voltage at its terminals
     record: ClassVar = np.dtype(
@@ -196,11 +215,14 @@ class SynchronousMachine(Rotating):
             # X_dd is X_d - X_d', X_dl is X_d' - X_l, and so for q; k and a as in the equations
             *((name, "f8") for name in ("X_dd", "X_qq", "X_dl", "X_ql", "k_d", "k_q", "a_d")),
             *((name, "f8") for name in ("a_q", "X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20")),
-            # of the regulator; K is 0 without one
-            *((name, "f8") for name in ("K", "T_R", "T_A", "T_B", "T_E", "E_min", "E_max")),
-            ("V_set", "f8"),
-            ("x", "f8", (N_STATES,)), ("rate", "f8", (N_STATES,)),
-            ("guess", "f8", (N_STATES,)), ("guess_rate", "f8", (N_STATES,)),
+            # of each control: its kind, 0 if there is none, and its numbers
+            *((role, "i8") for role in ROLES),
+            *((f"{role}_p", "f8", (MOST_NUMBERS,)) for role in ROLES),
+            *((f"{role}_set", "f8") for role in ROLES),  # what is asked; without avr E_fd
+            # with a governor, torque of the turbine at the tick; P_turbine is that half a tick on
+            ("turbine", "f8"),
+            *((x, "f8", (N_STATES,)) for x in ("x", "rate", "guess", "guess_rate")),
+            *((x, "f8", (N_STATES,)) for x in ("least", "most")),  # limits of x
             # e'' and psi'' in the rotor's frame, at the tick and in the middle of the one to come
             ("E", "c16"), ("E_middle", "c16"), ("psi_middle", "c16"), ("psi_slope", "c16"),
             ("omega_middle", "f8"),
@@ -226,7 +248,13 @@ class SynchronousMachine(Rotating):
     T_q10: Positive = Field(0.4, description="open-circuit transient time constant T_q0', s")
     T_d20: Positive = Field(0.03, description="open-circuit subtransient time constant T_d0'', s")
     T_q20: Positive = Field(0.05, description="open-circuit subtransient time constant T_q0'', s")
-    avr: Regulator | None = Field(None, description="voltage regulator; E_fd is constant if none")
+    avr: AnyExciter | None = Field(
+        None, description="voltage regulator with its exciter; E_fd is constant if none"
+    )
+    governor: AnyGovernor | None = Field(
+        None, description="governor with its turbine, in place of droop and T_gov"
+    )
+    pss: AnyStabiliser | None = Field(None, description="stabiliser; it needs an avr")
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -242,30 +270,54 @@ class SynchronousMachine(Rotating):
                 least = value
         return self
 
+    @model_validator(mode="after")
+    def _fit_together(self) -> Self:
+        if self.pss is not None and self.avr is None:
+            raise ValueError("pss: acts on a voltage regulator; give the machine an avr, too")
+        for name in ("droop", "T_gov"):
+            value = getattr(self, name)
+            if self.governor is not None and value != type(self).model_fields[name].default:
+                raise ValueError(f"{name} = {value:g}: leave it out, the governor has its own")
+        return self
+
+    def _controls(self) -> Iterator[tuple[str, int, Control]]:
+        """Role and first state of each control that it has."""
+        for role, (at, _) in ROLES.items():
+            if (one := getattr(self, role)) is not None:
+                yield role, at, one
+
     def elements(self, name: str) -> tuple[Branch]:
         return (Branch(name, emf(name), self.node, self.X_2 / self.S, self.R / self.S),)
 
     def label(self) -> str:
-        regulator = "" if self.avr is None else ", AVR"
-        return f"S {self.S:g}, H {self.H:g} s, X'' {self.X_2:g}{regulator}"
+        kinds = [f", {one.kind()}" for *_, one in self._controls()]
+        return f"S {self.S:g}, H {self.H:g} s, X'' {self.X_2:g}{''.join(kinds)}"
+
+    def asked(self, omega: float) -> float:
+        if self.governor is None:
+            return super().asked(omega)
+        return float(self.P - (omega - 1.0) * (self.governor.per_speed() + self.D))
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
         pack_swing(self, record, self.X_2 / self.S, where, T_s, omega_b)
-        avr = self.avr or Regulator()
         for name in ("X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20"):
             record[name] = getattr(self, name)
-        for name in ("K", "T_R", "T_A", "T_B", "T_E", "E_min", "E_max"):
-            record[name] = getattr(avr, name)
+        record["least"], record["most"] = -np.inf, np.inf
         lags = [(name, getattr(self, name)) for name in ("T_d10", "T_q10", "T_d20", "T_q20")]
-        if self.avr is None:
-            record["K"], record["E_min"], record["E_max"] = 0.0, -np.inf, np.inf
-        else:
-            lags += [(f"avr.{name}", getattr(avr, name)) for name in ("T_R", "T_B", "T_E")]
+        for role, at, one in self._controls():
+            lags += [(f"{role}.{name}", lag) for name, lag in one.lags().items()]
+            record[role] = 1 + ROLES[role][1].index(type(one))
+            numbers = one.numbers()
+            record[f"{role}_p"][: len(numbers)] = numbers
+            for place, ends in one.limits().items():
+                record["least"][at + place], record["most"][at + place] = ends
         for name, lag in lags:
             if lag < _LAG * T_s:
                 raise ValueError(
                     f"{where}: {name} = {lag:g}: must be >= {_LAG * T_s:g} s at this T_s"
                 )
+        if self.governor is not None:  # its turbine does not move within a tick
+            record["droop"] = record["T_gov"] = np.inf
         for axis in "dq":
             X, X_1 = getattr(self, f"X_{axis}"), getattr(self, f"X_{axis}1")
             record[f"X_{axis}{axis}"], record[f"X_{axis}l"] = X - X_1, X_1 - self.X_l
@@ -288,22 +340,31 @@ class SynchronousMachine(Rotating):
         unit = -1j * q_axis / abs(q_axis)
         i_d, i_q = (own := i * unit.conjugate()).real, own.imag
         E_fd = (v * unit.conjugate() + self.R * own).imag / omega + self.X_d * i_d
-        if self.avr is not None and not self.avr.E_min < E_fd < self.avr.E_max:
-            raise NoEquilibrium(
-                f"the machine at {self.node}: V = {self.V:g} p.u. needs an excitation of"
-                f" {E_fd:.4g} p.u.; its regulator gives {self.avr.E_min:g} to {self.avr.E_max:g}"
-            )
-        ahead = 0.0 if self.avr is None else E_fd / self.avr.K
         E_q, E_d = E_fd - (self.X_d - self.X_d1) * i_d, (self.X_q - self.X_q1) * i_q
         psi_kd = E_q - (self.X_d1 - self.X_l) * i_d
         psi_kq = -E_d - (self.X_q1 - self.X_l) * i_q
-        record["V_set"] = abs(v) + ahead
-        record["x"] = E_q, E_d, psi_kd, psi_kq, abs(v), ahead, E_fd
+        torque = ((v + self.R * i) * i.conjugate()).real / omega + self.D * (omega - 1.0)
+        record["x"], record["avr_set"] = 0.0, E_fd
+        record["x"][:AVR] = E_q, E_d, psi_kd, psi_kq
+        seen = {"avr": (E_fd, abs(v)), "governor": (torque, omega - 1.0), "pss": (0.0, omega - 1.0)}
+        for role, at, one in self._controls():
+            states, record[f"{role}_set"] = one.rest(*seen[role])
+            record["x"][at : at + len(states)] = states
+            self._check_limits(role, one, states)
         psi = complex(E_q - (self.X_d1 - self.X_2) * i_d, -E_d - (self.X_q1 - self.X_2) * i_q)
         record["psi_middle"], record["psi_slope"] = psi, 0j
         record["omega"] = record["omega_middle"] = omega
         record["E"] = record["E_middle"] = 1j * omega * psi
         return complex(record["E"]) * unit
+
+    def _check_limits(self, role: str, one: Control, states: Sequence[float]) -> None:
+        for place, (least, most) in one.limits().items():
+            if not least < states[place] < most:
+                name = one.states[place][0]
+                raise NoEquilibrium(
+                    f"the machine at {self.node}: its {role}, {one.kind()}, needs {name} ="
+                    f" {states[place]:.4g} p.u. at the start; its limits are {least:g} and {most:g}"
+                )
 
     def linear(
         self, record: Any, seen: complex, source: complex, slip: float, omega_b: float
@@ -314,36 +375,53 @@ class SynchronousMachine(Rotating):
         here is V_m and what that current brings, so that none is left.
         """
         one = SimpleNamespace(**{name: record[name] for name in record.dtype.names})
-        unit, (own, per_power) = (
-            source / complex(one.E),
-            swing_matrix(self.H, self.D, self.droop, self.T_gov, 1.0),
-        )
+        unit = source / complex(one.E)
+        own, per_power = swing_matrix(self.H, self.D, self.droop, self.T_gov, 1.0)
         resting = seen * unit.conjugate() / self.S
         ahead = complex(one.E) - complex(self.R, one.omega * self.X_2) * resting
-        ahead *= self.X_2 / (omega_b * one.T_R * abs(ahead))
+        ahead *= self.X_2 / (omega_b * abs(ahead))
+        if self.governor is not None:
+            own[1] = 0.0
+        n = 3 + N_STATES  # angle, speed, power of the turbine without a governor, x
 
         def moved(nudge: Matrix) -> Matrix:
-            """d/dt of the states (10,), and the source (2,), after a nudge of the states and of
-            what it sees, (12,)."""
+            """d/dt of the states (n,), and the source (2,), after a nudge of the states and of what
+            it sees, (n + 2,)."""
             rotor = unit * np.exp(1j * nudge[0])
-            i = (seen + complex(*nudge[10:])) * rotor.conjugate() / self.S
-            omega, x, rate = one.omega + nudge[1], one.x + nudge[3:10], np.empty(N_STATES)
-            x[V_M] -= (ahead.conjugate() * (i - resting)).real
-            _rates.py_func(one, x, 0.0, i, rate)
+            i = (seen + complex(*nudge[n:])) * rotor.conjugate() / self.S
+            w, x, rate = one.omega - 1.0 + nudge[1], one.x + nudge[3:n], np.zeros(N_STATES)
+            if self.avr is not None:
+                x[AVR] -= (ahead.conjugate() * (i - resting)).real / self.avr.T_R
+            self._rates(one, x, 0.0, w, i, rate)
             psi = _flux.py_func(one, x)
-            E = 1j * omega * psi + _flux.py_func(one, rate) / omega_b
-            V = abs(E - complex(self.R, omega * self.X_2) * i)
-            _rates.py_func(one, x, V, i, rate)
+            E = 1j * (1.0 + w) * psi + _flux.py_func(one, rate) / omega_b
+            V = abs(E - complex(self.R, (1.0 + w) * self.X_2) * i)
+            turbine = self._rates(one, x, V, w, i, rate)
+            change = nudge[2] if self.governor is None else turbine - one.turbine
             torque = _torque.py_func(psi, 1.0, i)
-            swung = own @ nudge[1:3] - np.array([per_power * torque, 0.0])
+            swung = own @ [nudge[1], change] - np.array([per_power * torque, 0.0])
             at = E * rotor
             return np.array([omega_b * nudge[1], *swung, *rate, at.real, at.imag])
 
-        slopes_of = np.stack(
-            [(moved(n) - moved(-n)) / (2 * _NUDGE) for n in _NUDGE * np.eye(12)], axis=1
+        found = np.stack(
+            [(moved(x) - moved(-x)) / (2 * _NUDGE) for x in _NUDGE * np.eye(n + 2)], axis=1
         )
-        kept = [k for k in range(10) if self.avr is not None or k < 3 + V_M]
-        A, by_seen = slopes_of[np.ix_(kept, kept)], slopes_of[kept, 10:]
+        kept = [k for k in range(n) if found[k].any() or found[:, k].any()]
         turn = np.zeros(len(kept))
         turn[0] = 1.0
-        return LinearPart(A, by_seen, slopes_of[10:, kept], turn, slopes_of[10:, 10:])
+        A, by_seen = found[np.ix_(kept, kept)], found[kept, n:]
+        return LinearPart(A, by_seen, found[n:, kept], turn, found[n:, n:])
+
+    def _rates(self, one: Any, x: Matrix, V: float, w: float, i: complex, out: Matrix) -> float:
+        """As the compiled ``_rates``, of these controls."""
+
+        def output(role: str, seen: float, asked: float) -> float:
+            if (control := getattr(self, role)) is None:
+                return asked
+            numbers, at = getattr(one, f"{role}_p"), ROLES[role][0]
+            found: float = type(control).rates.py_func(numbers, x, at, seen, asked, out)
+            return found
+
+        V_s = output("pss", w, one.pss_set)
+        _windings.py_func(one, x, output("avr", V, one.avr_set + V_s), i, out)
+        return output("governor", w, one.governor_set)

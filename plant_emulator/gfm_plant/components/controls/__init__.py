@@ -1,0 +1,74 @@
+"""The controls of a synchronous machine, one a file, and their registries.
+
+A new control is a file here and a line there.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Union
+
+from pydantic import BeforeValidator, Field
+
+from gfm_plant.components.controls.control import Control
+from gfm_plant.components.controls.ieeet1 import Ieeet1
+from gfm_plant.components.controls.pss1a import Pss1a
+from gfm_plant.components.controls.sexs import Sexs
+from gfm_plant.components.controls.tgov1 import Tgov1
+from gfm_runtime.compiled import inlined_as
+
+EXCITERS = (Sexs, Ieeet1)
+GOVERNORS = (Tgov1,)
+STABILISERS = (Pss1a,)
+
+
+def _one_of(kinds: Sequence[type[Control]]) -> Any:
+    """The type of a table whose key ``type`` names one of the kinds; the first if it is left
+    out."""
+    if len(kinds) == 1:
+        return kinds[0]
+
+    def named(table: Any) -> Any:
+        return {"type": kinds[0].kind(), **table} if isinstance(table, dict) else table
+
+    union: Any = Union[tuple(kinds)]  # noqa: UP007
+    return Annotated[union, Field(discriminator="type"), BeforeValidator(named)]
+
+
+AnyExciter: Any = _one_of(EXCITERS)
+AnyGovernor: Any = _one_of(GOVERNORS)
+AnyStabiliser: Any = _one_of(STABILISERS)
+
+
+def _chosen(role: str, kinds: Sequence[type[Control]]) -> Any:
+    """A compiled function (kind, p, x, at, seen, asked, out) that calls the ``rates`` of a kind, of
+    which the first is 1; of 0 the output is what is asked for."""
+
+    def none(kind: int, p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+        return asked
+
+    chain = inlined_as(role, none)
+    for k, one in reversed([*enumerate(kinds, 1)]):
+        chain = _link(role, one.rates, k, chain)
+    return chain
+
+
+def _link(role: str, call: Callable[..., float], k: int, others: Callable[..., float]) -> Any:
+    def link(kind: int, p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+        if kind == k:
+            return call(p, x, at, seen, asked, out)
+        return others(kind, p, x, at, seen, asked, out)
+
+    return inlined_as(f"{role}_{k}", link)
+
+
+excite, govern = _chosen("excite", EXCITERS), _chosen("govern", GOVERNORS)
+stabilise = _chosen("stabilise", STABILISERS)
+
+
+def _most(kinds: Sequence[type[Control]]) -> int:
+    return max(len(kind().rest(0.0, 0.0)[0]) for kind in kinds)
+
+
+_EACH = (*EXCITERS, *GOVERNORS, *STABILISERS)
+#: numbers and states of one of each role, at most
+MOST_NUMBERS = max(len(kind().numbers()) for kind in _EACH)
+OF_EXCITER, OF_GOVERNOR, OF_STABILISER = map(_most, (EXCITERS, GOVERNORS, STABILISERS))

@@ -1,0 +1,63 @@
+"""What a control of a synchronous machine declares: an exciter with its regulator, a governor with
+its turbine, or a stabiliser."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
+
+from gfm_plant.parameters import Options
+
+
+class Control(Options):
+    """Base of all controls; the options of one are its standard parameters, in p.u. of the
+    machine's rating and s.
+
+    Its ``rates`` is a compiled function (p, x, at, seen, asked, out) -> output. p are its
+    ``numbers``, its states are x from ``at`` on, and their d/dt, 1/s, go to the same places of out.
+    A time constant of 0 that it allows leaves its block out, whose states then do not move.
+    """
+
+    #: its states in their order: name, unit, meaning
+    states: ClassVar[Sequence[tuple[str, str, str]]]
+    rates: ClassVar[Callable[..., float]]
+
+    @classmethod
+    def kind(cls) -> str:
+        """The name of what it is, its key ``type``."""
+        return str(cls.model_fields["type"].default)
+
+    def numbers(self) -> Sequence[float]:
+        """What ``rates`` takes as p."""
+        raise NotImplementedError
+
+    def lags(self) -> Mapping[str, float]:
+        """Its time constants by their names, s."""
+        raise NotImplementedError
+
+    def limits(self) -> Mapping[int, tuple[float, float]]:
+        """Between which values a state stays, by its place: a limit without wind-up."""
+        return {}
+
+    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+        """Its states, and what it is asked for, where nothing moves."""
+        raise NotImplementedError
+
+
+class Exciter(Control):
+    """A voltage regulator with its exciter: sees the size of the terminals' voltage, is asked for a
+    voltage, gives E_fd. Its first state is that voltage as measured, with the lag T_R."""
+
+    T_R: float
+
+
+class Governor(Control):
+    """A governor with its turbine: sees the deviation of the speed, is asked for a power, gives the
+    torque of the turbine."""
+
+    def per_speed(self) -> float:
+        """How much more torque it gives at rest by a lower speed, p.u./p.u."""
+        raise NotImplementedError
+
+
+class Stabiliser(Control):
+    """A power system stabiliser: sees the deviation of the speed, gives what is added to the
+    set-point of the voltage."""

@@ -1,0 +1,67 @@
+"""TGOV1, a governor with a steam turbine:
+
+    T1 dx_1/dt = P_ref - w / R - x_1,    V_min <= x_1 <= V_max,
+    T3 dx_2/dt = x_1 - x_2,    P_m = x_2 + (x_1 - x_2) T2 / T3 - D_t w,
+
+where w is the deviation of the speed, x_1 the valve, and T2 / T3 the part of the power that does
+not pass the reheater. P_ref is in p.u. of power, that of PSS/E times R.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from gfm_plant.components.controls.control import Governor
+from gfm_plant.parameters import NonNegative, Positive
+from gfm_runtime.compiled import compiled
+
+
+@compiled
+def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+    R, T1, T2, T3, D_t = p[0], p[1], p[2], p[3], p[4]
+    valve, behind = x[at], x[at + 1]
+    out[at] = (asked - seen / R - valve) / T1
+    out[at + 1] = (valve - behind) / T3
+    return behind + T2 / T3 * (valve - behind) - D_t * seen
+
+
+class Tgov1(Governor):
+    """A governor with a steam turbine, TGOV1."""
+
+    states: ClassVar = (
+        ("x_1", "p.u.", "position of the valve"),
+        ("x_2", "p.u.", "power behind the reheater"),
+    )
+    rates: ClassVar = _rates
+
+    type: Literal["TGOV1"] = Field("TGOV1", description="which governor")
+    R: Positive = Field(0.05, description="droop, frequency by power, p.u./p.u.")
+    T1: Positive = Field(0.5, description="lag of the valve, s")
+    V_max: float = Field(1.2, ge=-100.0, le=100.0, description="largest opening of it, p.u.")
+    V_min: float = Field(0.0, ge=-100.0, le=100.0, description="least opening of it, p.u.")
+    T2: NonNegative = Field(3.0, description="lead of the turbine, s")
+    T3: Positive = Field(10.0, description="lag of the turbine, s: its reheater")
+    D_t: NonNegative = Field(0.0, description="damping of the turbine by frequency, p.u./p.u.")
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        if not self.V_min < self.V_max:
+            raise ValueError(f"V_min = {self.V_min:g}: must be less than V_max, {self.V_max:g}")
+        return self
+
+    def numbers(self) -> Sequence[float]:
+        return self.R, self.T1, self.T2, self.T3, self.D_t
+
+    def lags(self) -> Mapping[str, float]:
+        return {"T1": self.T1, "T3": self.T3}
+
+    def limits(self) -> Mapping[int, tuple[float, float]]:
+        return {0: (self.V_min, self.V_max)}
+
+    def per_speed(self) -> float:
+        return 1.0 / self.R + self.D_t
+
+    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+        valve = output + self.D_t * seen
+        return (valve, valve), valve + seen / self.R
