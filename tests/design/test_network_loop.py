@@ -124,6 +124,12 @@ def with_controls(place: Path | None = None) -> Scenario:
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
 
 
+def with_following(place: Path | None = None) -> Scenario:
+    neighbour = {"G": {"node": "far", "S": 0.8, "P": 0.4, "Q": 0.1}}
+    banks = {"bank": {"node": "far", "Q": 0.1}}
+    return island(grid_following=neighbour, capacitors=banks)
+
+
 def with_finite_grid(place: Path) -> Scenario:
     return scenario({**THREE, "grid": "far"}, plant={"grid": {**FINITE, "V_g": 1.02}})
 
@@ -168,6 +174,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_machine,
         with_synchronous_machine,
         with_controls,
+        with_following,
         with_finite_grid,
         with_pll,
     ],

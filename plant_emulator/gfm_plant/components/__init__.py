@@ -11,6 +11,7 @@ from pydantic import Field
 from gfm_plant.components.capacitor_bank import CapacitorBank
 from gfm_plant.components.constant_power import ConstantPowerLoad
 from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.grid_following import GridFollowing
 from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
@@ -33,6 +34,7 @@ class NetworkParts(Options):
     saturations: dict[str, Saturation] = Field({}, description="of transformers, by name")
     loads: dict[str, Load] = Field({}, description="by name")
     constant_power: dict[str, ConstantPowerLoad] = Field({}, description="by name")
+    grid_following: dict[str, GridFollowing] = Field({}, description="by name")
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
     machines: dict[str, Machine] = Field({}, description="by name")
     synchronous_machines: dict[str, SynchronousMachine] = Field({}, description="by name")
