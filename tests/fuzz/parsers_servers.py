@@ -106,7 +106,9 @@ def _modbus(place: Path) -> Iterator[Take]:
     port = free_port()
 
     async def listen() -> Server:
-        server = Server(SimDevice(id=1, simdata=[block], action=action), ("127.0.0.1", port), None)
+        server = Server(
+            [SimDevice(id=1, simdata=[block], action=action)], ("127.0.0.1", port), None
+        )
         await server.serve_forever(background=True)
         return server
 

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_the_first_page_says_what_was_judged_and_has_room_to_sign(report):
     assert facts["digests"]["droop-3"] in first and facts["machine"] in first
     for words in (
         "droop-3",
-        "gfmhil 0.1.0",
+        f"gfmhil {version('gfmhil')}",
         "droop 1 %, that of the law itself; power -1 to 1 p.u.",
         "ours; no source gives it 1 0",
         "all 1 0",
