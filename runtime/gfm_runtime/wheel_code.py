@@ -62,7 +62,7 @@ class WheelCode:
 
     @cached_property
     def unfit(self) -> str:
-        """Why nothing of the file is used; empty if it is used, or there is none."""
+        """The reason not to use the file; empty if it is used, or there is none."""
         try:
             held = memoryview(self._file.read_bytes())
         except FileNotFoundError:

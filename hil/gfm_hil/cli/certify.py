@@ -1,4 +1,4 @@
-"""gfmhil certify: the class of grids in which converters are stable, whoever else is there."""
+"""gfmhil certify: the class of grids in which any number of converters is stable."""
 
 import argparse
 import json

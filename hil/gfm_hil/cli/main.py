@@ -37,7 +37,7 @@ COMMANDS = {
     "campaign": ("campaign", "run a scenario many times with drawn values"),
     "conform": ("conform", "run published tests of grid-forming converters, and judge them"),
     "scan": ("scan", "measure a converter's dq admittance, and judge grids by it"),
-    "certify": ("certify", "say in which grids converters are stable, whoever else is there"),
+    "certify": ("certify", "say in which grids any number of converters is stable"),
     "fit": ("fit", "fit D, H and X_eff to a run or a recording, with intervals"),
     "bench": ("bench", "measure links, clock, kernel and loop on this machine"),
     "laws": ("laws", "list the laws, or show one"),

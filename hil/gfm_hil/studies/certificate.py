@@ -1,4 +1,4 @@
-"""Certificates for converters: which grids they may be connected to, whoever else is there."""
+"""Certificates for converters: to which grids any number of them may be connected."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RUN_S = 4.0
 
 
 @dataclass(frozen=True)
-class Unstable:
+class UnstableGrid:
     """A grid of the class with which one converter alone is unstable.
 
     Attributes:
@@ -69,7 +69,7 @@ class CertifiedLaws:
     powers: tuple[float, ...]
     grids: GridClass
     certificate: Certificate | None
-    unstable: Unstable | None
+    unstable: UnstableGrid | None
 
     @property
     def holds(self) -> bool:
@@ -163,7 +163,7 @@ def on_grid(scenario: Scenario, law: str, scr: float, x_over_r: float, P: float)
     )  # fmt: skip
 
 
-def counter_run(scenario: Scenario, unstable: Unstable) -> str:
+def counter_run(scenario: Scenario, unstable: UnstableGrid) -> str:
     """The status of a run of 4 s whose grid's angle jumps by 0.5 degrees, on the grid of a
     counter-example; empty where there is no operating point to begin at."""
     if unstable.mode is None:
@@ -212,7 +212,7 @@ def strength_of(scenario: Scenario) -> Strength:
     return Strength(float(strengths[0]), stiffest, (min(ratios), max(ratios)), loads)
 
 
-def _tried(scenario: Scenario) -> tuple[str, ClosedLoop | None, Unstable | None]:
+def _tried(scenario: Scenario) -> tuple[str, ClosedLoop | None, UnstableGrid | None]:
     """The name of the law, and its loop if that is stable."""
     grid, P = scenario.plant.grid, scenario.references.P_ref
     name = initial_law(scenario)[0].law.name
@@ -220,9 +220,9 @@ def _tried(scenario: Scenario) -> tuple[str, ClosedLoop | None, Unstable | None]
     try:
         loop, _ = scenario_loop(scenario)
     except NoEquilibrium:
-        return name, None, Unstable(*at, None)
+        return name, None, UnstableGrid(*at, None)
     worst = loop.modes()[0]
-    return name, loop, Unstable(*at, worst) if worst.sigma >= 0.0 else None
+    return name, loop, UnstableGrid(*at, worst) if worst.sigma >= 0.0 else None
 
 
 def _admittances(loops: Sequence[ClosedLoop], hz: Vector) -> list[NDArray[np.complex128]]:

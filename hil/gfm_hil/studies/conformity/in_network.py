@@ -168,6 +168,10 @@ def _add_lines(
     for scr in levels:
         line = Grid(scr=(scr - below) * share, x_over_r=x_over_r).line()
         assert line is not None
+        if _line(scr) in lines:
+            raise UserError(
+                f"network.lines: {_line(scr)!r} is the name of a line of the test's own"
+            )
         lines[_line(scr)] = {
             "start": node, "end": _GRID, "L": line["L_g"], "R": line["R_g"], "closed": scr <= now,
         }  # fmt: skip
