@@ -112,24 +112,16 @@ def linearise_stage(
     Raises:
         NoEquilibrium: a limit of the stage acts at ``op``.
     """
-    if isinstance(inner, StiffSource):  # the bridge produces E_u itself
+    if isinstance(inner, StiffSource):
         _check_limits(inner, op, 0.0)
-        none, D_u = np.zeros((0, 0)), np.eye(NU_INNER, NU)
-        B_u, B_y, C = np.zeros((0, NU)), np.zeros((0, NY_INNER)), np.zeros((NU_INNER, 0))
-        D_y, C_pll = np.zeros((NU_INNER, NY_INNER)), np.zeros((1, 0))
-        return LinearStage(none, B_u, B_y, C, D_u, D_y, C_pll, D_y[:1], states=())
+        return _without_states()
     c = np.zeros(1, np.dtype([*INNER_NUMBERS, *inner_fields(np.dtype(float))]))[0]
     pack_inner(inner, c, T_s, omega_b)
     omega_0, dual = float(op.u[1]), isinstance(inner, DualSequence)
     stator = isinstance(inner, VirtualStator)
     i_0, v_0, i_o_0 = (complex(op.x[k], op.x[k + 1]) for k in (0, 2, 4))
     _check_limits(inner, op, abs(i_0))
-    acts = {"v_f": True, "i*": stator, "x_v": not stator and c["T_k_vi"] > 0.0}
-    acts["x_c"] = c["T_k_ci"] > 0.0
-    acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), dual)
-    both = [name for name, there in acts.items() if there]
-    states = [f"{name} of the inner stage, {axis}" for name in both for axis in "dq"]
-    states += ["angle of the PLL", "frequency of the PLL"] if inner.f_pll > 0.0 else []
+    both, states = _states(inner, c)
     # A quantity is a row over w = (x, u, y): its real and its imaginary part are those of row @ w.
     n = len(states)
     w = np.eye(n + NU + NY_INNER)
@@ -185,6 +177,26 @@ def linearise_stage(
     C_pll, _, D_pll = np.split(seen[None, :], split, axis=1)
     assert C.shape == (NU_INNER, n)
     return LinearStage(A, B_u, B_y, C, D_u, D_y, C_pll, D_pll, states=tuple(states))
+
+
+def _without_states() -> LinearStage:
+    """A stage whose bridge produces E_u itself."""
+    none, D_u = np.zeros((0, 0)), np.eye(NU_INNER, NU)
+    B_u, B_y, C = np.zeros((0, NU)), np.zeros((0, NY_INNER)), np.zeros((NU_INNER, 0))
+    D_y, C_pll = np.zeros((NU_INNER, NY_INNER)), np.zeros((1, 0))
+    return LinearStage(none, B_u, B_y, C, D_u, D_y, C_pll, D_y[:1], states=())
+
+
+def _states(inner: InnerStage, c: np.void) -> tuple[list[str], list[str]]:
+    """The states that have both axes, by their symbols; and all states, one axis each, in words."""
+    stator = isinstance(inner, VirtualStator)
+    acts = {"v_f": True, "i*": stator, "x_v": not stator and c["T_k_vi"] > 0.0}
+    acts["x_c"] = c["T_k_ci"] > 0.0
+    acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), isinstance(inner, DualSequence))
+    both = [name for name, there in acts.items() if there]
+    states = [f"{name} of the inner stage, {axis}" for name in both for axis in "dq"]
+    states += ["angle of the PLL", "frequency of the PLL"] if inner.f_pll > 0.0 else []
+    return both, states
 
 
 def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:

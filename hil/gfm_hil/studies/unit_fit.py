@@ -11,6 +11,7 @@ equation itself leaves shows as more after the jump than before it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +66,33 @@ class UnitFit:
         return 2.0 * self.H / self.D
 
 
+@dataclass(frozen=True)
+class _Recorded:
+    """The power around a phase jump, as means over a cycle."""
+
+    radians: float  # of the jump
+    omega_b: float  # rad/s
+    X_grid: float  # of the line to the stiff grid, p.u.
+    before: Vector  # p.u.
+    after: Vector  # p.u.
+    starts: Vector  # of ``after`` from the jump, s
+    smooth: list[float]  # the lengths of the means that p has been through, s
+    lag: float  # of the meter, s
+
+    def left(self, X: float, zero: float, stiff: float) -> Vector:
+        """What the power is above that of the swing equation, without its mean: the level at rest
+        is not known."""
+        swing = np.array([1.0, zero, stiff])
+        seen = np.convolve(swing, [self.lag, 1.0]) if self.lag else swing
+        poles, residues = modes([1.0, zero], seen)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a unit almost without inertia
+            for seconds in self.smooth:
+                residues = residues * np.expm1(poles * seconds) / (poles * seconds)
+            answer = (residues * np.exp(np.outer(self.starts, poles))).sum(1).real
+            rest = np.concatenate([self.before, self.after + self.radians / X * answer])
+            return np.asarray(rest - rest.mean())
+
+
 def fit_run(run: Run) -> UnitFit:
     """D, H and X_eff with intervals of 95 %, fitted to p after a phase jump of a stiff grid.
 
@@ -78,13 +106,46 @@ def fit_run(run: Run) -> UnitFit:
         UserError: the first event is no jump or the grid not stiff, the run is too short, or no
             swing equation fits.
     """
+    seen = _around_jump(run)
+    noise = float(np.std(seen.before))
+    largest = float(np.abs(seen.after - seen.before.mean()).max())
+    if not largest > 0:
+        raise UserError("fit: the power does not change")
+    most = math.hypot(0.1 * largest, 1.5 * noise)
+    best = fit_swing(seen.left, abs(seen.radians) / largest, most)
+    X, zero, stiff = (float(x) for x in np.exp(best.x))
+    H = seen.omega_b / (2 * stiff * X)
+    D, X_eff = 2 * H * zero, X - seen.X_grid
+    wide = _half_widths(best.fun, best.jac)
+    # D = omega_b zero/(stiff X), H = omega_b/(2 stiff X) and TPf = 1/zero: as logarithms, sums
+    interval = {}
+    for name, value, way in (
+        ("D", D, (-1, 1, -1)),
+        ("H", H, (-1, 0, -1)),
+        ("mp", 1 / D, (1, -1, 1)),
+        ("TPf", 1 / zero, (0, -1, 0)),
+    ):
+        factor = math.exp(min(_FAR, wide(*way)))
+        interval[name] = value / factor, value * factor
+    beside = X * wide(1, 0, 0)
+    interval["X_eff"] = X_eff - beside, X_eff + beside
+    if interval["X_eff"][1] <= 0:
+        raise UserError(
+            f"fit: X = {X:.4g} p.u. in all: must be above that of the line, {seen.X_grid:.4g} p.u."
+        )
+    left = float(np.sqrt(np.mean(best.fun[len(seen.before) :] ** 2)))
+    return UnitFit(D, H, X_eff, interval, noise, left)
+
+
+def _around_jump(run: Run) -> _Recorded:
+    """The power of a run around its phase jump; raises as ``fit_run``."""
     scenario, T_s = run.scenario, run.scenario.T_s
     events = scenario.sorted_events()
     if scenario.network is not None or scenario.plant.grid.finite is not None:
         raise UserError("fit: the grid must be stiff, of one converter")
     if not events or not isinstance(events[0], PhaseJump) or not events[0].degrees:
         raise UserError("fit: the first event must be a grid-phase-jump")
-    radians, first = math.radians(events[0].degrees), events[0].at(T_s)
+    first = events[0].at(T_s)
     par, lcl = make_plant(scenario.plant, T_s).par[0], scenario.plant.lcl
     omega_b, X_grid = float(par["omega_b"]), float(par["L_g"]) - (lcl.L if lcl else 0.0)
     read = run.summary.get(ABOUT, {})
@@ -108,51 +169,22 @@ def fit_run(run: Run) -> UnitFit:
             )
     starts = skip * T_s - 0.5 * window + width * T_s * np.arange(len(after))
     smooth = [width * T_s, *filter(None, [window])]
+    radians = math.radians(events[0].degrees)
+    return _Recorded(radians, omega_b, X_grid, before, after, starts, smooth, lag)
 
-    def off(X: float, zero: float, stiff: float) -> Vector:
-        swing = np.array([1.0, zero, stiff])
-        poles, residues = modes([1.0, zero], np.convolve(swing, [lag, 1.0]) if lag else swing)
-        with np.errstate(over="ignore", invalid="ignore"):  # of a unit almost without inertia
-            for seconds in smooth:
-                residues = residues * np.expm1(poles * seconds) / (poles * seconds)
-            answer = (residues * np.exp(np.outer(starts, poles))).sum(1).real
-            rest = np.concatenate([before, after + radians / X * answer])
-            return np.asarray(rest - rest.mean())  # the level at rest
 
-    noise, largest = float(np.std(before)), float(np.abs(after - before.mean()).max())
-    if not largest > 0:
-        raise UserError("fit: the power does not change")
-    best = fit_swing(off, abs(radians) / largest, math.hypot(0.1 * largest, 1.5 * noise))
-    rest, J = best.fun, best.jac
+def _half_widths(rest: Vector, J: Vector) -> Callable[..., float]:
+    """Half of the interval of a sum of the parameters with these factors."""
     free = len(rest) - J.shape[1] - 1
     inverse = np.linalg.pinv(J.T @ J)
     C = toeplitz(_autocovariance(rest * math.sqrt(len(rest) / free)))
     covariance = inverse @ J.T @ C @ J @ inverse
-    X, zero, stiff = (float(x) for x in np.exp(best.x))
-    H = omega_b / (2 * stiff * X)
     sure = float(student.ppf(0.975, free))
 
     def wide(*way: int) -> float:
         return sure * math.sqrt(max(0.0, float(np.array(way) @ covariance @ np.array(way))))
 
-    # D = omega_b zero/(stiff X), H = omega_b/(2 stiff X) and TPf = 1/zero: as logarithms, sums
-    interval = {}
-    for name, value, way in (
-        ("D", 2 * H * zero, (-1, 1, -1)),
-        ("H", H, (-1, 0, -1)),
-        ("mp", 1 / (2 * H * zero), (1, -1, 1)),
-        ("TPf", 1 / zero, (0, -1, 0)),
-    ):
-        factor = math.exp(min(_FAR, wide(*way)))
-        interval[name] = value / factor, value * factor
-    X_eff, beside = X - X_grid, X * wide(1, 0, 0)
-    interval["X_eff"] = X_eff - beside, X_eff + beside
-    if interval["X_eff"][1] <= 0:
-        raise UserError(
-            f"fit: X = {X:.4g} p.u. in all: must be above that of the line, {X_grid:.4g} p.u."
-        )
-    left = float(np.sqrt(np.mean(rest[len(before) :] ** 2)))
-    return UnitFit(2 * H * zero, H, X_eff, interval, noise, left)
+    return wide
 
 
 def _means(x: Vector, width: int) -> Vector:
