@@ -80,6 +80,7 @@ def test_no_certified_network_is_unstable(law, inner) -> None:
     assert certified > 5
 
 
+@pytest.mark.full  # 30 points of a scan
 def test_a_measured_converter_is_certified_as_its_model() -> None:
     scan = gfmhil.scan("mimo-gfm", inner="virtual-stator", stop_hz=4500.0, points=30)
     (R, L), grids = scan.line, GridClass(1.5, 100.0, (5.0, 15.0))

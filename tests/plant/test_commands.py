@@ -4,10 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba import njit
-from numba.core.runtime import _nrt_python, rtsys
-
-from gfm_plant import TRUTH, plant_advance, plant_sample, plant_truth
 
 
 def commands(n: int, u0: Any) -> Any:
@@ -90,28 +86,3 @@ def test_regulated_source_does_not_wind_up(rest):
         peak = max(peak, plant.truth()["v_dc"])
     assert plant.truth()["v_dc"] == pytest.approx(1.0, abs=1e-3)
     assert peak < 1.01
-
-
-def test_no_allocation_in_a_tick(rest):
-    @njit
-    def run(plant: Any, u: Any, y: Any, out: Any, ticks: int) -> None:
-        for _ in range(ticks):
-            plant_sample(plant, 0, y)
-            plant_advance(plant, u)
-            plant_truth(plant, 0, out)
-
-    plant = rest(
-        sensors={"bandwidth_hz": 2000.0, "noise_std": {"p": 1e-3}},
-        adc="DS2004",
-        dac="DS2101",
-        delay={"samples": 1, "fraction": 0.5},
-    )
-    arguments = plant.plant.records, plant.u, np.empty(5), np.empty(len(TRUTH))
-    run(*arguments, 1)
-    _nrt_python.memsys_enable_stats()
-    before = rtsys.get_allocation_stats().alloc
-    run(*arguments, 1000)
-    after = rtsys.get_allocation_stats().alloc
-    _nrt_python.memsys_disable_stats()
-    boxed = len(plant.plant.memory) + 3  # the arguments, once per call; nothing per tick
-    assert after - before <= boxed
