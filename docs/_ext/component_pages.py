@@ -122,6 +122,13 @@ def _breaker(one: _Entry) -> str:
     return f"`breaker` with its name.{checked}"
 
 
+def _terminals(one: _Entry) -> list[str]:
+    """Where a run may record it."""
+    parts = NetworkParts.model_validate(one.example)
+    each = {name: found for _, name, found in parts.components()}
+    return [end.name for end in each[_NAME].terminals(_NAME)] if _NAME in each else []
+
+
 def components() -> str:
     """Every component: what it is, its parameters, states, breaker and columns."""
     lines = []
@@ -131,6 +138,9 @@ def components() -> str:
         states = _states(one)
         lines += ["States:", "", *(states or ["- none"]), ""]
         lines += [f"Breaker: {_breaker(one)}", ""]
+        if ends := _terminals(one):
+            named = " and ".join(f"`{end}`" for end in ends)
+            lines += [f"Where `network.record` names it: power and current of {named}.", ""]
         if one.columns:
             known_as = {name: TABLE[name] for name in one.columns}
             rows = [(f"`{n}`", row.unit or "–", row.quantity) for n, row in known_as.items()]

@@ -9,6 +9,7 @@ from .emulator import (
     plant_step,
     plant_truth,
 )
+from .flows import plant_flows
 from .grid import (
     SynchroCheckResult,
     breaker,
@@ -68,6 +69,7 @@ __all__ = [
     "plant_advance",
     "plant_command",
     "plant_equilibrium",
+    "plant_flows",
     "plant_is_delayed",
     "plant_options",
     "plant_sample",

@@ -13,7 +13,7 @@ from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.line import Line
-from gfm_plant.components.part import Component, Dynamic, Fed, emf
+from gfm_plant.components.part import Component, Dynamic, Fed, Terminal, emf
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.swing import pack_swing
 from gfm_plant.layout import Record, make_net_and_now
@@ -86,7 +86,8 @@ def make_network(
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
     opened = frozenset(name for _, name, one in each if not getattr(one, "closed", True))
-    network = _make(converters, T_s, grid, parts.grid, each, opened)
+    recorded = parts.recorded({name: node for name, (_, node) in converters.items()})
+    network = _make(converters, T_s, grid, parts.grid, each, opened, recorded=recorded)
     network.net["joins"] = 1
     return network
 
@@ -111,6 +112,7 @@ def _make(
     each: Sequence[tuple[str, str, Component]] = (),
     opened: frozenset[str] = frozenset(),
     branches: Sequence[Branch] = (),
+    recorded: tuple[Terminal, ...] = (),
 ) -> Network:
     """Return a plant.
 
@@ -118,6 +120,7 @@ def _make(
         each: table, name and options of each component.
         opened: names of those whose breaker is open.
         branches: more of them, p.u. of the converter.
+        recorded: where the run records currents and powers.
     """
     if not (math.isfinite(T_s) and T_s > 0):
         raise ValueError(f"T_s = {T_s}: must be finite and > 0 s")
@@ -148,6 +151,7 @@ def _make(
         tuple(fed),
         grid_node,
         opened=opened,
+        recorded=recorded,
     )
     _check_paths(wiring)
     dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
@@ -233,6 +237,12 @@ def _network(
         len(wiring.breakers()) + 2,  # the grid's, and the second end of a line with a fault inside
         len(wiring.nodes),
         entries,
+        (
+            sum(1 for one in wiring.recorded if one.node),
+            len(wiring.recorded_nodes),
+            sum(len(one.parts) or len(wiring.order) for one in wiring.recorded),
+            sum(len(one.columns) for one in wiring.recorded),
+        ),
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)

@@ -78,7 +78,7 @@ def _may_open(n: Any, now: Any, j: int, p: int) -> bool:
 def _keep_currents(plant: PlantRecords, at: float, which: int) -> None:
     n, i = plant.net[0], field(plant.now[0], "carried")
     for j in range(n.poles + 1):
-        i[which, j, 0], i[which, j, 1], i[which, j, 2] = _currents(plant, at, j)
+        i[which, j, 0], i[which, j, 1], i[which, j, 2] = contact_currents(plant, at, j)
 
 
 @compiled
@@ -97,7 +97,7 @@ def _find_zero(plant: PlantRecords, j: int, p: int, begin: float, f_a: float, f_
     for _ in range(_TRIES):
         at = (a * f_b - b * f_a) / (f_b - f_a)
         _go_to(plant, begin, at)
-        f = _currents(plant, at, j)[p]
+        f = contact_currents(plant, at, j)[p]
         if abs(f) < _ZERO:
             return at
         if f * f_b > 0.0:
@@ -145,7 +145,7 @@ def _pass_on(plant: PlantRecords, at: float) -> None:
     """Set the contact's own current, if it may become a state, to what flows through it now."""
     n = plant.net[0]
     if n.contact_w >= 0:
-        i_a, i_b, i_c = _currents(plant, at, 0)
+        i_a, i_b, i_c = contact_currents(plant, at, 0)
         vector = complex((2.0 * i_a - i_b - i_c) / 3.0, (i_b - i_c) / math.sqrt(3.0))
         field(plant.now[0], "w")[n.contact_w] = vector * _turn(plant, at).conjugate()
 
@@ -172,7 +172,7 @@ def _open_joint(plant: PlantRecords, j: int, p: int, at: float) -> None:
 
 
 @compiled
-def _currents(plant: PlantRecords, at: float, j: int) -> tuple[float, float, float]:
+def contact_currents(plant: PlantRecords, at: float, j: int) -> tuple[float, float, float]:
     """Return the currents of phases a, b, c through contact j, of several or the only one, at an
     instant of the period."""
     n, now = plant.net[0], plant.now[0]

@@ -1,4 +1,4 @@
-"""How a plant goes on between two instants of a sampling period: averaged, or from edge to edge.
+"""How a plant goes on between two instants of a sampling period: averaged, or from edge to edge;
 
 A compiled function contains all that it calls, and LLVM optimises the callees again in each caller.
 Both ways are large and have several callers. So callers reach them by an address in the plant's
@@ -43,11 +43,13 @@ def _switched(plant: Any, begin: float, end: float) -> None:
 @inlined
 def advance(plant: PlantRecords, begin: float, end: float) -> None:
     """Go on between two instants of the period, s after its beginning; inf: to its end."""
-    _call(plant.net[0].advance, plant, begin, end)
+    call_at(plant.net[0].advance, plant, begin, end)
 
 
 @intrinsic
-def _call(typingctx: Any, address: Any, plant: Any, begin: Any, end: Any) -> Any:
+def call_at(typingctx: Any, address: Any, plant: Any, begin: Any, end: Any) -> Any:
+    """Call the function at an address, with these arguments, inside compiled functions."""
+
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         at, *others = arguments
         others[0] = cgutils.alloca_once_value(builder, others[0])

@@ -216,6 +216,11 @@ def _fill(n: Any, now: Any) -> None:
                     node_w[c, place, image, i] += by * modes[c, image, m, i]
                 for s in range(now.n_s):
                     node_s[c, place, image, s] += by_rate * drive[c, image, m, s]
+    for place in range(node.shape[0]):  # `solution.node_voltage` turns the whole sum around
+        for i in range(n.n_states):
+            node_w[c, place, 1, i] = node_w[c, place, 1, i].conjugate()
+        for s in range(now.n_s):
+            node_s[c, place, 1, s] = node_s[c, place, 1, s].conjugate()
 
 
 @inlined

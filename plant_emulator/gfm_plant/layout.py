@@ -84,6 +84,15 @@ _NET: _Arrays = {
     "node_s": (complex, ("n_m", "n_nodes", 2, "n_s")),
     "node_turn": (complex, ("n_c",)),
     "node_i": (int, ("n_nodes",)),
+    # of recorded terminals, see `flows`: the places of nodes in ``flow_v``, whether the grid holds
+    # a node; where the currents of each begin among ``flow_from``, which are places in w, or
+    # after those of sources, and ``flow_by``, their factors; and its conductance to ground
+    "flow_node": (int, ("n_flows",)),
+    "flow_held": (int, ("n_flow_nodes",)),
+    "flow_begin": (int, ("n_flow_ends",)),
+    "flow_from": (int, ("n_flow_sums",)),
+    "flow_by": (float, ("n_flow_sums",)),
+    "flow_G": (float, ("n_flows",)),
     # of a large plant, see `sparse.Sparse`, of each contact its axis alpha and its axis beta: how
     # many states, sums for the voltages, rows of ``extra_at``, sums on the way in, and sums of no
     # more than two, of three and of four entries; and of each node whose voltage is looked at its
@@ -133,6 +142,10 @@ _NOW: _Arrays = {
     "w": (complex, ("n_w",)),
     "emf": (complex, ("n_s",)),  # p.u.; of a component with a voltage, over its unit phasor
     "unit": (complex, ("n_phasors",)),  # the sources' unit phasors, then those of their mirrors
+    # of recorded terminals the voltages of their nodes; the currents of components with such
+    "flow_v": (complex, ("n_flow_nodes",)),
+    "flow_i": (complex, ("n_flow_sources",)),
+    "flow_row": (float, ("n_flow_columns",)),  # as recorded at the last look
     "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
     "w_before": (complex, ("n_w",)),  # at the last tick
     "unit_before": (complex, ("n_s",)),
@@ -182,7 +195,8 @@ net_dtype = _header(
     [
         ("omega_b", "f8"),  # rad/s
         ("T_s", "f8"),
-        ("advance", "i8"),  # address, see `going_on`
+        ("advance", "i8"),  # addresses, see `going_on`; of the second 0: nothing is recorded
+        ("look", "i8"),
         ("conversions", "i8"),  # of the A/D at the phases in a period
         ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
@@ -195,6 +209,11 @@ net_dtype = _header(
         # whether p, q and V of the connection points, and the charge of batteries, are recorded
         ("connections", "i8"),
         ("batteries", "i8"),
+        # of recorded terminals, see `flows`: the place of the first of their nodes among those
+        # whose voltage is looked at, and whether the currents of a fault are recorded, and there
+        # may be one: 0, 1 or 2
+        ("flow_first", "i8"),
+        ("flow_fault", "i8"),
         ("n_states", "i8"),  # of w, without those at its end that the plant does not have
         ("contact_w", "i8"),  # place of the contact's own current, -1: it has none
         # of several contacts: how many states, breakers' ends; whether the fault opens at zeros
@@ -276,6 +295,7 @@ def make_net_and_now(
     breakers: int = 0,
     nodes: int = 0,
     entries: int = 0,
+    flows: tuple[int, int, int, int] = (0, 0, 0, 0),
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -291,6 +311,8 @@ def make_net_and_now(
         breakers: how many ends of lines may open at a time.
         nodes: between the parts.
         entries: of the sums of a large plant, see `sparse`; 0: it is solved by its modes.
+        flows: recorded terminals, their nodes, and currents that these are sums of, at most, and
+            columns of all.
     """
     modes, circuits = 2 * states - zeros, MOST_CONTACTS * (converters + 1) + 1
     if entries:
@@ -300,7 +322,10 @@ def make_net_and_now(
         "n_phasors": 2 * sources, "n_contacts": MOST_CONTACTS,
         "n_c": circuits, "n_m": 1 if entries else circuits,
         "n_parts": parts, "n_cuts": 2 * parts + 1,
-        "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0),
+        "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0) + flows[1],
+        "n_flows": flows[0], "n_flow_nodes": flows[1], "n_flow_sums": flows[2],
+        "n_flow_sources": sources if flows[0] else 0, "n_flow_columns": flows[3],
+        "n_flow_ends": flows[0] + 1 if flows[0] else 0,
         "n_units": units, "n_rates": circuits if units else 0,
         "n_q": modes, "n_poles": breakers if modes else 0, "n_joint": breakers + 1,
         "n_sparse": 2 * MOST_CONTACTS if entries else 0, "n_sum": entries,
@@ -311,6 +336,7 @@ def make_net_and_now(
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
     net["connections"], net["sparse"] = connections, entries > 0
+    net["flow_first"] = CHECK_SIDES + (converters if connections else 0)
     return net, now
 
 

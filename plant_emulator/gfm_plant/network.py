@@ -10,13 +10,16 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from numba import typeof
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from gfm_plant.circuit import Branch
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed, emf
 from gfm_plant.contacts import OWN_PATH, join
 from gfm_plant.emulator import plant_start, reconnect
+from gfm_plant.flows import find_look
 from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
@@ -51,6 +54,7 @@ class Network:
         """The same memory, as the compiled functions take it."""
         records = PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
         self.net["advance"] = find_address(records)
+        self.net["look"] = find_look(typeof(records)) if self.wiring.recorded else 0
         return records
 
     @property
@@ -239,6 +243,7 @@ def _connect(plant: Network, wiring: Wiring) -> None:
             may_lead = may_lead and not record["leads"]
     found, which = {}, {}
     _pack_contacts(net, wiring)
+    _pack_flows(net, wiring)
     looked_at = _nodes(net, wiring)
     net["poles"], fastest = 0, []
     if net["sparse"]:
@@ -342,7 +347,40 @@ def _nodes(net: Any, wiring: Wiring) -> dict[int, str]:
         found[CHECK_SIDES + k] = unit.connection
         last = "beyond" if wiring.split == unit.line else unit.line
         net["node_i"][CHECK_SIDES + k] = wiring.order.index(last)
-    return found
+    return found | dict(enumerate(wiring.recorded_nodes, int(net["flow_first"])))
+
+
+def _pack_flows(net: Any, wiring: Wiring) -> None:
+    """Set what the currents of recorded terminals are made of, and which of their nodes the grid
+    holds."""
+    order, nodes, sources = wiring.order, wiring.recorded_nodes, wiring.sources()
+    net["flow_held"] = [wiring.closed and node == wiring.grid for node in nodes]
+    net["flow_fault"] = 0
+    through = {one.name: 1 / one.R for one in wiring.shunts if one.name not in wiring.opened}
+    sinks = {one.name for one in wiring.sinks} - wiring.opened
+    k = count = 0
+    for one in wiring.recorded:
+        if not one.node:
+            net["flow_fault"] = 1 + (wiring.fault is not None)
+            continue
+        parts = one.parts or tuple(
+            (name, -by) for name, by in wiring.with_poles().to_grid().items()
+        )
+        net["flow_node"][k], net["flow_begin"][k] = nodes.index(one.node), count
+        net["flow_G"][k] = sum(by * through.get(name, 0.0) for name, by in parts)
+        for name, by in parts:
+            if name == wiring.split != one.name:  # its end
+                name = "beyond"
+            if name in order:
+                net["flow_from"][count] = order.index(name)
+            elif name in sinks:
+                net["flow_from"][count] = len(order) + sources[name]
+            else:
+                continue
+            net["flow_by"][count], count = by, count + 1
+        k += 1
+    if k:
+        net["flow_begin"][k] = count
 
 
 def _pack_contacts(net: Any, wiring: Wiring) -> None:
@@ -391,15 +429,28 @@ def _pack_joint(plant: Network, wiring: Wiring) -> float:
         if source == GRID_SOURCE:
             net["from_s"][places[source] + 1, :, :q] = one.from_s[:, j]
     net["node_q"] = 0.0
+
+    def behind(place: int, state: str, path: Sequence[tuple[Branch, bool]]) -> None:
+        """A node's voltage: that of a capacitor, and what branches on the way add and take."""
+        direct, rate = net["node_q"][place, :, :, :q]
+        if state:
+            direct += one.to_w[:, order.index(state)]
+        for branch, forth in path:
+            i = one.to_w[:, order.index(branch.name)]
+            for v, Z in ((direct, branch.R), (rate, branch.L / wiring.omega_b)):
+                if forth:
+                    v /= branch.ratio
+                v -= Z * i if forth else -Z * i
+                if not forth:
+                    v *= branch.ratio
+
     pieces = {part.name: part for part in wiring.with_poles().whole(wiring.units_lines)}
     for k, unit in enumerate(wiring.units if net["connections"] else ()):
-        direct, rate = net["node_q"][CHECK_SIDES + k, :, :, :q]
-        direct += one.to_w[:, order.index(unit.states[1])]
-        for name in (unit.line, *(["beyond"] * (wiring.split == unit.line))):
-            if unit.at_end and name in pieces:
-                i = one.to_w[:, order.index(name)]
-                direct -= pieces[name].R * i
-                rate -= pieces[name].L / wiring.omega_b * i
+        line = [unit.line, *(["beyond"] * (wiring.split == unit.line))] if unit.at_end else []
+        path = [(pieces[name], True) for name in line if name in pieces]
+        behind(CHECK_SIDES + k, unit.states[1], path)
+    for k, node in enumerate(wiring.recorded_nodes, int(net["flow_first"])):
+        behind(k, *wiring.path_to(node))
     if net["n_units"]:
         c, norm = net["n_c"] - 1, max(np.linalg.norm(flow, 2) for flow in one.flow)
         net["axis"][c], net["leg_axis"][c] = 1.0, np.exp(2j * np.pi / 3 * np.arange(3))

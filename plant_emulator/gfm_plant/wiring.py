@@ -31,7 +31,7 @@ from gfm_plant.circuit import (
     rest,
     without_ends,
 )
-from gfm_plant.components.part import Fed, emf
+from gfm_plant.components.part import Fed, Terminal, emf
 from gfm_plant.contacts import zero_circuit
 from gfm_plant.names import FAULTED_PHASES
 
@@ -202,6 +202,7 @@ class Wiring:
     # indices of converters whose bridges are out of every circuit
     blocked: frozenset[int] = frozenset()
     check: Check | None = None  # the synchro-check that waits to close a breaker, or None
+    recorded: tuple[Terminal, ...] = ()  # where the run records currents and powers
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -230,6 +231,32 @@ class Wiring:
         ends += [sink.node for sink in self.sinks]
         within = {GROUND, *(unit.terminal for unit in self.units)}  # which a core may be at
         return tuple(dict.fromkeys(node for node in ends if node not in within))
+
+    @property
+    def recorded_nodes(self) -> tuple[str, ...]:
+        """The nodes of ``recorded``, each once."""
+        return tuple(dict.fromkeys(one.node for one in self.recorded if one.node))
+
+    def path_to(self, node: str) -> tuple[str, list[tuple[Branch, bool]]]:
+        """A capacitor's voltage, and the branches from there to a node, each with whether they lead
+        from its start to its end; over an opening breaker only where nothing else leads there.
+        Nothing does: "" and none."""
+        banks = {bank.node: bank.name for bank in self.capacitors}
+        known = banks | {unit.terminal: unit.states[1] for unit in self.units}
+        found: dict[str, tuple[str, list[tuple[Branch, bool]]]]
+        found = {at: (state, []) for at, state in known.items()}
+        opening = {part for _, part in self.poles}
+        whole = [*self.with_poles().whole((*self.units_lines, *self.branches))]
+        for those in ([one for one in whole if one.name not in opening], whole):
+            before = -1
+            while before < len(found):
+                before = len(found)
+                for one in those:
+                    for a, b in ((one.start, one.end), (one.end, one.start)):
+                        if a in found and b not in found and GROUND not in (a, b):
+                            state, path = found[a]
+                            found[b] = state, [*path, (one, a == one.start)]
+        return found.get(node, ("", []))
 
     @property
     def joint(self) -> bool:

@@ -93,6 +93,7 @@ class _End:
             part.signals,
             part.times,
             part.progress,
+            part.flows,
             *bench.trace,
         )
         self.side = Side(end, records)

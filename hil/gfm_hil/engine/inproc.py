@@ -18,7 +18,7 @@ from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
-from gfm_plant import PlantRecords, plant_is_delayed, plant_step
+from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
@@ -61,7 +61,7 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 @compiled
 def _run_ticks(
-    plant, stack, plant_rows, controller_rows, start, stop, first, survives_trip, plan, kept
+    plant, stack, plant_rows, controller_rows, flows, start, stop, first, survives_trip, plan, kept
 ):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
     ctl, laws, states, est = stack.controllers
@@ -70,6 +70,7 @@ def _run_ticks(
     delayed = plant_is_delayed(plant)
     for k in range(start, stop):
         changed, trips = False, 0
+        plant_flows(plant, flows[k - first])
         for i in range(len(ctl)):
             before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, k - first]
             tripped = sample(plant, i, y[i], row)
@@ -110,6 +111,7 @@ def run_ticks(
     first: int = 0,
     survives_trip: bool = False,
     trace: Trace | None = None,
+    flows: NDArray[np.float64] | None = None,
 ) -> int:
     """Run ticks [start, stop); returns the tick after the last one done.
 
@@ -122,8 +124,10 @@ def run_ticks(
             columns as ``signals_of`` says.
         survives_trip: the run does after a trip.
         trace: what the run replays, if anything.
+        flows: of the network, (ticks, columns), likewise; None: nothing.
     """
-    rows, more = (plant_rows, controller_rows), trace or no_trace()
+    of_network = np.empty((plant_rows.shape[1], 0)) if flows is None else flows
+    rows, more = (plant_rows, controller_rows, of_network), trace or no_trace()
     return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip, *more)[0])
 
 
@@ -141,6 +145,7 @@ def run_inproc(
     chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
     controllers = stack(benches)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
+    flows = np.empty((piece, len(bench.flows)))
     sides = (plant_rows, plant_parts), (controller_rows, controller_parts)
     while k < ticks and any(timeline.running for timeline in timelines):
         for timeline in timelines:
@@ -153,6 +158,7 @@ def run_inproc(
                 controllers,
                 plant_rows,
                 controller_rows,
+                flows,
                 k,
                 end,
                 k,
@@ -162,6 +168,7 @@ def run_inproc(
             for room, parts in sides:
                 for part, recorded in zip(parts, room, strict=True):
                     part.put(k, recorded[: done - k])
+            plant_parts[0].put_flows(k, flows[: done - k])
             k = done
         if bench.plant.net[0]["joins"]:
             follow_trips(bench.plant)

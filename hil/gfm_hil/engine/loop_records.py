@@ -104,6 +104,7 @@ class Records(NamedTuple):
     rows: NDArray[np.float64]
     times: NDArray[np.int64]
     progress: NDArray[np.int64]
+    flows: NDArray[np.float64]  # of the network, of that part; (ticks, 0) if it has none
     # plan, kept: of the trace that is replayed, see ``gfm_hil.engine.replay``
     plan: NDArray[np.int64]
     kept: NDArray[np.float64]

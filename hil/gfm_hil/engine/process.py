@@ -131,8 +131,10 @@ class _SideResources:
         self.scenario = scenario = bench.scenario
         _begin(folder, scenario)
         if scenario.mode == "realtime":
-            keep_in_memory(folder, scenario.ticks, notice, bench.inner, bench.options)
-        self.part = RolePart.create(folder, role, scenario.ticks, bench.inner, bench.options)
+            keep_in_memory(folder, scenario.ticks, notice, bench.inner, bench.options, bench.flows)
+        self.part = RolePart.create(
+            folder, role, scenario.ticks, bench.inner, bench.options, bench.flows
+        )
         self.timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         stack.callback(self.timeline.close)
 

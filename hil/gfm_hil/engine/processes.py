@@ -116,7 +116,10 @@ class Processes:
                 else:
                     endpoints[name] = link.endpoint
                 if self.scenario.mode == "realtime":
-                    keep_in_memory(self._places[name], self.scenario.ticks, self.notice)
+                    flows = self.scenario.flows if name == next(iter(self._places)) else ()
+                    keep_in_memory(
+                        self._places[name], self.scenario.ticks, self.notice, flows=flows
+                    )
             self._say_what_starts()
             self._plant = _Process("plant", "plant", self.folder, self._plant_command(endpoints))
             self._controllers = {

@@ -59,6 +59,12 @@ class Bench:
         n = self.plant.net[0]
         return (CONNECTION if n["connections"] else ()) + (BATTERY if n["batteries"] else ())
 
+    @property
+    def flows(self) -> tuple[str, ...]:
+        """What the recording has of the network, which is beside that of its first converter."""
+        those = self.plant.wiring.recorded if self.place == 0 else ()
+        return tuple(name for one in those for name in one.columns)
+
     def keep(self) -> None:
         """Remember this instant as the start, to which a reset goes back."""
         c = self.controller

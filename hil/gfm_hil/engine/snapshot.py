@@ -66,10 +66,11 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
         own = _folder(folder, bench)
         if bench.place == 0:
             kept = _read(_file(own, "plant"), where)
-            plant, advance = bench.plant, bench.plant.net["advance"].copy()
+            plant, own_net = bench.plant, bench.plant.net.copy()
             for name, record in _memory(bench).items():
                 put_back(where, kept, name, record)
-            plant.net["advance"] = advance  # an address of this process
+            for name in ("advance", "look"):  # addresses of this process
+                plant.net[name] = own_net[name]
         kept, c = _read(_file(own, "controller"), where), bench.controller
         if (kept.get("laws", np.zeros(0)).tobytes()) != c.laws.tobytes():
             raise UserError(

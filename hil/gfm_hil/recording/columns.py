@@ -82,9 +82,11 @@ def kept_of(role: Role) -> tuple[str, ...]:
     return TIMES_OF[role] + COUNTS_OF[role]
 
 
-def bytes_per_tick(inner: int = PLAIN, options: tuple[str, ...] = ()) -> int:
-    """What a tick takes in the parts of a run."""
-    signals = [signals_of(role, inner, options) for role in SIGNALS_OF]
+def bytes_per_tick(
+    inner: int = PLAIN, options: tuple[str, ...] = (), flows: tuple[str, ...] = ()
+) -> int:
+    """What a tick takes in the parts of a run; ``flows``: the columns of its network."""
+    signals = [*(signals_of(role, inner, options) for role in SIGNALS_OF), flows]
     return 8 * sum(map(len, [*signals, *map(kept_of, SIGNALS_OF)]))
 
 
@@ -135,7 +137,7 @@ class Described:
     def shown(self, f_n: float) -> Shown:
         """A frequency in Hz (``f_n`` is nominal), an angle in degrees, the rest as recorded."""
         signal = self.name
-        if self.name not in CONTROLLER_INNER:  # their names have no prefix
+        if self.name not in CONTROLLER_INNER and "." not in self.name:  # their names have no prefix
             signal = self.name.partition("_")[2] or self.name
         if self.unit == "p.u. (omega_n)":
             return Shown("f_g" if signal == "omega_g" else "f", "Hz", f_n)
@@ -284,12 +286,37 @@ DERIVED = _derived()
 A phase's voltage is that against the star point of the three: with three wires there is no zero
 sequence."""
 
+_FLOWS = {
+    "P": ("P", "p.u. (S_n)", "active power"),
+    "Q": ("Q", "p.u. (S_n)", "reactive power"),
+    "i_re": (r"\Re i", "p.u. (S_n/V_n)", "current, real part in the frame that turns at omega_n"),
+    "i_im": (r"\Im i", "p.u. (S_n/V_n)", "current, imaginary part in that frame"),
+    **{
+        f"i_{phase}": (f"i_{phase}", "p.u. (sqrt(2/3) S_n/V_n)", f"current of phase {phase}")
+        for phase in PHASES
+    },
+}
+"""What a run records of parts of a network, see `gfm_plant.components.part.Terminal`: symbol, unit,
+with the bases of the first converter, and meaning by what follows the name of the part and a dot.
+"""
+
+
+def of_network(name: str) -> Described | None:
+    """A column of a network, by its name."""
+    part, _, what = name.rpartition(".")
+    if not part or what not in _FLOWS:
+        return None
+    symbol, unit, quantity = _FLOWS[what]
+    return Described(name, symbol, unit, f"{quantity} of {part}", _TRUE)
+
+
 HERTZ = "f_hz"
 """The converter's frequency in Hz, which is derived: true_omega_u times the nominal frequency."""
 
 
 def describe(name: str, laws: list[str]) -> Described:
-    """A column of signals.npz or timing.npz, by its name there, or one of ``DERIVED``.
+    """A column of signals.npz or timing.npz, by its name there, one of ``DERIVED``, or one of a
+    network.
 
     Args:
         name: of the column.
@@ -298,7 +325,7 @@ def describe(name: str, laws: list[str]) -> Described:
     Raises:
         UserError: there is no such column.
     """
-    row = TABLE.get(name) or DERIVED.get(name)
+    row = TABLE.get(name) or DERIVED.get(name) or of_network(name)
     if row is None:
         raise UserError(f"column {name!r}: unknown; a recording has {[*TABLE]}")
     return replace(row, words=tuple(enumerate(laws))) if name == "law" else row
@@ -309,7 +336,7 @@ def unit_of(name: str) -> str:
     ``f_hz``; per unit without its base, and empty for codes."""
     if name == HERTZ:
         return "Hz"
-    row = TABLE.get(name) or TABLE[f"true_{name}"]
+    row = TABLE.get(name) or of_network(name) or TABLE[f"true_{name}"]
     return row.unit.partition(" (")[0]
 
 

@@ -49,7 +49,8 @@ class LiveRun:
                     and (part := RolePart.open(self.folder, role)) is not None
                 ):
                     self._parts = {**self._parts, role: part}
-                    self._columns = {**self._columns, **named(role, part.signals, part.times)}
+                    own = named(role, part.signals, part.times) | part.of_network()
+                    self._columns = {**self._columns, **own}
             return self._parts
 
     @property

@@ -1,6 +1,6 @@
 """Makes signals.npz and timing.npz from the parts of both roles."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, COUNTS_OF, kept_of, recorded_in
 from gfm_hil.recording.npz import BLOCK, ColumnGroup, write_npz
-from gfm_hil.recording.parts import RolePart, mapped, place_of
+from gfm_hil.recording.parts import FLOWS, RolePart, mapped, place_of
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NY
 
+_AT_ONCE = 64  # columns
 
-def _rows(file: Path, first: int, last: int, columns: int | None = None) -> NDArray[Any]:
+
+def _rows(file: Path, first: int, last: int, columns: slice = slice(None)) -> NDArray[Any]:
     """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
-    return np.ascontiguousarray(mapped(file)[first:last, :columns].T)
+    return np.ascontiguousarray(mapped(file)[first:last, columns].T)
 
 
 def _blocks(rows: int) -> Iterator[tuple[int, int]]:
@@ -50,7 +52,9 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
     columns = {role: recorded_in(role, part.signals.shape[1]) for role, part in parts.items()}
-    write_npz(folder / "signals.npz", _signals(files, columns, done, T_s, laws))
+    names = parts["plant"].names if "plant" in parts else ()
+    of_network = _of_network(place / FLOWS, names, done)
+    write_npz(folder / "signals.npz", _signals(files, columns, done, T_s, laws, of_network))
     write_npz(folder / "timing.npz", _timing(place, [*parts], done))
 
 
@@ -60,6 +64,7 @@ def _signals(
     done: int,
     T_s: float,
     laws: list[str],
+    of_network: Iterable[ColumnGroup],
 ) -> Iterator[ColumnGroup]:
     kinds: dict[str, np.dtype[Any]] = {"tick": np.dtype(np.int64), "t": np.dtype(float)}
 
@@ -86,7 +91,15 @@ def _signals(
     if "controller" in files:
         kinds = dict.fromkeys(columns["controller"], np.dtype(float))
         yield ColumnGroup(kinds, done, rows(files["controller"], CONTROLLER_COLUMNS.index("law")))
+    yield from of_network
     yield ColumnGroup.of(laws=np.array(known_laws(laws, used)))
+
+
+def _of_network(file: Path, names: Sequence[str], done: int) -> Iterator[ColumnGroup]:
+    """The columns of a network, a few at a time: each is kept in memory while it is written."""
+    for k in range(0, len(names), _AT_ONCE):
+        kinds = dict.fromkeys(names[k : k + _AT_ONCE], np.dtype(float))
+        yield ColumnGroup(kinds, done, partial(_rows, file, columns=slice(k, k + _AT_ONCE)))
 
 
 def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[ColumnGroup]:
@@ -102,7 +115,7 @@ def _timing(parts: Path, roles: list[Role], done: int) -> Iterator[ColumnGroup]:
             names = names[: len(names) - len(counts)]
         if known.any():
             kinds = {f"{role}_{name}": np.dtype(np.int64) for name in names}
-            yield ColumnGroup(kinds, done, partial(_rows, file, columns=len(kinds)))
+            yield ColumnGroup(kinds, done, partial(_rows, file, columns=slice(len(kinds))))
 
 
 def laws_used(indices: NDArray[Any]) -> int:

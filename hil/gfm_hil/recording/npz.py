@@ -35,7 +35,7 @@ _LEVEL = 1
 _SPOOL = 1 << 20  # bytes of a column, compressed, that are kept in memory
 _DENSEST = 1032  # bytes that deflate can make of one
 _FIELD = 0x6667  # id of the extra field: rows a block, then where each block begins
-_MEMBERS = 128  # of a file, at most; there are half as many columns
+_MEMBERS = 4096  # of a file, at most
 _LARGEST = 1 << 23  # bytes of a block, or of a column of another writer, which has no blocks
 #: what a damaged file raises in zipfile, zlib and here; of OSError, a place where no file goes on
 _DAMAGED = (

@@ -11,7 +11,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ from gfm_hil.recording.npz import read_header
 _MEMORY = Path("/dev/shm")
 _PREFIX = "gfmhil-parts-"
 _KINDS = ("signals", "times", "progress")
-_FILES = frozenset(f"{s}_{what}.npy" for s in ROLES for what in _KINDS)
+#: columns of a network and their names, beside those of the plant of its first converter
+FLOWS, _NAMES = "network_signals.npy", "network_names.npy"
+_FILES = frozenset((*(f"{s}_{what}.npy" for s in ROLES for what in _KINDS), FLOWS, _NAMES))
 _HOME = "home"  # in a folder in memory, a link back to the ``parts`` of its run
 _holds: dict[Path, int] = {}  # on folders in memory, by the ``parts`` that links to them
 
@@ -38,26 +40,35 @@ class RolePart:
     """One side's arrays: ``signals`` (ticks, columns) float64, NaN where not yet recorded,
     ``times`` (ticks, columns) int64 in ns, -1 where nothing happened, and ``progress`` for
     observers: ticks done; of the plant the misses, of the controller the reason of SAFE; and the
-    thread of the loop."""
+    thread of the loop; ``flows`` (ticks, columns) as ``signals``, of a network, with their names.
+    """
 
     signals: NDArray[np.float64]
     times: NDArray[np.int64]
     progress: NDArray[np.int64]
+    flows: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    names: tuple[str, ...] = ()
 
     @staticmethod
     def create(
-        folder: Path, role: Role, ticks: int, inner: int = False, options: tuple[str, ...] = ()
+        folder: Path,
+        role: Role,
+        ticks: int,
+        inner: int = False,
+        options: tuple[str, ...] = (),
+        flows: tuple[str, ...] = (),
     ) -> RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
-        ``inner``, ``options``: what the run records besides, see ``signals_of``.
+        ``inner``, ``options``: what the run records besides, see ``signals_of``; ``flows``: the
+        columns of its network, of which the controller records none.
         """
         columns, times = signals_of(role, inner, options), kept_of(role)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
-        def made(what: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
-            path = parts / f"{role}_{what}.npy"
+        def made(name: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
+            path = parts / name
             try:
                 array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
                 with path.open("r+b") as file:  # else a full disk would kill the process later
@@ -67,11 +78,21 @@ class RolePart:
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
+        of_network: tuple[str, ...] = flows if role == "plant" else ()
+        if of_network:
+            np.save(parts / _NAMES, np.array(of_network))
+        whole = (ticks, len(of_network))
         return RolePart(
-            made("signals", "f8", (ticks, len(columns)), np.nan),
-            made("times", "i8", (ticks, len(times)), -1),
-            made("progress", "i8", (3,), 0),
+            made(f"{role}_signals.npy", "f8", (ticks, len(columns)), np.nan),
+            made(f"{role}_times.npy", "i8", (ticks, len(times)), -1),
+            made(f"{role}_progress.npy", "i8", (3,), 0),
+            made(FLOWS, "f8", whole, np.nan) if of_network else np.empty(whole),
+            of_network,
         )
+
+    def put_flows(self, first: int, rows: NDArray[np.float64]) -> None:
+        """As ``put``, of the network."""
+        self.flows[first : first + len(rows)] = rows
 
     def put(self, first: int, rows: NDArray[np.float64]) -> None:
         """Record rows of consecutive ticks, the first of which is ``first``."""
@@ -99,7 +120,18 @@ class RolePart:
         whole = types and widths and progress.shape == (3,) and len(signals) == len(times)
         if not whole or not 0 <= progress[0] <= len(signals):
             raise UserError(f"{files[0]}: is no recording of a {role}, nor are those beside it")
-        return RolePart(signals, times, progress)
+        own = [file.with_name(name) for file in files[:1] for name in (FLOWS, _NAMES)]
+        if role != "plant" or not all(os.path.lexists(file) for file in own):
+            return RolePart(signals, times, progress)
+        flows, names = map(mapped, own)
+        shape = (len(signals), len(names)) if names.dtype.kind == "U" and names.ndim == 1 else ()
+        if flows.dtype.str != "<f8" or flows.shape != shape:
+            raise UserError(f"{own[0]}: is no recording of a network")
+        return RolePart(signals, times, progress, flows, tuple(map(str, names)))
+
+    def of_network(self) -> dict[str, NDArray[np.float64]]:
+        """The columns of its network, as views of shape (ticks,), by their names."""
+        return dict(zip(self.names, self.flows.T, strict=True))
 
 
 def mapped(file: Path) -> NDArray[Any]:
@@ -139,6 +171,7 @@ class Kept:
         ticks: of a run.
         inner, options: what the run records besides, see ``signals_of``.
         only: names of the columns that are kept; None: all.
+        flows: the columns of the network, which are kept.
     """
 
     def __init__(
@@ -148,19 +181,27 @@ class Kept:
         inner: int = False,
         options: tuple[str, ...] = (),
         only: Collection[str] | None = None,
+        flows: tuple[str, ...] = (),
     ) -> None:
         recorded = signals_of(role, inner, options)
         self._names = [name for name in recorded if only is None or name in only]
         self._places = [recorded.index(name) for name in self._names]
         self._columns = np.empty((len(self._names), ticks))
+        self._of_network = flows
+        self._flows = np.empty((len(flows), ticks))
 
     def put(self, first: int, rows: NDArray[np.float64]) -> None:
         """As ``RolePart.put``."""
         self._columns[:, first : first + len(rows)] = rows.T[self._places]
 
+    def put_flows(self, first: int, rows: NDArray[np.float64]) -> None:
+        """As ``RolePart.put_flows``."""
+        self._flows[:, first : first + len(rows)] = rows.T
+
     def named(self, done: int) -> dict[str, NDArray[np.float64]]:
         """The columns of the first ``done`` ticks by name, as views of shape (done,)."""
-        return dict(zip(self._names, self._columns[:, :done], strict=True))
+        found = dict(zip(self._names, self._columns[:, :done], strict=True))
+        return found | dict(zip(self._of_network, self._flows[:, :done], strict=True))
 
 
 def keep_in_memory(
@@ -169,6 +210,7 @@ def keep_in_memory(
     notice: Callable[[str], None] = lambda text: None,
     inner: int = False,
     options: tuple[str, ...] = (),
+    flows: tuple[str, ...] = (),
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.
 
@@ -182,7 +224,7 @@ def keep_in_memory(
     if not _MEMORY.is_dir():
         return
     _rescue(notice)
-    needed = bytes_per_tick(inner, options) * ticks
+    needed = bytes_per_tick(inner, options, flows) * ticks
     parts = folder / "parts"
     if not parts.is_symlink():
         if shutil.disk_usage(_MEMORY).free < 2 * needed:

@@ -22,6 +22,7 @@ from gfm_hil.recording.columns import (
     TABLE,
     ColumnLike,
     Columns,
+    of_network,
     pieces,
     unit_of,
     wave,
@@ -35,6 +36,7 @@ from gfm_hil.results.look import figure_of, look, own_axes, own_colour, rc, with
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
+from gfm_plant.components.part import FAULT
 
 if TYPE_CHECKING:  # matplotlib takes half a second to import: the functions that draw import it
     from matplotlib.axes import Axes
@@ -129,6 +131,8 @@ def symbol(name: str, unit: str | None = None) -> str:
     """Symbol and unit of a signal, see ``Signals``, as an axis shows them; ``unit``: another one
     than that of the recording."""
     row = TABLE.get(name) or TABLE.get(f"true_{name}")
+    if of_network(name):
+        return f"{name} [{unit_of(name)}]"
     if name == HERTZ or (row and unit == "Hz" and row.unit == "p.u. (omega_n)"):
         return "$f$ [Hz]"
     if row is None or not row.symbol:
@@ -484,6 +488,32 @@ def panels_of_all(
         )  # fmt: skip
 
 
+def panels_of_network(run: NetworkRun, most: int = POINTS) -> Iterator[Panel]:
+    """What was recorded of a network's parts, for a page: P, Q and the size of the current of a few
+    parts a panel, at the starts of lines, and the phases of the fault's current."""
+    columns = next(iter(run.values())).columns
+    there = [name for name in run.scenario.flows if name in columns]
+    parts = [n.removesuffix(".P") for n in there if n.endswith(".P") and not n.endswith(".end.P")]
+    each: list[tuple[str, dict[str, ColumnLike]]] = []
+    for k in range(0, len(parts), len(COLOURS)):
+        group = parts[k : k + len(COLOURS)]
+        for what, title in (("P", "active power P"), ("Q", "reactive power Q")):
+            each.append((title, {part: columns[f"{part}.{what}"] for part in group}))
+        currents = {n: Magnitude(columns[f"{n}.i_re"], columns[f"{n}.i_im"]) for n in group}
+        each.append(("current |i|", {**currents}))
+    if f"{FAULT}.i_a" in there:
+        phases = {f"i_{phase}": columns[f"{FAULT}.i_{phase}"] for phase in PHASES}
+        each.append(("currents of the fault", phases))
+    t = columns["t"]
+    happened = [(float(e["t"]), str(e["label"])) for e in run.events]
+    for title, drawn in each:
+        at = few_ticks([*drawn.values()], most)
+        yield Panel(
+            f"{title} [p.u.]", _at(t, at), {name: _at(x, at) for name, x in drawn.items()},
+            (0.0, float(t[len(t) - 1 :][0])), happened, colours=COLOURS[: len(drawn)],
+        )  # fmt: skip
+
+
 class _Padded:
     """A column of a run that may have ended before the others, NaN up to their end."""
 
@@ -738,6 +768,7 @@ def _draw_named(
         name: [
             (run.signals["t"], run.signals[name], COLOURS[k % len(COLOURS)], label or name)
             for k, (label, run) in enumerate(runs.items())
+            if k == 0 or not of_network(name)  # which is in the first recording
         ]
         for name in names
     }

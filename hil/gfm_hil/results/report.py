@@ -129,7 +129,7 @@ def write_report(run: Run | NetworkRun) -> None:
     network only the figures that they share, and one report of all."""
     # a second of imports, which the sides' processes do without
     from gfm_hil.results.diagram import draw_diagram
-    from gfm_hil.results.figures import SHARED, draw_comparison, draw_run
+    from gfm_hil.results.figures import SHARED, draw_comparison, draw_run, panels_of_network
 
     folder, scenario = run.folder, run.scenario
     assert folder is not None
@@ -137,8 +137,9 @@ def write_report(run: Run | NetworkRun) -> None:
         draw_comparison(folder / "converters.png", scenario, run.columns, run.events, SHARED)
         diagram = draw_diagram(folder, scenario, PAGE)
         write_together(
-            folder, scenario, run.runs, run.events, "converter", "converters.png", diagram
-        )
+            folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
+            [*panels_of_network(run, POINTS)] if len(run.flows) > 1 else [],
+        )  # fmt: skip
         return
     timing = draw_run(folder, scenario, run.columns, run.timing, run.summary)
     chapter = _chapter("", run, POINTS, timing)
@@ -155,6 +156,7 @@ def write_together(
     kind: str,
     picture: str,
     diagram: str = "",
+    of_network: Sequence[Panel] = (),
 ) -> None:
     """Write report.html of several runs, which show the same quantities beside each other.
 
@@ -166,6 +168,7 @@ def write_together(
         kind: what the names are of, ``converter``, ``law``, or ``run`` of a network's converter
             under a law.
         diagram: of the network; drawn if there is none.
+        of_network: what was recorded of its lines, loads and other parts.
     """
     from gfm_hil.results.diagram import ONLY, draw_diagram
     from gfm_hil.results.figures import panels_of_all
@@ -186,6 +189,7 @@ def write_together(
         "kind": kind,
         "runs": Table([kind, "controlled by", "status", "reason", "misses"], rows, text=4),
         "shared": [*panels_of_all(scenario, columns, events, most)] if columns else [],
+        "flows": of_network,
     }
     ticks = max((run.ticks for run in known.values()), default=0)
     if not diagram:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.columns import Columns
-from gfm_hil.recording.run import Run, read_scenario
+from gfm_hil.recording.run import Run, Signals, nominal_frequency, read_scenario
 from gfm_hil.run.run_folder import Report, recover, save
 from gfm_hil.scenario import Scenario, write_scenario
 
@@ -102,6 +102,14 @@ class NetworkRun(Mapping[str, Run]):
     def columns(self) -> dict[str, Columns]:
         """The columns of each run."""
         return {name: run.columns for name, run in self.items()}
+
+    @property
+    def flows(self) -> Signals:
+        """What was recorded of the network itself, see ``network.record``, by names such as
+        ``feeder.P``, and ``t``, s; p.u. of the first converter."""
+        columns = next(iter(self.values())).columns
+        there = [name for name in ("t", *self.scenario.flows) if name in columns]
+        return Signals({name: columns[name] for name in there}, nominal_frequency(self.scenario))
 
     @property
     def events(self) -> list[dict[str, Any]]:

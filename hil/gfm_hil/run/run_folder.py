@@ -42,10 +42,13 @@ _LOCK = ".lock"  # removed when the folder is complete
 _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 
 
-def check_free(folder: Path, ticks: int, inner: int = False, options: tuple[str, ...] = ()) -> None:
+def check_free(
+    folder: Path, ticks: int, inner: int = False, options: tuple[str, ...] = (), besides: int = 0
+) -> None:
     """See that a run may be recorded in ``folder``, which need not exist.
 
-    ``inner``, ``options``: what the run records besides, see ``signals_of``. Raises UserError:
+    ``inner``, ``options``: what the run records besides, see ``signals_of``; ``besides``: and how
+    many values of a network in all. Raises UserError:
     it holds something, cannot be made or written, or the disk is too full; a memory-mapped file on
     a full disk would end the process without a word.
     """
@@ -57,7 +60,7 @@ def check_free(folder: Path, ticks: int, inner: int = False, options: tuple[str,
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * (bytes_per_tick(inner, options) + 16) * ticks  # with tick and t
+    needed = 2 * ((bytes_per_tick(inner, options) + 16) * ticks + 8 * besides)  # with tick and t
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(

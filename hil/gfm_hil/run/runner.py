@@ -190,7 +190,9 @@ def _recorded(
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
-    check_free(folder, scenario.ticks * len(places), scenario.carries, scenario.optional_signals)
+    besides = scenario.ticks * len(scenario.flows)
+    what = scenario.carries, scenario.optional_signals
+    check_free(folder, scenario.ticks * len(places), *what, besides)
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:
@@ -272,7 +274,10 @@ def _run_here(
 ) -> float:
     """Run both sides of each converter in this process; returns when the first tick was run."""
     ticks, what = benches[0].scenario.ticks, (benches[0].inner, benches[0].options)
-    plant_parts = [RolePart.create(place, "plant", ticks, *what) for place in places]
+    plant_parts = [
+        RolePart.create(place, "plant", ticks, *what, bench.flows)
+        for place, bench in zip(places, benches, strict=True)
+    ]
     controller_parts = [RolePart.create(place, "controller", ticks, *what) for place in places]
     timelines = [
         Timeline(bench, place / "events_both.jsonl", ROLES)
@@ -318,7 +323,7 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
 def _room(bench: Bench) -> tuple[Kept, Kept]:
     """Room for all columns of a bench."""
     what = bench.scenario.ticks, bench.inner, bench.options
-    return Kept("plant", *what), Kept("controller", *what)
+    return Kept("plant", *what, flows=bench.flows), Kept("controller", *what)
 
 
 def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:

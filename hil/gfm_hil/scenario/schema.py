@@ -30,6 +30,7 @@ from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, table_hash
 #: passes meanwhile, and a busy machine may keep a side for seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
 _WITH_COUNTS = ("shm", "zmq")  # links
+_MOST_FLOWS = 3500  # columns of a network, in a file of signals
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
 
@@ -385,6 +386,23 @@ class Scenario(StrictSchema):
         battery = any(one.dc_source.battery is not None for one in plants)
         return (CONNECTION if connection else ()) + (BATTERY if battery else ())
 
+    @property
+    def flows(self) -> tuple[str, ...]:
+        """What the recording has of the network, beside that of its first converter."""
+        if self.network is None:
+            return ()
+        nodes = {name: member.node for name, member in self.network.converters.items()}
+        return tuple(name for one in self.network.recorded(nodes) for name in one.columns)
+
+    def _wrong_record(self) -> list[str]:
+        try:
+            names = self.flows
+        except ValueError as problem:
+            return [f"network.{problem}"]
+        if len(names) <= _MOST_FLOWS:
+            return []
+        return [f"network.record: {len(names)} columns; at most are {_MOST_FLOWS}; name fewer"]
+
     def _wrong_links(self) -> list[str]:
         problems = []
         own = dict(zip(self.parts or [""], self.links, strict=True))
@@ -465,7 +483,7 @@ class Scenario(StrictSchema):
                     f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
                     f"{meant(asked, self.converters)}"
                 )
-        problems += self._wrong_snapshot()
+        problems += self._wrong_record() + self._wrong_snapshot()
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         if self.network is not None and self.plant.grid.scr is not None:

@@ -3,7 +3,7 @@
 A new component is a file here and a field there.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, get_args
 
 from pydantic import Field
@@ -15,7 +15,7 @@ from gfm_plant.components.grid_following import GridFollowing
 from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
-from gfm_plant.components.part import Component, Dynamic, Fed
+from gfm_plant.components.part import FAULT, Component, Dynamic, Fed, Terminal, converter_terminal
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
@@ -28,6 +28,11 @@ class NetworkParts(Options):
 
     grid: str | None = Field(
         None, min_length=1, description="node of the grid of plant.grid; an island if none"
+    )
+    record: list[str] = Field(
+        [],
+        description="whose currents and powers the run records: names of converters and of what "
+        'follows, or all of a table, such as "lines"; "converters", "grid", "fault", or "all"',
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
     transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
@@ -45,11 +50,37 @@ class NetworkParts(Options):
             for name, one in getattr(self, table).items():
                 yield table, name, one
 
+    def recorded(self, converters: Mapping[str, str]) -> tuple[Terminal, ...]:
+        """What ``record`` names, in the order of the network.
+
+        Args:
+            converters: their nodes by their names.
+
+        Raises:
+            ValueError: a name is unknown, or of something without a current of its own.
+        """
+        each = {("converters", n): [converter_terminal(n, at)] for n, at in converters.items()}
+        each |= {(table, n): [*one.terminals(n)] for table, n, one in self.components()}
+        if self.grid is not None:
+            each["grid", "grid"] = [Terminal("grid", self.grid)]
+        each[FAULT, FAULT] = [Terminal(FAULT, "")]
+        each = {key: terminals for key, terminals in each.items() if terminals}
+        names, asked = {name for _, name in each}, {*self.record}
+        known = sorted(names) + sorted({table for table, _ in each} - names) + ["all"]
+        if unknown := [name for name in self.record if name not in known]:
+            raise ValueError(f"record = {unknown[0]!r}: must be one of {known}")
+        return tuple(
+            terminal
+            for (table, name), terminals in each.items()
+            if "all" in asked or name in asked or (table in asked and table not in names)
+            for terminal in terminals
+        )
+
 
 COMPONENTS: dict[str, type[Component]] = {
     table: get_args(field.annotation)[1]
     for table, field in NetworkParts.model_fields.items()
-    if table != "grid"
+    if table not in ("grid", "record")
 }
 """The components by their tables."""
 
@@ -86,3 +117,4 @@ def _link(hook: str, call: Callable[..., None], k: int, others: Callable[..., No
 every_at_rest, every_keep, every_go_back = _every("at_rest"), _every("keep"), _every("go_back")
 every_begin, every_drive = _every("begin"), _every("drive")
 every_middle, every_end, every_tick = _every("middle"), _every("end"), _every("tick")
+every_flow = _every("flow")

@@ -75,6 +75,11 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.v_f = one.v_f_before
 
 
+@compiled
+def _flow(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    field(now, "flow_i")[one.source] = drawn(one.S, one.least_v2, one.v_f, 0j)[0]
+
+
 class ConstantPowerLoad(Drawing):
     """A load whose control holds P and Q, such as a drive or a charger: it draws the current
     conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
@@ -99,7 +104,8 @@ class ConstantPowerLoad(Drawing):
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back
+        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back,
+        "flow": _flow,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")

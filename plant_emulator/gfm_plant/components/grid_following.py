@@ -99,6 +99,11 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
         one.s[j] = one.kept[j]
 
 
+@compiled
+def _flow(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    field(now, "flow_i")[one.source] = _drawn(one, one.s)
+
+
 class GridFollowing(Drawing):
     """A grid-following converter: a PLL, a current control as one lag, set-points of P and Q, and a
     limit of the current. It has no DC link and no filter of its own: its node needs a capacitor
@@ -114,6 +119,7 @@ class GridFollowing(Drawing):
         ("theta, x", "rad, rad/s", "of its PLL"),
         ("i_d, i_q", "p.u. of its rating", "its current in the frame of the PLL"),
     )
+    feeds: ClassVar = True
     lacks: ClassVar = "{} brings a current, so the node needs a bank of network.capacitors"
     record: ClassVar = np.dtype(
         [
@@ -124,7 +130,8 @@ class GridFollowing(Drawing):
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back
+        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back,
+        "flow": _flow,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")

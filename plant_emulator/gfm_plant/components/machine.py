@@ -85,6 +85,7 @@ class Rotating(Fed):
     )
     columns: ClassVar = ("true_omega_g",)
     is_voltage: ClassVar = True
+    feeds: ClassVar = True
 
     node: str = Field(min_length=1, description="where it is")
     S: Positive = Field(description="rating over that of the first converter")

@@ -8,12 +8,37 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.circuit import CurrentSource, Element
+from gfm_plant.circuit import GROUND, Branch, Capacitor, CurrentSource, Element
 from gfm_plant.parameters import Options
 from gfm_plant.solution import state
 from gfm_runtime.compiled import compiled
 
 Matrix = NDArray[np.float64]
+
+
+#: what a run records of a terminal, after its name and a dot: the power by the voltage of its node,
+#: and its current in the common frame; of the fault the currents of its phases
+FLOW, OF_FAULT = ("P", "Q", "i_re", "i_im"), ("i_a", "i_b", "i_c")
+FAULT = "fault"
+
+
+@dataclass(frozen=True)
+class Terminal:
+    """Where a component meets a node; of ``FAULT`` the node is that of any fault, ""."""
+
+    name: str  # of the component; ".end" follows at the end of a line
+    node: str
+    parts: tuple[tuple[str, float], ...] = ()  # elements, and factors of their currents
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Its columns in the recording."""
+        return tuple(f"{self.name}.{what}" for what in (FLOW if self.node else OF_FAULT))
+
+
+def converter_terminal(name: str, node: str) -> Terminal:
+    """That of a converter: what its line, whose name is ``f"{name}.i_o"``, brings to its node."""
+    return Terminal(name, node, ((f"{name}.i_o", 1.0),))
 
 
 class Component(Options):
@@ -31,10 +56,29 @@ class Component(Options):
     columns: ClassVar[Sequence[str]] = ()
     #: how many there can be, besides what is said of the circuit
     how_many: ClassVar[str] = "any number"
+    #: whether it counts the power that it feeds into its node, in place of what it takes from there
+    feeds: ClassVar[bool] = False
 
     def elements(self, name: str) -> Sequence[Element]:
         """What it puts into the circuit; the first one has its name."""
         return ()
+
+    def terminals(self, name: str) -> Sequence[Terminal]:
+        """Where a run may record it: at its node, or at its start and its end, where power counts
+        from start to end. Capacitors, those of a line's charging too, are left out."""
+        found: dict[str, list[tuple[str, float]]] = {}
+        for one in self.elements(name):
+            if isinstance(one, Capacitor):
+                continue
+            for node, factor in one.taken() if isinstance(one, Branch) else ((one.node, 1.0),):
+                if node not in (GROUND, emf(name)):
+                    found.setdefault(node, []).append((one.name, factor))
+        terminals = []
+        for at_end, (node, ends) in enumerate(found.items()):
+            sign = -1.0 if self.feeds or at_end else 1.0
+            parts = tuple((part, sign * factor) for part, factor in ends)
+            terminals.append(Terminal(f"{name}.end" if at_end else name, node, parts))
+        return terminals
 
     def label(self) -> str:
         """Its parameters, for the diagram."""
@@ -67,7 +111,7 @@ class Dynamic(Component):
     record: ClassVar[np.dtype[np.void]]
     #: at_rest, once at the start; keep, at an instant, and go_back to it, as often as it takes;
     #: begin of a piece; drive, where sources add to the forcing of the modes; middle and end of the
-    #: piece; tick, after each tick
+    #: piece; tick, after each tick; flow, where its current is recorded, which goes to ``flow_i``
     hooks: ClassVar[Mapping[str, Callable[..., None]]]
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:

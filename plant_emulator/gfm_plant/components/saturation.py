@@ -83,6 +83,11 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     one.flux, one.turn = one.flux_before, one.turn_before
 
 
+@compiled
+def _flow(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    field(now, "flow_i")[one.source] = _current(one, one.flux) * one.turn.conjugate()
+
+
 class Core(Options):
     """Where a transformer's core saturates."""
 
@@ -116,7 +121,8 @@ class Saturation(Core, Drawing):
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back
+        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back,
+        "flow": _flow,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor")
