@@ -17,6 +17,56 @@ from tests.support.processes import wait_for
 from tests.support.scope import RIG, Browser, Rig, rig
 
 HERE = Path(__file__).resolve().parent
+NETWORK = """
+title = "Three converters and a machine at a weak grid"
+duration = 900.0
+T_s = 1e-3
+mode = "realtime"
+law = "droop-5"
+[references]
+P_ref = 0.4
+[late_policy]
+hold = 10000
+[link]
+type = "shm"
+peer_timeout_s = 30.0
+[plant]
+delay = { samples = 1 }
+dc_source = { mode = "regulated" }
+[network]
+grid = "grid"
+record = ["lines", "transformers", "loads", "machines", "grid"]
+[network.converters.A]
+node = "bus"
+[network.converters.B]
+node = "bus"
+[network.converters.C]
+node = "far"
+references = { P_ref = 0.6 }
+[network.lines.feeder]
+start = "bus"
+end = "far"
+L = 0.1
+R = 0.02
+[network.transformers.step-up]
+start = "far"
+end = "grid"
+S = 2.0
+X = 0.1
+[network.loads.town]
+node = "bus"
+P = 0.9
+Q = 0.2
+[network.loads.mill]
+node = "far"
+P = 0.4
+closed = false
+[network.machines.hydro]
+node = "far"
+S = 1.0
+H = 3.0
+P = 0.3
+"""
 IN_THE_LAB = RIG.replace("that is told what to do", "in the lab")
 
 
@@ -84,6 +134,19 @@ def phone(run: Rig) -> None:
         save(page, "phone")
 
 
+def network() -> None:
+    """The diagram of a network with the powers of its parts, and on a phone."""
+    with TemporaryDirectory() as place, rig(Path(place), NETWORK) as run:
+        for name, page in (
+            ("network", Browser(1280, 960)),
+            ("network_phone", Browser(390, 844, phone=True, dark=True)),
+        ):
+            with page:
+                opened(page, run)
+                wait_for(lambda page=page: page.text("[data-power=feeder]"))
+                save(page, name)
+
+
 def costs() -> None:
     """The table of what the server costs."""
     rows = ["| window | pictures a second | kB each | of a core |", "|---|---|---|---|"]
@@ -99,6 +162,7 @@ def main() -> None:
     with TemporaryDirectory() as place, rig(Path(place), IN_THE_LAB) as run:
         for picture in (dark, light, phone):
             picture(run)
+    network()
     costs()
 
 

@@ -36,6 +36,8 @@ peer_timeout_s = 30.0
 [plant]
 delay = { samples = 1 }
 dc_source = { mode = "regulated" }
+[network]
+record = ["lines", "loads"]
 [network.converters.A]
 node = "bus"
 references = { P_ref = 0.2 }
@@ -111,6 +113,11 @@ def test_four_converters_of_a_network(tmp_path):
         assert told == {"A": [], "B": [], "C": [], "D": ["P_ref = 0.4"]}
         wait_for(lambda: breaker(page, "base") == "true")
         assert (breaker(page, "feeder"), breaker(page, "step")) == ("true", "false")
+        # D, at the end of the feeder, feeds the load at its start: the arrow points there
+        tip = "return document.querySelector('[data-flow=feeder]').getBBox()"
+        wait_for(lambda: page.js(f"{tip}.width") > 5)
+        assert page.text("[data-power=feeder]").startswith("P \u22120.4")
+        assert page.text("[data-power=base]").startswith("P 1.")
         before = sum(flow(page, name) for name in "ABCD")
         operator = Operator(four.folder / "A")
         operator.command({"type": "breaker", "name": "step", "closed": True})

@@ -28,13 +28,15 @@ class Flows:
         bars, lines = bars_of(self._scenario, nodes)
         rows = give_rows(bars, lines)
         self._closed = {name: True for name in nodes} | {n: line[-1] for n, line in lines.items()}
+        network = self._scenario.network
+        feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
         found: list[dict[str, Any]] = []
         for name, bar in bars.items():
             hanging = []
             for symbol, text, closed in bar.right:
                 part = text.partition("\n")[0] if symbol != "~" else GRID
                 self._closed[part] = closed
-                hanging.append({"name": part, "symbol": symbol})
+                hanging.append({"name": part, "symbol": symbol, "feeds": part in feeds})
             found.append({
                 "name": name, "column": bar.column, "rows": bar.rows,
                 "converters": bar.converters, "right": hanging,
@@ -52,13 +54,26 @@ class Flows:
         return next(iter(self._runs.values())).record.scenario
 
     def now(self) -> dict[str, Any]:
-        """The newest tick of each converter, and whether the breaker of each part is closed."""
+        """The newest tick of each converter, P and Q of each part that the run records, p.u., a
+        line's at its start, and whether the breaker of each part is closed."""
         converters = {name: _newest(run) for name, run in self._runs.items()}
         closed = dict(self._closed)
         for line in next(iter(self._runs.values())).happened()["events"]:
             if (change := switched(line)) is not None:
                 closed[change[0]] = change[1]
-        return {"converters": converters, "closed": closed}
+        return {"converters": converters, "flows": self._recorded(), "closed": closed}
+
+    def _recorded(self) -> dict[str, list[float]]:
+        run = next(iter(self._runs.values()))
+        columns, done = run.record.columns, run.pyramid.done
+        names = [n.removesuffix(".P") for n in self._scenario.flows if n.endswith(".P")]
+        if not done:
+            return {}
+        return {
+            name: [round(float(columns[f"{name}.{x}"][done - 1 : done][0]), 5) for x in "PQ"]
+            for name in names
+            if f"{name}.P" in columns and not name.endswith(".end")
+        }
 
 
 def _newest(run: WatchedRun) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 import { value } from "./text.js";
 
-const BOX = 176, FIRST = BOX + 66, COLUMN = 150, ROW = 58, HANG = 64, TOP = 22; // pixels
+const BOX = 204, FIRST = BOX + 66, COLUMN = 150, ROW = 58, HANG = 64, TOP = 22; // pixels
+const LEAST = 5e-4; // p.u.; a smaller power has no arrow
 const SPACE = "http://www.w3.org/2000/svg";
 
 function svg(tag, attributes = {}, ...children) {
@@ -21,10 +22,12 @@ export class Diagram {
     this.converters = new Map();
     this.breakers = new Map();
     const at = Object.fromEntries(network.bars.map((bar) => [bar.name, FIRST + COLUMN * bar.column]));
-    const wide = Math.max(...Object.values(at)) + HANG + 96;
+    this.parts = new Map();
+    const wide = Math.max(...Object.values(at)) + HANG + 150;
     const high = TOP + ROW * network.rows;
-    this.element = svg("svg", { viewBox: `0 0 ${wide} ${high}`, width: wide, height: high,
+    this.element = svg("svg", { viewBox: `0 0 ${wide} ${high}`,
       role: "img", "aria-label": "Single-line diagram" });
+    this.element.style.maxWidth = `${wide}px`;
     const rows = new Map(network.bars.map((bar) => [bar.name, [...bar.rows]]));
     for (const part of network.lines) {
       const [left, right] = [at[part.start], at[part.end]].sort((a, b) => a - b);
@@ -32,6 +35,8 @@ export class Diagram {
       this.element.append(line(left, y, right, y), text((left + right) / 2, y + 18, part.name, "name"));
       this.inLine((left + right) / 2, y, part.symbol);
       this.breaker(part.name, left + 22, y);
+      this.flow(part.name, right - 24, y, at[part.start] > at[part.end],
+        text((left + right) / 2, y + 32, "", "name"));
       for (const end of [part.start, part.end]) rows.get(end).push(part.row);
     }
     for (const bar of network.bars) {
@@ -68,9 +73,18 @@ export class Diagram {
     }
   }
 
-  hang({ name, symbol }, x, y) {
+  // A part's power, and an arrow that shows where it flows; leftwards: where a positive one does.
+  flow(name, x, y, leftwards, words) {
+    const arrow = svg("path", { class: "arrow", "data-flow": name, display: "none" });
+    words.dataset.power = name;
+    this.element.append(arrow, words);
+    this.parts.set(name, { arrow, words, x, y, leftwards });
+  }
+
+  hang({ name, symbol, feeds }, x, y) {
     const end = x + HANG;
-    this.element.append(line(x, y, end, y), text(end + 30, y + 4, name, "part"));
+    this.element.append(line(x, y, end, y), text(end + 30, y - 2, name, "part"));
+    if (symbol !== "capacitor") this.flow(name, x + 48, y, feeds, text(end + 30, y + 13, "", "flow"));
     if (symbol === "load" || symbol === "capacitor") {
       this.element.append(svg("path", { d: `M${end} ${y}v10m-5 0h10l-5 8z`, class: "load" }));
     } else {
@@ -87,8 +101,17 @@ export class Diagram {
     this.breakers.set(name, mark);
   }
 
-  // flows: {converters: {name: {p, q, V, omega_u, state, misses}}, closed: {name: boolean}}
-  show({ converters, closed }) {
+  // flows: {converters: {name: {p, q, V, omega_u, state, misses}}, flows: {name: [P, Q]},
+  // closed: {name: boolean}}
+  show({ converters, flows, closed }) {
+    for (const [name, [P, Q]] of Object.entries(flows)) {
+      const part = this.parts.get(name);
+      if (!part) continue;
+      const { arrow, words, x, y, leftwards } = part, to = (P < 0) === leftwards ? 6 : -6;
+      words.textContent = `P ${value(P, "p.u.")}  Q ${value(Q, "p.u.")}`;
+      arrow.setAttribute("d", `M${x + to} ${y}l${-1.6 * to} ${-5}v10z`);
+      arrow.setAttribute("display", Math.abs(P) < LEAST ? "none" : "inline");
+    }
     for (const [name, now] of Object.entries(converters)) {
       const { link, numbers, more } = this.converters.get(name);
       link.dataset.state = now.state ?? "";
