@@ -11,7 +11,7 @@ runs/conformity, and from there writes
     docs/_static/figures/conformity_grid.png        the same of the laws for grid codes
     docs/_static/figures/conformity_part.png        one run with its windows and limits
 
-Usage: python docs/make_conformity.py    (20 minutes on two processors that others use too)
+Usage: python docs/make_conformity.py    (20 to 40 minutes on two processors that others use too)
 """
 
 from __future__ import annotations
