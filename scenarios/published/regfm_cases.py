@@ -1,7 +1,7 @@
 """The published cases of REGFM_A1 and REGFM_B1, on the bench and beside the published points.
 
-PNNL's seven disturbances of each model, computed by PSCAD and by PSS/E. ``regfm_points.csv`` has
-points of twelve of the fourteen; of the others PSCAD's were not at hand.
+PNNL's seven disturbances of each model, computed by PSCAD and by PSS/E; ``regfm_points.csv`` has
+points of all.
 """
 
 from pathlib import Path
@@ -15,8 +15,9 @@ import gfmhil
 HERE = Path(__file__).parent
 T_EVENT = 0.5  # s
 SIGNALS = ("P", "Q", "V", "f")
-#: first-order lag of PSCAD's recorded P, Q and V, s: not published, fitted to the frequency cases
-METER = {"regfm_a1": 0.0125, "regfm_b1": 0.007}
+#: first-order lag of PSCAD's recorded P, Q and V, s. A1's P is its own P_f, as its f shows, so that
+#: these are TPf, TQf and TVf; B1's is not published, and is fitted to the frequency cases.
+METER = {"regfm_a1": 0.01, "regfm_b1": 0.007}
 #: power and voltage of a model's p.u. of impedance
 _OHM = {"regfm_a1": 480.0**2 / 1e5, "regfm_b1": 230e3**2 / 1e8}
 _R = {"regfm_a1": 0.001, "regfm_b1": 0.1}  # of the faults, ohm

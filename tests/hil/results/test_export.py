@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import struct
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -136,6 +137,34 @@ def test_comtrade_is_read_by_its_package_with_scale_and_clock(table, tmp_path, k
         step = np.ptp(want) / (131_000 if kind == "cfg" else 399_000)  # half of one
         near = step + 2e-7 * np.abs(want).max()  # and the package has 32-bit floats
         assert np.abs(x - want).max() <= near, name
+
+
+def read_by_the_standard(file: Path) -> dict[str, np.ndarray]:
+    """Channels of a .cfg and its binary .dat by the text of C37.111-2013 alone: records of two
+    32-bit numbers and a 16-bit one for each channel, whose value is a x + b."""
+    lines = file.read_text("utf-8").splitlines()
+    count = int(lines[1].split(",")[1].removesuffix("A"))
+    channels = [line.split(",") for line in lines[2 : 2 + count]]
+    data = file.with_suffix(".dat").read_bytes()
+    rows = [*struct.iter_unpack(f"<II{count}h", data)]
+    assert [row[0] for row in rows] == [*range(1, len(rows) + 1)]
+    found = {"t": np.array([row[1] for row in rows]) * 1e-6}
+    for k, fields in enumerate(channels):
+        a, b = float(fields[5]), float(fields[6])
+        found[fields[1]] = np.array([a * row[2 + k] + b for row in rows])
+    return found
+
+
+def test_comtrade_is_read_by_the_formula_of_the_standard(table, tmp_path):
+    """A second reader, which shares nothing with the package."""
+    export_run(table.folder, "cfg", tmp_path / "run.cfg", "si")
+    found = read_by_the_standard(tmp_path / "run.cfg")
+    assert np.allclose(found["t"], table.columns["t"], atol=1e-9)
+    waves = table.three_phase(si=True)
+    assert {*waves} <= {*found}
+    for name, x in found.items():
+        want = waves[name] if name in waves else table.columns[name]
+        assert np.abs(x - want).max() <= np.ptp(want) / 131_000 + 1e-9 * np.abs(want).max(), name
 
 
 @pytest.fixture
