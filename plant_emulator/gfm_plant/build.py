@@ -13,7 +13,7 @@ from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.line import Line
-from gfm_plant.components.part import Component, Dynamic, Fed, Terminal, emf
+from gfm_plant.components.part import Component, Dynamic, Fed, Terminal
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.swing import pack_swing
 from gfm_plant.layout import Record, make_net_and_now
@@ -262,7 +262,7 @@ def _network(
             if name in lags:
                 record["lag"] = len(par) + lags.index(name)
             if isinstance(one, Fed):
-                record["source"] = places[emf(name) if one.is_voltage else name]
+                record["source"] = places[one.sources(name)[0]]
     return Network(par, st, net, now, tuple(parts), wiring)
 
 
@@ -271,12 +271,8 @@ def _check_paths(wiring: Wiring) -> None:
     terminals = {unit.terminal for unit in wiring.units}
     reached = {unit.node for unit in wiring.units}
     while True:
-        more = {
-            node
-            for branch in wiring.branches
-            if branch.end != GROUND and {branch.start, branch.end} & reached
-            for node in (branch.start, branch.end)
-        }
+        lines = [(b.start, b.end) for b in wiring.branches if b.end != GROUND]
+        more = {node for ends in [*lines, *wiring.by_waves] if {*ends} & reached for node in ends}
         if more <= reached:
             break
         reached |= more
@@ -284,7 +280,7 @@ def _check_paths(wiring: Wiring) -> None:
     ends += [(b.name, node) for b in wiring.branches for node in (b.start, b.end)]
     ends += [(shunt.name, shunt.node) for shunt in wiring.shunts]
     ends += [(capacitor.name, capacitor.node) for capacitor in wiring.capacitors]
-    ends += [(name, one.node) for name, one in wiring.fed]
+    ends += [(name, node) for name, one in wiring.fed for node in one.nodes]
     ends += [] if wiring.grid is None else [("the grid", wiring.grid)]
     for name, node in ends:
         if node not in reached | terminals | {GROUND}:

@@ -86,10 +86,12 @@ class VoltageSource:
 
 @dataclass(frozen=True)
 class CurrentSource:
-    """A current from a node with a capacitor to ground, p.u."""
+    """A current from a node with a capacitor to ground, p.u.; one that is not ``switched`` has no
+    breaker."""
 
     name: str
     node: str
+    switched: bool = True
 
 
 Element = Branch | Capacitor | Shunt | CurrentSource

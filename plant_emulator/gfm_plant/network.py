@@ -16,7 +16,7 @@ from scipy.linalg import expm
 
 from gfm_plant.circuit import Branch
 from gfm_plant.components import DYNAMIC
-from gfm_plant.components.part import Dynamic, Fed, emf
+from gfm_plant.components.part import Dynamic, Fed
 from gfm_plant.contacts import OWN_PATH, join
 from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.flows import find_look
@@ -125,10 +125,11 @@ class Network:
         resting_at = rests or [(np.empty(0), float(u[0, 1]))] * len(wiring.fed)
         fed = [(*item, *rest) for item, rest in zip(self.fed(), resting_at, strict=True)]
         for name, one, record, z, omega in fed:
-            source = emf(name) if one.is_voltage else name
-            turns[source], volts[source] = omega, 0j
+            source, *others = one.sources(name)
+            turns |= dict.fromkeys((source, *others), omega)
+            volts |= dict.fromkeys((source, *others), 0j)
             if one.is_voltage:
-                volts[source] = voltage = one.start(record, 0j, omega, omega_b, z)
+                volts[source] = voltage = one.settle(record, 0j, omega, omega_b, z)
                 place = place_of[source]
                 now["emf"][place] = E = complex(record["E"])
                 now["unit"][place] = voltage / E
@@ -139,7 +140,10 @@ class Network:
         currents = [item for item in fed if not item[1].is_voltage]
         for _ in range(_ROUNDS if currents else 0):  # they follow from the voltages
             for name, one, record, z, omega in currents:
-                volts[name] = one.start(record, complex(w[record["sees"]]), omega, omega_b, z)
+                brought = np.atleast_1d(
+                    one.settle(record, w[record["sees"]].tolist(), omega, omega_b, z)
+                )
+                volts |= zip(one.sources(name), brought.tolist(), strict=True)
             w = rests_at(volts, turns)
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
@@ -237,7 +241,8 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     banks |= {bank.node: bank.name for bank in reversed(wiring.capacitors)}
     may_lead = wiring.grid is None
     for name, one, record in plant.fed():
-        record["sees"] = order.index(one.sees(name, banks))
+        seen = one.sees(name, banks)
+        record["sees"] = order.index(seen) if isinstance(seen, str) else [*map(order.index, seen)]
         if "leads" in record.dtype.names:
             record["leads"] = may_lead and name not in wiring.opened
             may_lead = may_lead and not record["leads"]
@@ -485,6 +490,8 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
                 f" rad/s; allowed are {_DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
             )
         r["dc_steps"] = max(1, math.ceil(rate * 2 * max(net["half_h"][:parts]) / _DC_STEP))
+    for name, one, _ in plant.fed():
+        one.check_pieces(name, 2 * float(min(net["half_h"][:-1])), plant.wiring.omega_b)
     lags = [lag for _, one, _ in plant.fed() if (lag := one.lag()) is not None]
     net["lag_rate"] = [*plant.par["omega_s"], *(1 / lag for lag in lags)]
     for part, half in enumerate(net["half_h"][:-1]):

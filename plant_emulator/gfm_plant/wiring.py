@@ -226,7 +226,7 @@ class Wiring:
         """The nodes between the parts, each once."""
         ends = [unit.node for unit in self.units]
         ends += [node for branch in self.branches for node in (branch.start, branch.end)]
-        ends += [one.node for _, one in self.fed if one.is_voltage]
+        ends += [node for _, one in self.fed if one.is_voltage for node in one.nodes]
         ends += [shunt.node for shunt in self.shunts] + [c.node for c in self.capacitors]
         ends += [sink.node for sink in self.sinks]
         within = {GROUND, *(unit.terminal for unit in self.units)}  # which a core may be at
@@ -312,17 +312,23 @@ class Wiring:
         each = (part for name, one in self.fed for part in one.elements(name))
         return tuple(part for part in each if isinstance(part, CurrentSource))
 
+    @property
+    def fed_shunts(self) -> tuple[Shunt, ...]:
+        """What the components with currents put beside them."""
+        each = (part for name, one in self.fed for part in one.elements(name))
+        return tuple(part for part in each if isinstance(part, Shunt))
+
     def sources(self) -> dict[str, int]:
         """The place of each source in the compiled plant; that of the grid is followed by its
         negative sequence."""
         names = [unit.bridge for unit in self.units] + [GRID_SOURCE, ""]
-        names += [emf(name) if one.is_voltage else name for name, one in self.fed]
+        names += [source for name, one in self.fed for source in one.sources(name)]
         return {name: place for place, name in enumerate(names) if name}
 
     @property
     def places(self) -> int:
         """How many places of sources there are."""
-        return len(self.units) + 2 + len(self.fed)
+        return len(self.units) + 2 + sum(len(one.nodes) for _, one in self.fed)
 
     def named_lines(self) -> dict[str, Branch]:
         """Lines and transformers by the name that people use: a converter's line has that of the
@@ -351,12 +357,17 @@ class Wiring:
     def islands(self) -> list[tuple[str, ...]]:
         """The nodes in groups that closed lines connect, each in the order of ``nodes``."""
         groups = {node: {node} for node in self.nodes}
-        for line in self.branches:
-            if line.end != GROUND and line.name not in self.opened:
-                both = groups[line.start] | groups[line.end]
-                groups.update(dict.fromkeys(both, both))
+        lines = [b for b in self.branches if b.end != GROUND and b.name not in self.opened]
+        for start, end in [*((b.start, b.end) for b in lines), *self.by_waves]:
+            both = groups[start] | groups[end]
+            groups.update(dict.fromkeys(both, both))
         each = (tuple(n for n in self.nodes if n in groups[node]) for node in self.nodes)
         return list(dict.fromkeys(each))
+
+    @property
+    def by_waves(self) -> list[tuple[str, ...]]:
+        """The nodes at the ends of each component between two nodes."""
+        return [one.nodes for _, one in self.fed if len(one.nodes) > 1]
 
     def breakers(self) -> dict[str, tuple[str, str, str]]:
         """By the name that people use: the branch or shunt that a breaker opens, and the nodes at
@@ -364,7 +375,9 @@ class Wiring:
         found = {n: (b.name, b.start, b.end) for n, b in self.named_lines().items()}
         lines = (*self.branches, *self.fed_branches)
         found |= {b.name: (b.name, b.start, b.end) for b in lines if b.switched}
-        to_ground: tuple[Shunt | CurrentSource, ...] = (*self.shunts, *self.sinks)
+        to_ground: tuple[Shunt | CurrentSource, ...] = (
+            *self.shunts, *(sink for sink in self.sinks if sink.switched)
+        )  # fmt: skip
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
     @property
@@ -593,7 +606,7 @@ class Wiring:
                 through.append(Branch(CONTACT, GRID_SOURCE, str(self.grid), seen.imag, seen.real))
         elif isinstance(contact, OpeningBreaker) and seen is not None:
             poles = {contact.name: seen}
-        shunts = _in_parallel(shunts)
+        shunts = _in_parallel([*shunts, *self.fed_shunts])
         for k, unit in enumerate(self.units):
             if k not in blocked:
                 i_f = unit.states[0]
@@ -616,6 +629,7 @@ class Wiring:
             held |= {node for line in self.branches for node in (line.start, line.end)}
         branches = without_ends(branches, held)
         met = {node for branch in branches for node in (branch.start, branch.end)}
+        met |= {shunt.node for shunt in self.fed_shunts}
         shunts = [s for s in shunts if s.node in met]
         sinks = tuple(sink for sink in self.sinks if sink.name not in self.opened)
         circuit = Circuit(tuple(branches), tuple(capacitors), tuple(sources), tuple(shunts), sinks)

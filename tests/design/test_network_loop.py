@@ -130,6 +130,12 @@ def with_following(place: Path | None = None) -> Scenario:
     return island(grid_following=neighbour, capacitors=banks)
 
 
+def with_waves(place: Path | None = None) -> Scenario:
+    line = {"start": "bus", "end": "far", "L": 0.1, "R": 0.02, "B": 0.1}
+    banks = {"b": {"node": "bus", "Q": 0.1}, "f": {"node": "far", "Q": 0.1}}
+    return island(lines={}, bergeron_lines={"feeder": line}, capacitors=banks)
+
+
 def with_finite_grid(place: Path) -> Scenario:
     return scenario({**THREE, "grid": "far"}, plant={"grid": {**FINITE, "V_g": 1.02}})
 
@@ -175,6 +181,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_synchronous_machine,
         with_controls,
         with_following,
+        with_waves,
         with_finite_grid,
         with_pll,
     ],

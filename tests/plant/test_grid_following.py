@@ -112,7 +112,7 @@ def test_its_poles_on_a_stiff_voltage():
     plant = make()
     (one,) = plant.of(GridFollowing)
     g, v = plant.wiring.fed[0][1], 1.1 * np.exp(0.3j)
-    source = g.start(one, v, 1.0, 100 * np.pi, np.empty(0))
+    source = g.settle(one, v, 1.0, 100 * np.pi, np.empty(0))
     part = g.linear(one, v, source, 0.0, 100 * np.pi)
     exact = [*np.roots([1.0, g.k_p * 1.1, g.k_i * 1.1]), -1 / g.T_i, -1 / g.T_i]
     found = np.linalg.eigvals(part.A)

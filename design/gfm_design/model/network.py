@@ -50,7 +50,7 @@ from gfm_design.model.operating_point import OperatingPoint, operating_points
 from gfm_design.norms.performance import StateSpace
 from gfm_plant import Network
 from gfm_plant.components.finite_grid import FiniteGrid
-from gfm_plant.components.part import Fed, LinearPart, emf
+from gfm_plant.components.part import Fed, LinearPart
 from gfm_plant.components.swing import SWING_PARAMETERS, swing_matrix
 from gfm_plant.model import V_DC
 from gfm_plant.records import N_OWN
@@ -423,7 +423,7 @@ class _Writing:
         fed = [item for item in plant.fed() if item[1].is_voltage or item[0] not in wiring.opened]
         voltages = [(name, one, record) for name, one, record in fed if one.is_voltage]
         at_node = {m.name: unit.node for m, unit in zip(members, wiring.units, strict=True)}
-        at_node |= {name: one.node for name, one, _ in voltages}
+        at_node |= {name: one.nodes[0] for name, one, _ in voltages}
         speeds = [float(m.op.u[OMEGA_ROW]) for m in members]
         speeds += [float(record["omega"]) for *_, record in voltages]
         if wiring.grid is not None and wiring.closed:
@@ -436,8 +436,9 @@ class _Writing:
         self.speed[list(self.island.values())] = speeds
         #: of each component with a source
         self.fed = {name: self._linear(one, record) for name, one, record in fed}
-        self.at_w = {name: int(record["sees"]) for name, _, record in fed}
-        self.fed_island = {name: self._island(one.node) for name, one, _ in fed}
+        self.at_w = {name: np.atleast_1d(record["sees"]) for name, _, record in fed}
+        self.fed_sources = {name: one.sources(name) for name, one, _ in fed}
+        self.fed_island = {name: self._island(one.nodes[0]) for name, one, _ in fed}
         sizes = {m.name: 1 + len(self._alone(k).A) - V_DC for k, m in enumerate(members)}
         sizes[GRID] = 3 if len(plant.of(FiniteGrid)) else 1
         sizes |= {name: len(part.A) for name, part in self.fed.items()}
@@ -464,10 +465,10 @@ class _Writing:
 
     def _linear(self, one: Fed, record: Any) -> LinearPart:
         """A component with a source around its steady state."""
-        slip = self.omega_b * (self.speed[self._island(one.node)] - 1.0)
+        slip = self.omega_b * (self.speed[self._island(one.nodes[0])] - 1.0)
         source = complex(self.plant.now[0]["unit"][record["source"]])
         source *= complex(record["E"]) if one.is_voltage else 0.0
-        seen = complex(self.w[record["sees"]])
+        seen = self.w[record["sees"]].tolist()
         return one.linear(record, seen, source, slip, self.omega_b)
 
     def _alone(self, k: int) -> LinearPlant:
@@ -499,9 +500,8 @@ class _Writing:
             else:
                 self.B_d[angle, 0] = self.omega_b
         for name, part in self.fed.items():
-            at, seen = self.at[name], _rows(self.modes.states[self.at_w[name]])
-            source = emf(name) if emf(name) in self.sources else name
-            drive = self.modes.drive[:, [self.sources.index(source)]]
+            at, seen = self.at[name], _real(self.modes.states[self.at_w[name]])
+            drive = self.modes.drive[:, [self.sources.index(s) for s in self.fed_sources[name]]]
             self.A[at, at], self.A[at, self.z] = part.A, part.by_seen @ seen
             self.A[self.z, at] = _real(drive) @ part.source
             self.A[self.z, self.z] += _real(drive) @ part.direct @ seen

@@ -147,7 +147,7 @@ class _NetworkEquilibrium:
         self.nodes = wiring.nodes
         self.free = [node for node in self.nodes if node != self.fixed]
         feeding = {unit.node for unit in wiring.units}
-        feeding |= {one.node for _, one in wiring.fed if one.is_voltage}
+        feeding |= {node for _, one in wiring.fed if one.is_voltage for node in one.nodes}
         groups = wiring.islands()
         self.islands = [g for g in groups if self.fixed not in g and feeding & {*g}]
         self.island_of = {node: k for k, nodes in enumerate(self.islands) for node in nodes}
@@ -197,9 +197,11 @@ class _NetworkEquilibrium:
         fed = zip(wiring.fed, own[len(self.sides) :], strict=True)
         for (name, one), mine in sorted(fed, key=lambda item: item[0][1].is_voltage):
             if one.is_voltage or name not in wiring.opened:
-                v, omega = volts[one.node], speeds[one.node]
-                i, wanted = one.steady(v, omega, wiring.omega_b, mine)
-                missing[one.node] += i
+                at, omega = [volts[node] for node in one.nodes], speeds[one.nodes[0]]
+                seen = np.array(at) if len(at) > 1 else at[0]
+                i, wanted = one.steady(seen, omega, wiring.omega_b, mine)
+                for node, brought in zip(one.nodes, np.atleast_1d(i).tolist(), strict=True):
+                    missing[node] += brought
                 rows.append(np.array(wanted))
         met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
@@ -231,10 +233,11 @@ class _NetworkEquilibrium:
         left = iter(blocks[len(own) :])
         for k, (name, component) in fed:
             rows = next(left) if component.is_voltage or name not in wiring.opened else set()
-            mine[k] = rows | at.get(component.node, set())
-            if component.node in terminals:
-                own[terminals[component.node]] |= rows
-            reached.get(component.node, set()).update(rows)
+            mine[k] = rows.union(*(at.get(node, set()) for node in component.nodes))
+            for node in component.nodes:
+                if node in terminals:
+                    own[terminals[node]] |= rows
+                reached.get(node, set()).update(rows)
         found = [rows for rows, side in zip(own, self.sides, strict=True) for _ in range(side.size)]
         found += [reached[node] for node in self.free for _ in range(2)]
         for k, (_, component) in enumerate(wiring.fed):
@@ -270,14 +273,14 @@ class _NetworkEquilibrium:
         each = zip(self.sides, self.wiring.units, own, strict=False)
         points = [side.found(mine, speeds[unit.node]) for side, unit, mine in each]
         parts = zip(own[len(points) :], self.wiring.fed, strict=True)
-        return points, [(mine, speeds[one.node]) for mine, (_, one) in parts]
+        return points, [(mine, speeds[one.nodes[0]]) for mine, (_, one) in parts]
 
 
 def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     """Where the search for the voltage of each node begins, p.u.: at the nominal one, but where
     only converters far below it feed, as at a black start, at theirs."""
     found = dict.fromkeys(wiring.nodes, 1.0)
-    stiff = {one.node for _, one in wiring.fed if one.is_voltage}
+    stiff = {node for _, one in wiring.fed if one.is_voltage for node in one.nodes}
     stiff |= {wiring.grid} if wiring.grid is not None and wiring.closed else set()
     for nodes in wiring.islands():
         own = [ref[4] for unit, ref in zip(wiring.units, refs, strict=True) if unit.node in nodes]

@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from pydantic import Field
 
+from gfm_plant.components.bergeron_line import BergeronLine
 from gfm_plant.components.capacitor_bank import CapacitorBank
 from gfm_plant.components.constant_power import ConstantPowerLoad
 from gfm_plant.components.finite_grid import FiniteGrid
@@ -35,6 +36,7 @@ class NetworkParts(Options):
         'follows, or all of a table, such as "lines"; "converters", "grid", "fault", or "all"',
     )
     lines: dict[str, Line] = Field({}, description="between nodes, by name")
+    bergeron_lines: dict[str, BergeronLine] = Field({}, description="between nodes, by name")
     transformers: dict[str, Transformer] = Field({}, description="between nodes, by name")
     saturations: dict[str, Saturation] = Field({}, description="of transformers, by name")
     loads: dict[str, Load] = Field({}, description="by name")

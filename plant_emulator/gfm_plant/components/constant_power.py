@@ -146,7 +146,7 @@ class ConstantPowerLoad(Drawing):
     ) -> tuple[complex, list[float]]:
         return -self.current(v, omega_b * (omega - 1.0))[1], []
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         record["v_f"], i = self.current(v, omega_b * (omega - 1.0))
         return i
 

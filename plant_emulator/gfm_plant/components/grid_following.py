@@ -170,7 +170,7 @@ class GridFollowing(Drawing):
     ) -> tuple[complex, list[float]]:
         return self.S * self.brings(v), []
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         theta = cmath.phase(v)
         i = self.brings(v) * cmath.exp(-1j * theta)
         record["s"] = theta, omega_b * (omega - 1.0), i.real, i.imag

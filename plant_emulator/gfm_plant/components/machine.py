@@ -138,7 +138,7 @@ class Machine(Rotating):
         i = (voltage - v) / complex(self.R / self.S, omega * (self.X / self.S))
         return i, [(voltage * i.conjugate()).real / self.S - self.asked(omega)]
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         record["omega"] = omega
         return complex(self.E * np.exp(1j * z[0]))
 

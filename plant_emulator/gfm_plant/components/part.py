@@ -90,7 +90,8 @@ class LinearPart:
     """Small deviations of a component with a source, around its rest.
 
     It has m states. Currents and voltages are two numbers each, the real and the imaginary part of
-    a space vector in the frame that turns with the component's island.
+    a space vector in the frame that turns with the component's island; with two sources, those of
+    both and then the imaginary ones.
     """
 
     A: Matrix  # the states by themselves, (m, m), 1/s
@@ -133,7 +134,7 @@ class Dynamic(Component):
 
 
 class Fed(Dynamic):
-    """A component with a source of its own: a voltage or a current.
+    """A component with a source of its own: a voltage or a current; between two nodes two currents.
 
     Its record has ``source``, the place of that among the sources, and ``sees``, the place in w of
     the state that it sees; that of a voltage has ``E``, its value, p.u., over its unit phasor. A
@@ -145,9 +146,19 @@ class Fed(Dynamic):
     #: of its steady state, besides currents and voltages of the circuit
     unknowns: ClassVar[int] = 0
 
-    node: str
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Where its sources are: its node, or two; then what is said below of one is an array."""
+        return (self.node,)  # type: ignore[attr-defined]
 
-    def sees(self, name: str, banks: Mapping[str, str]) -> str:
+    def sources(self, name: str) -> tuple[str, ...]:
+        """Their names, whose places follow each other."""
+        return (emf(name) if self.is_voltage else name,)
+
+    def check_pieces(self, name: str, shortest: float, omega_b: float) -> None:
+        """Raise ValueError if it cannot have pieces of time as short as this, s."""
+
+    def sees(self, name: str, banks: Mapping[str, str]) -> str | tuple[str, ...]:
         """The state of w that it sees.
 
         Args:
@@ -159,9 +170,7 @@ class Fed(Dynamic):
         """
         raise NotImplementedError
 
-    def steady(
-        self, v: complex, omega: float, omega_b: float, z: Matrix
-    ) -> tuple[complex, list[float]]:
+    def steady(self, v: Any, omega: float, omega_b: float, z: Matrix) -> tuple[Any, list[float]]:
         """At rest, the current that it brings to its node, and what must vanish besides.
 
         Args:
@@ -172,7 +181,7 @@ class Fed(Dynamic):
         """
         raise NotImplementedError
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: Any, omega: float, omega_b: float, z: Matrix) -> Any:
         """Write the state at rest to its record; returns its source, in the common frame.
 
         Args:
@@ -181,7 +190,7 @@ class Fed(Dynamic):
         raise NotImplementedError
 
     def linear(
-        self, record: Any, seen: complex, source: complex, slip: float, omega_b: float
+        self, record: Any, seen: Any, source: Any, slip: float, omega_b: float
     ) -> LinearPart:
         """Small deviations around the rest that its record has.
 
@@ -209,6 +218,7 @@ class Drawing(Fed):
     """A component that draws a current from a node whose voltage a capacitor holds."""
 
     is_voltage: ClassVar = False
+    node: str
     #: what a node without a capacitor lacks, after its name and that of the component
     lacks: ClassVar[str]
 

@@ -139,7 +139,7 @@ class Saturation(Core, Drawing):
     ) -> tuple[complex, list[float]]:
         return 0j, []
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         record["flux"], record["turn"] = v / complex(0.0, omega), 1.0
         if abs(v) / omega > self.knee:
             raise NoEquilibrium(

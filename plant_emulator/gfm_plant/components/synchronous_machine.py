@@ -334,7 +334,7 @@ class SynchronousMachine(Rotating):
             abs(v) - self.V, torque - self.asked(omega), terminal.real, terminal.imag
         ]  # fmt: skip
 
-    def start(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
+    def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         i, v = complex(*z[:2]), complex(*z[2:])
         q_axis = v + complex(self.R, omega * self.X_q) * i
         unit = -1j * q_axis / abs(q_axis)
