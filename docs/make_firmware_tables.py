@@ -79,7 +79,7 @@ def _table(results: list[dict[str, Checked]]) -> str:
         [
             *lines,
             "",
-            f"{len(law_names())} laws, {' and '.join(sorted(versions))}, `-O2`. In each column "
+            f"{len(law_names())} laws, {' and '.join(sorted(versions))}. In each column "
             f"{max(rows):,} rows a law, 0 words that differ.",
             "",
         ]
@@ -110,13 +110,13 @@ def _fixed(folder: Path, in_float32: dict[str, Checked]) -> str:
             cells += ["{}…{}".format(*found.instructions), str(found.code)]
         cells += [deviation_text(one) for kind in kinds for one in proven[c.name][kind]]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", f"{_version('m4f')}, `-O2`. {DEAD_BUS}", ""])
+    return "\n".join([*lines, "", f"{_version('m4f')}. {DEAD_BUS}", ""])
 
 
 def _version(target: str) -> str:
     compiler = f"{TARGETS[target].prefix}{TARGETS[target].compiler}"
     said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True)
-    return said.stdout.splitlines()[0]
+    return f"{said.stdout.splitlines()[0]}, `{TARGETS[target].optimised}`"
 
 
 def _stages(results: dict[str, list[Checked]]) -> str:

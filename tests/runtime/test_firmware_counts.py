@@ -40,11 +40,17 @@ COUNTED = {
 }  # fmt: skip
 
 
+def test_after_a_law_that_refuses_its_last_row_the_next_one_begins_anew(tmp_path):
+    """A change of law would ask the refusing one for its output."""
+    found = check(exported(tmp_path, "float32", "unrolled", of=COUNTED), "host", ticks=300)
+    assert [(c.rows, c.differ) for c in found] == [(300, 0)] * len(COUNTED)
+
+
 @pytest.mark.parametrize(
     ("target", "real", "style", "flags"),
     [
         ("host", "float32", "unrolled", "-O2"), ("host", "float64", "records", "-O3"),
-        ("clang", "float64", "unrolled", "-O2"), ("m4f", "float32", "unrolled", "-O2"),
+        ("clang", "float64", "unrolled", "-O2"), ("m4f", "float32", "unrolled", "-Os"),
         ("m4f", "float32", "records", "-O2"), ("m7", "float64", "unrolled", "-O2"),
         ("m3", "float32", "unrolled", "-O2"), ("s390x", "float32", "unrolled", "-O2"),
         ("aarch64", "float64", "unrolled", "-O2"), ("i386", "float32", "unrolled", "-O2"),
@@ -56,8 +62,8 @@ def test_the_whole_interrupt_has_the_kernels_bits(tmp_path, target, real, style,
     assert [(c.name, c.rows, c.differ) for c in found] == [(n, CHECKED, 0) for n in COUNTED]
     if (target, style) == ("m4f", "unrolled"):
         most = {c.name: c.instructions[1] for c in found if c.instructions}
-        assert most.pop("third") <= 1050  # three states and a cascaded stage
-        assert max(most.values()) <= 900
+        assert most.pop("third") <= 980  # three states and a cascaded stage
+        assert max(most.values()) <= 860
 
 
 def test_the_rows_reach_what_they_are_for():

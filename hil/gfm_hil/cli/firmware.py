@@ -96,7 +96,12 @@ def add(command: argparse.ArgumentParser) -> None:
         help="; ".join(f"{name}: {target.what}" for name, target in TARGETS.items())
         + f"; {EVA}: no run, but Frama-C's proof that --real fixed never overflows",
     )  # fmt: skip
-    proof.add_argument("--flags", default=OPTIMISED, help=f"for the compiler ({OPTIMISED})")
+    others = ", ".join(
+        f"{target.optimised} on {name}"
+        for name, target in TARGETS.items()
+        if target.optimised != OPTIMISED
+    )
+    proof.add_argument("--flags", help=f"for the compiler ({OPTIMISED}, {others})")
     proof.add_argument(
         "--ticks", type=int, default=CHECKED, metavar="N", help=f"rows of each law ({CHECKED})"
     )

@@ -51,6 +51,7 @@ class Target:
     machine: tuple[str, ...] = ()  #: QEMU's command, or () for this machine
     #: of the clock that counts instructions; 0 for QEMU in user mode, which has none
     tick_ns: int = 0
+    optimised: str = OPTIMISED  #: flag for the compiler
     real: str = "float64"  #: float32 if that is all that its floating-point unit has
     order: Literal["<", ">"] = "<"  #: of bytes, as numpy has it
 
@@ -78,6 +79,7 @@ TARGETS = {
     "clang": Target("this machine, clang", compiler="clang", packages="clang libc6-dev"),
     "m4f": Target(
         "Cortex-M4F in QEMU", **_ARM, real="float32",
+        optimised="-Os",  # takes 4 to 7 % fewer instructions than -O2
         flags=("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
         machine=("qemu-system-arm", "-machine", "mps2-an386"),
     ),
@@ -144,13 +146,15 @@ class Checked:
         return least - self.checks, most - self.checks
 
 
-def check(folder: Path, target: str, flags: str = OPTIMISED, ticks: int = CHECKED) -> list[Checked]:
+def check(
+    folder: Path, target: str, flags: str | None = None, ticks: int = CHECKED
+) -> list[Checked]:
     """Build, run and compare a folder that ``export`` wrote.
 
     Args:
         folder: with report.json and the sources.
         target: one of ``TARGETS``.
-        flags: more for the compiler, e.g. ``"-O3"``.
+        flags: more for the compiler, e.g. ``"-O3"``, in place of the target's ``optimised``.
         ticks: golden rows of each law.
 
     Raises:
@@ -212,7 +216,7 @@ def build(
     where: Target,
     names: Sequence[str],
     rest: Sequence[str],
-    flags: str = OPTIMISED,
+    flags: str | None = None,
 ) -> None:
     """Compile the modules ``names`` of a folder, and a program around them, to ``PROGRAM``.
 
@@ -222,12 +226,13 @@ def build(
         where: the target.
         names: of the modules, without an end.
         rest: the program's sources, and more for their compiler.
-        flags: more for the compiler.
+        flags: more for the compiler, in place of the target's ``optimised``.
 
     Raises:
         LawError: it does not compile.
     """
-    compiler = [where.prefix + where.compiler, *FLAGS, *where.flags, *shlex.split(flags)]
+    compiler = [where.prefix + where.compiler, *FLAGS, *where.flags]
+    compiler += shlex.split(where.optimised if flags is None else flags)
     own = [str(folder / f"{name}.c") for name in names]
     called([*compiler, "-fstack-usage", f"-I{folder}", "-c", *own], at)
     called([*compiler, "-std=gnu99", f"-I{folder}", "-c", *rest], at)

@@ -103,7 +103,8 @@ def columns(
 def golden(modules: Sequence[Module], ticks: int) -> Golden:
     """Golden rows of the laws one after the other, each with that many ticks.
 
-    The first law starts by init, each of the others by a change from the law before it.
+    The first law starts by init, each of the others by a change from the law before it, or by init
+    where that one refuses its last row.
     """
     if modules[0].fixed:
         return _fixed_rows(modules, ticks)
@@ -130,7 +131,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         op, refs, ys = inputs(seed, ticks, real, stages)
         if counts:
             op, ys = _adc(op, seed, module.record)
-        op[0] = INIT if k == 0 else SWITCH
+        op[0] = SWITCH if k and now[2] == OK else INIT
         for nth, at in enumerate(range(SEGMENT // 3, ticks, SEGMENT) if module.tuning else ()):
             if op[at] == STEP:
                 op[at] = TUNE + nth % len(module.sets())
