@@ -263,6 +263,7 @@ def _network(
                 record["lag"] = len(par) + lags.index(name)
             if isinstance(one, Fed):
                 record["source"] = places[one.sources(name)[0]]
+    net["n_dynamic"] = len(dynamic)
     return Network(par, st, net, now, tuple(parts), wiring)
 
 

@@ -201,6 +201,7 @@ net_dtype = _header(
         ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
         ("n_converters", "i8"),
+        ("n_dynamic", "i8"),  # components with records
         # units of a switched bridge's carrier in a period, between two loads of compare values (0:
         # no bridge is switched); how many go into a period of the carrier; s of one
         ("n_units", "i8"),
