@@ -140,10 +140,8 @@ class Network:
         currents = [item for item in fed if not item[1].is_voltage]
         for _ in range(_ROUNDS if currents else 0):  # they follow from the voltages
             for name, one, record, z, omega in currents:
-                brought = np.atleast_1d(
-                    one.settle(record, w[record["sees"]].tolist(), omega, omega_b, z)
-                )
-                volts |= zip(one.sources(name), brought.tolist(), strict=True)
+                i = one.settle(record, w[record["sees"]].tolist(), omega, omega_b, z)
+                volts |= zip(one.sources(name), np.atleast_1d(i).tolist(), strict=True)
             w = rests_at(volts, turns)
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))

@@ -200,8 +200,8 @@ class _NetworkEquilibrium:
                 at, omega = [volts[node] for node in one.nodes], speeds[one.nodes[0]]
                 seen = np.array(at) if len(at) > 1 else at[0]
                 i, wanted = one.steady(seen, omega, wiring.omega_b, mine)
-                for node, brought in zip(one.nodes, np.atleast_1d(i).tolist(), strict=True):
-                    missing[node] += brought
+                for node, current in zip(one.nodes, np.atleast_1d(i).tolist(), strict=True):
+                    missing[node] += current
                 rows.append(np.array(wanted))
         met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])

@@ -106,9 +106,8 @@ class BergeronLine(Fed):
     """A line or cable as travelling waves of constant speed (Bergeron): L and B as those of a line
     as a pi, of which the characteristic impedance is sqrt(L / B) and the delay sqrt(L B) over the
     nominal angular frequency; R is a quarter at each end and half in the middle. The delay must be
-    at least the sampling period. It has no breaker, carries no zero
-    sequence and cannot be recorded; both of its nodes
-    need a capacitor."""
+    at least the sampling period. It has no breaker, carries no zero sequence and cannot be
+    recorded; both of its nodes need a capacitor."""
 
     title: ClassVar = "Line of travelling waves"
     symbol: ClassVar = "inductor"
