@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy  # loads scipy.interpolate, and so scipy.optimize, when it is first used
 from pydantic import Field
-from scipy.interpolate import pade
 
 from gfm_plant.circuit import CurrentSource, Element, Shunt
 from gfm_plant.components.part import Fed, LinearPart, Matrix, Terminal
@@ -232,7 +232,9 @@ class BergeronLine(Fed):
     ) -> LinearPart:
         """Each delay as its Pade approximant of the envelope in the frame of the island."""
         tau, h = self.delay(omega_b), self.h
-        upper, lower = pade([(-1.0) ** k / math.factorial(k) for k in range(2 * _ORDER)], _ORDER)
+        upper, lower = scipy.interpolate.pade(
+            [(-1.0) ** k / math.factorial(k) for k in range(2 * _ORDER)], _ORDER
+        )
         poles = lower.roots
         residues = upper(poles) / lower.deriv()(poles)
         enter = np.kron(np.eye(2), np.ones((_ORDER, 1))) / tau
