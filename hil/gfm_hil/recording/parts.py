@@ -61,7 +61,7 @@ class RolePart:
         """New files in ``folder``/parts, filled so that no page is first touched in the loop.
 
         ``inner``, ``options``: what the run records besides, see ``signals_of``; ``flows``: the
-        columns of its network, of which the controller records none.
+        columns of its network, which the plant alone records.
         """
         columns, times = signals_of(role, inner, options), kept_of(role)
         parts = folder / "parts"

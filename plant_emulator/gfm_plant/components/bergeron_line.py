@@ -103,10 +103,10 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 
 class BergeronLine(Fed):
-    """A line or cable as travelling waves of constant speed (Bergeron): L and B as those of a line
-    as a pi, of which the characteristic impedance is sqrt(L / B) and the delay sqrt(L B) over the
-    nominal angular frequency; R is a quarter at each end and half in the middle. The delay must be
-    at least the sampling period. It has no breaker, carries no zero sequence and cannot be
+    """A line or cable on which waves travel at a constant speed (Bergeron). L and B are those of a
+    line as a pi: its characteristic impedance is sqrt(L / B), and its delay is sqrt(L B) over the
+    nominal angular frequency. A quarter of R is at each end and half in the middle. The delay must
+    be at least the sampling period. It has no breaker, carries no zero sequence and cannot be
     recorded; both of its nodes need a capacitor."""
 
     title: ClassVar = "Line of travelling waves"

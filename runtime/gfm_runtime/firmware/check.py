@@ -79,7 +79,7 @@ TARGETS = {
     "clang": Target("this machine, clang", compiler="clang", packages="clang libc6-dev"),
     "m4f": Target(
         "Cortex-M4F in QEMU", **_ARM, real="float32",
-        optimised="-Os",  # takes 4 to 7 % fewer instructions than -O2
+        optimised="-Os",  # takes 3 to 7 % fewer instructions than -O2
         flags=("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"),
         machine=("qemu-system-arm", "-machine", "mps2-an386"),
     ),
