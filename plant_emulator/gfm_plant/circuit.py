@@ -21,10 +21,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy  # loads its parts when they are first used: a controller's side uses none
 from numpy.typing import NDArray
-from scipy.linalg import null_space
-from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import splu
 
 GROUND = "ground"
 
@@ -235,7 +233,9 @@ def rest(
         for sink in circuit.sinks:
             right[n_b + place[sink.node]] -= those[sink.name]
         rows, columns, values = zip(*entries, strict=True)
-        found = splu(csc_matrix((values, (rows, columns)), (n, n), dtype=complex)).solve(right)
+        shape = (n, n)
+        matrix = scipy.sparse.csc_matrix((values, (rows, columns)), shape, dtype=complex)
+        found = scipy.sparse.linalg.splu(matrix).solve(right)
         for j, b in enumerate(branches):
             w[places[b.name]] += found[j]
         for node, k in charged.items():
@@ -264,7 +264,7 @@ def find_rates(circuit: Circuit, omega_b: float, order: Sequence[str]) -> Rates:
 def _reduce(circuit: Circuit) -> _Reduced:
     one = assemble(circuit)
     rows = list(one.meets.values())
-    K = null_space(np.array(rows) / one.root) if rows else np.eye(len(one.root))
+    K = scipy.linalg.null_space(np.array(rows) / one.root) if rows else np.eye(len(one.root))
     return _Reduced(one.names, one.M, one.B, one.root, K)
 
 

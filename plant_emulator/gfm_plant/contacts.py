@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
+from numba.np.linalg import ensure_lapack
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, null_space
 
 from gfm_plant.circuit import GROUND, Assembled, Branch, Circuit, assemble, without_ends
 
@@ -71,6 +72,7 @@ def zero_circuit(wiring: Wiring) -> Circuit:
 def join(wiring: Wiring, omega_b: float) -> Joint:
     """Return the system of a wiring whose contacts are all closed. Raises ValueError: as
     `circuit.find_modes`."""
+    ensure_lapack()  # now, as the loop that calls `joint.make_joint` has no time for it
     fault, place = wiring.fault, "" if wiring.fault is None else wiring.fault_node
     closed = wiring.with_poles()
     circuit, _ = closed.circuit(wiring.blocked, None, 0, place or GROUND)
@@ -78,9 +80,10 @@ def join(wiring: Wiring, omega_b: float) -> Joint:
     axis, zero = assemble(circuit, place), assemble(zero_circuit(closed), at_zero)
     n, order = len(axis.names), wiring.order
     root = np.concatenate([axis.root, axis.root, zero.root])
-    meets = block_diag(_meet(axis, place), _meet(axis, place), _meet(zero, at_zero)) / root
-    K = null_space(meets) if len(meets) else np.eye(len(root))
-    wide = np.array([block_diag(axis.M, axis.M, zero.M)] * 8)
+    of_axis, of_zero = _meet(axis, place), _meet(zero, at_zero)
+    meets = scipy.linalg.block_diag(of_axis, of_axis, of_zero) / root
+    K = scipy.linalg.null_space(meets) if len(meets) else np.eye(len(root))
+    wide = np.array([scipy.linalg.block_diag(axis.M, axis.M, zero.M)] * 8)
     bars, carries = np.zeros((8, 3, len(root))), np.zeros((8, 3, len(root)))
     for phases in range(8):
         if fault is not None:

@@ -12,7 +12,6 @@ import cmath
 from typing import Any
 
 from numba import types
-from numba.np.linalg import ensure_lapack
 
 from gfm_plant.layout import field
 from gfm_plant.records import N_OWN
@@ -21,10 +20,9 @@ from gfm_runtime.compiled import compiled, inlined
 _NOTHING = 1e-9  # of a bar that others already are
 _LEAST = 1e-8  # 1/s; a smaller rate of `series` is rounding
 
-ensure_lapack()
 _floats = types.CPointer(types.float64)
-#: numba's own door to dgeev: kind, left and right vectors, n, matrix, rates, vectors; it brings its
-#: memory, and arrays are as Fortran has them
+#: numba's own door to dgeev, which `contacts.join` loads: kind, left and right vectors, n, matrix,
+#: rates, vectors; it brings its memory, and arrays are as Fortran has them
 _dgeev: Any = types.ExternalFunction(
     "numba_ez_rgeev",
     types.intc(

@@ -10,9 +10,9 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numba import typeof
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from gfm_plant.circuit import Branch
 from gfm_plant.components import DYNAMIC
@@ -504,5 +504,6 @@ def _low_pass(x: float) -> tuple[float, ...]:
     its input at the beginning, the middle and the end, between which the input is a parabola."""
     A = np.diag([1.0, 1.0, 1.0], 1)
     A[0, 0] = -x
-    whole, f_1, f_2, f_3 = expm(A)[0]  # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
+    # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
+    whole, f_1, f_2, f_3 = scipy.linalg.expm(A)[0]
     return whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)

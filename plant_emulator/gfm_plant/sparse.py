@@ -33,10 +33,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, diags
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from gfm_plant.circuit import GROUND, Branch, Circuit, check_parts
 from gfm_plant.layout import MOST_OF_SEVERAL, field
@@ -315,13 +313,13 @@ class _Factors:
                 for k, b in those:
                     G[j, k] += a * b / one.L
         i, j = np.array(list(G)).T
-        matrix = csc_matrix((list(G.values()), (i, j)), (n, n))
-        parts = connected_components(matrix, directed=False)[1]
+        matrix = scipy.sparse.csc_matrix((list(G.values()), (i, j)), (n, n))
+        parts = scipy.sparse.csgraph.connected_components(matrix, directed=False)[1]
         grounded = {parts[k] for k in to_known}
         pinned = [np.flatnonzero(parts == p)[0] for p in range(max(parts) + 1) if p not in grounded]
         for k in pinned:  # a part that hangs on nothing: its voltages are up to a constant
-            matrix = matrix + csc_matrix(([matrix[k, k]], ([k], [k])), (n, n))
-        lu = splu(
+            matrix = matrix + scipy.sparse.csc_matrix(([matrix[k, k]], ([k], [k])), (n, n))
+        lu = scipy.sparse.linalg.splu(
             matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )  # fmt: skip
@@ -332,7 +330,7 @@ class _Factors:
         if self.of_all is None:
             return []
         lu, n = self.of_all, len(right)
-        lower, upper = csr_matrix(lu.L), csr_matrix(lu.U)
+        lower, upper = scipy.sparse.csr_matrix(lu.L), scipy.sparse.csr_matrix(lu.U)
         at_row = np.argsort(lu.perm_r)
         found: list[Row] = []
         for k in range(n):
@@ -405,17 +403,19 @@ def _norms(
             for node, sign in one.taken.items() if node in place
         ]  # fmt: skip
         i, k, value = zip(*entries, strict=True) if entries else ((), (), ())
-        return csr_matrix((value, (i, k)), (n_b, max(1, len(place))))
+        return scipy.sparse.csr_matrix((value, (i, k)), (n_b, max(1, len(place))))
 
-    per_L = diags([one.L**-0.5 for one in branches])
-    per_C = diags([cap.C**-0.5 for cap in caps])
+    per_L = scipy.sparse.diags([one.L**-0.5 for one in branches])
+    per_C = scipy.sparse.diags([cap.C**-0.5 for cap in caps])
     to_caps = per_L @ incidence(at) @ per_C
     D = (per_L @ incidence(index)).T
-    lose = diags([one.R / one.L for one in branches])
+    lose = scipy.sparse.diags([one.R / one.L for one in branches])
     if resistive:
         to_R = per_L @ incidence(resistive)
-        lose = lose + to_R @ diags([through[node] for node in resistive]) @ to_R.T
-    leak = diags([1 / through[c.node] / c.C if c.node in through else 0.0 for c in caps])
+        lose = lose + to_R @ scipy.sparse.diags([through[node] for node in resistive]) @ to_R.T
+    leak = scipy.sparse.diags(
+        [1 / through[c.node] / c.C if c.node in through else 0.0 for c in caps]
+    )
 
     def project(i: Any) -> Any:
         return i if solved.of_all is None else i - D.T @ solved.of_all.solve(D @ i)
@@ -432,8 +432,10 @@ def _norms(
         if n <= DENSE:
             return float(np.sqrt(np.abs(np.linalg.eigvalsh(square(np.eye(n)))).max()))
         start = np.random.default_rng(0).standard_normal(n)
-        operator = LinearOperator((n, n), matvec=square, dtype=float)
-        found = eigsh(operator, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)
+        operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=square, dtype=float)
+        found = scipy.sparse.linalg.eigsh(
+            operator, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False
+        )
         return float(1.001 * np.sqrt(found[0]))
 
     norm = largest(lambda x: (y := skew(x) - loss(x), -skew(y) - loss(y))[1])

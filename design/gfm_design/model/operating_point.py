@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy  # loads its sparse matrices when they are first used: of large networks
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import splu
 
 from gfm_plant import Network, NoEquilibrium, plant_equilibrium
 from gfm_plant.circuit import GROUND
@@ -433,7 +432,8 @@ def _solve(jacobian: NDArray[np.float64], right: Vector) -> Vector:
     independent."""
     if len(right) > _MOST_BY_SQUARES and len(right) == jacobian.shape[1]:
         try:
-            return np.asarray(splu(csc_matrix(jacobian)).solve(right))
+            sparse = scipy.sparse.csc_matrix(jacobian)
+            return np.asarray(scipy.sparse.linalg.splu(sparse).solve(right))
         except RuntimeError:  # a part without a voltage
             pass
     return np.asarray(np.linalg.lstsq(jacobian, right, rcond=1e-12)[0])

@@ -17,13 +17,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
+import scipy  # loads scipy.fft when it is first used
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.run.cycles import hann
+from gfm_hil.run.cycles import detrend, hann
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
@@ -89,7 +88,7 @@ def remaining_ripple(
     for name, column in columns.items():
         if size[name] <= max(limit, size.get(worst, 0.0)):
             continue
-        if np.ptp(scipy.signal.detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
+        if np.ptp(detrend(column[done - n // 2 : done])) < 0.5 * size[name]:
             continue
         if done >= 2 * n:
             before, _ = _sinusoids(column[done - 2 * n : done - n][None], T_s, explained)
@@ -148,8 +147,9 @@ def _sinusoids(
     row of x (signals, ticks), beside those of the ``explained`` frequencies."""
     n = x.shape[1]
     window = hann(n)
-    length = next_fast_len(2 * n, real=True)  # lines half as far apart: it falls on none by 4 %
-    spectra = np.abs(np.fft.rfft(scipy.signal.detrend(x) * window, length))
+    # Lines lie half as far apart as the window has them: the strongest falls between two by 4 %.
+    length = scipy.fft.next_fast_len(2 * n, real=True)
+    spectra = np.abs(np.fft.rfft(detrend(x) * window, length))
     lines = np.fft.rfftfreq(length, T_s)
     apart = 1.0 / (n * T_s)
     spectra[:, lines < _SLOWEST * apart] = 0.0
