@@ -1,4 +1,4 @@
-"""REGFM_A1 and REGFM_B1 beside the published cases: the table and the figure of docs/regfm.md.
+"""REGFM_A1 and REGFM_B1 beside the published cases: the table and the figures of docs/regfm.md.
 
 Usage: python docs/make_regfm.py    (about a minute)
 """
@@ -17,46 +17,39 @@ from gfm_hil.scenario import find_scenario
 
 CASES = runpy.run_path(str(find_scenario("regfm_a1").parent / "published" / "regfm_cases.py"))
 Rows = NDArray[np.float64]
-DIGITS = (4, 4, 5, 3)  # of P, Q, V, f
+HEADS = ("P [p.u.]", "Q [p.u.]", "V [p.u.]", "f [Hz]")
+DIGITS = (4, 4, 5, 4)  # of these
 
 
 def main() -> None:
-    figure, panels = pyplot.subplots(7, 2, figsize=(8.5, 13.0), layout="constrained")
     rows = []
-    for (model, case), panel in zip(CASES["EVERY"], panels.T.flat, strict=True):
-        pscad, psse = (CASES["points"](model, case, by) for by in ("PSCAD", "PSS/E"))
-        own = CASES["traces"](model, case, CASES["run"](model, case))
-        rows.append(_row(model, case, own, pscad, psse))
-        panel.plot(own[:, 0], own[:, 1], "C0", lw=1, label="P, gfmhil through the meter")
-        panel.plot(own[:, 0], own[:, 2], "C2", lw=1, label="Q, gfmhil through the meter")
-        for k in (1, 2):
-            panel.plot(psse[:, 0], psse[:, k], "k+", ms=4, label="PSS/E" if k == 1 else None)
-            panel.plot(pscad[:, 0], pscad[:, k], "C3.", ms=5, label="PSCAD" if k == 1 else None)
-        panel.set(title=f"{model.upper()}: {case}", xlim=(-0.05, 0.8))
-        panel.title.set_size(9)
-    panels[0, 0].legend(fontsize=6)
-    for panel in panels[-1]:
-        panel.set_xlabel("t after the event [s]")
-    figure.supylabel("P, Q [p.u.]")
-    figure.savefig(FIGURES / "regfm.png", dpi=110)
-    heads = ("model", "case", "PSCAD's points", *(f"{name}: ours (PSS/E's)" for name in
-             ("P [p.u.]", "Q [p.u.]", "V [p.u.]", "f [Hz]")))  # fmt: skip
-    text = markdown(heads, rows) + "\n"
-    (TABLES / "regfm.md").write_text(text, encoding="utf-8")
+    for model in CASES["MODELS"]:
+        figure, panels = pyplot.subplots(7, 4, figsize=(12.0, 14.0), layout="constrained")
+        for case, line in zip(CASES["CASES"], panels, strict=True):
+            pscad, psse = (CASES["points"](model, case, by) for by in ("PSCAD", "PSS/E"))
+            own = CASES["traces"](model, case, CASES["run"](model, case))
+            rows.append(_row(model, case, own, pscad, psse))
+            for k, panel in enumerate(line, start=1):
+                panel.plot(own[:, 0], own[:, k], "C0", lw=1, label="gfmhil, through the meter")
+                panel.plot(psse[:, 0], psse[:, k], "k+", ms=4, label="PSS/E")
+                panel.plot(pscad[:, 0], pscad[:, k], "C3.", ms=5, label="PSCAD")
+                panel.set_xlim(-0.05, 0.8)
+                panel.ticklabel_format(useOffset=False)
+            line[0].set_ylabel(case, fontsize=9)
+        for panel, name in zip(panels[0], HEADS, strict=True):
+            panel.set_title(name, fontsize=10)
+        panels[0, 0].legend(fontsize=7)
+        figure.supxlabel("t after the event [s]")
+        figure.savefig(FIGURES / f"{model}.png", dpi=90)
+        pyplot.close(figure)
+    heads = ("model", "case", "PSCAD's points", *(f"{name}: ours (PSS/E's)" for name in HEADS))
+    (TABLES / "regfm.md").write_text(markdown(heads, rows) + "\n", encoding="utf-8")
 
 
 def _row(model: str, case: str, own: Rows, pscad: Rows, psse: Rows) -> tuple[str, ...]:
-    window = f"{len(pscad)}, {pscad[0, 0]:.3f}–{pscad[-1, 0]:.3f} s" if len(pscad) else "none read"
-    cells = ["–"] * 4
-    if len(pscad):
-        ours = np.stack(CASES["distances"](own, pscad))
-        theirs = np.full((2, 4), np.nan)
-        if len(psse):
-            theirs = np.stack(CASES["distances"](psse, pscad))
-        cells = [
-            "–" if np.isnan(o).any() else f"{_pair(o, d)} ({_pair(t, d)})"
-            for o, t, d in zip(ours.T, theirs.T, DIGITS, strict=True)
-        ]
+    ours, theirs = (np.stack(CASES["distances"](x, pscad)).T for x in (own, psse))
+    cells = (f"{_pair(o, d)} ({_pair(t, d)})" for o, t, d in zip(ours, theirs, DIGITS, strict=True))
+    window = f"{len(pscad)}, {pscad[0, 0]:.3f}–{pscad[-1, 0]:.3f} s"
     return (model.upper(), case, window, *cells)
 
 

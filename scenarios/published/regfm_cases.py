@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lsim
 
 import gfmhil
 
@@ -69,20 +70,32 @@ def metered(x: NDArray[np.float64], T: float, T_s: float) -> NDArray[np.float64]
 
 def traces(model: str, case: str, run: gfmhil.Run) -> NDArray[np.float64]:
     """The bench's rows as ``points``, at every tick: P, Q and V as PSCAD's meter would show them.
-    f of REGFM_B1's faults is nan: they publish the frequency of the machine, the bench records that
-    of E, which the angle's window ties to the PLL."""
+    f of REGFM_B1 is that of its machine, as published: the bench records that of E, which the
+    angle's window ties to the PLL in a fault."""
     s, T_s = run.signals, run.scenario.T_s
     columns = [metered(s[f"true_{name}"], METER[model], T_s) for name in ("p", "q", "V")]
-    f = 60.0 * s["true_omega_u"]
-    if model == "regfm_b1" and "fault" in case:
-        f = np.full_like(f, np.nan)
-    return np.stack([s["t"] - T_EVENT, *columns, f], axis=1)
+    speed = s["true_omega_u"] if model == "regfm_a1" else machine_speed(s["true_p"], T_s)
+    return np.stack([s["t"] - T_EVENT, *columns, 60.0 * speed], axis=1)
+
+
+def machine_speed(p: NDArray[np.float64], T_s: float) -> NDArray[np.float64]:
+    """The speed of REGFM_B1's machine, p.u., by its equation from P at every tick; at rest first.
+    No case reaches its limits of 0.05 p.u."""
+    k = gfmhil.Law.load("regfm-b1").gains
+    moves = np.polymul([2 * k["H"], k["D1"] + 1 / k["mp"]], [1.0, k["omega_D"]])
+    moves = np.polymul(np.polyadd(moves, [k["D2"], 0.0]), [k["TPf"], 1.0])
+    _, w, _ = lsim(([1.0, k["omega_D"]], moves), p[0] - p, T_s * np.arange(len(p)))
+    return np.asarray(1.0 + w)
 
 
 def at(rows: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``SIGNALS`` of rows at other instants (n, 4), nan outside them."""
-    columns = [np.interp(t, rows[:, 0], x, np.nan, np.nan) for x in rows.T[1:]]
-    return np.stack(columns, axis=1)
+    """``SIGNALS`` of rows at other instants (n, 4), by the rows that have them; nan outside."""
+    out = np.full((len(t), len(SIGNALS)), np.nan)
+    for x, column in zip(rows.T[1:], out.T, strict=True):
+        read = np.isfinite(x)
+        if read.any():
+            column[:] = np.interp(t, rows[read, 0], x[read], np.nan, np.nan)
+    return out
 
 
 def distances(

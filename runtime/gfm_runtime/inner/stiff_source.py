@@ -214,7 +214,6 @@ def keep_angle(law, state):
     low, high = law.give_back * (state.window[1] - angle), law.give_back * (state.window[0] - angle)
     follows = law.one + deviation
     state.omega = limited(state.omega, follows + low, follows + high)
-    state.omega = limited(state.omega, law.low[1], law.high[1])
     turn_pll(law, state, (follows - state.m[OMEGA]) * law.half_turn)
 
 

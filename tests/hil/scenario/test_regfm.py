@@ -25,12 +25,14 @@ FOUND = {
     ("regfm_a1", "frequency-up"): (0.0015, 0.0051, 1.5e-4, 8e-4),
     ("regfm_a1", "fault-0.1s"): (0.55, 0.075, 0.045, 0.5),
     ("regfm_a1", "fault-0.5s"): (0.17, 0.16, 0.0041, 0.22),
+    ("regfm_a1", "high-impedance-fault"): (0.014, 0.011, 0.0016, 0.016),
     ("regfm_b1", "voltage-down"): (0.001, 0.0015, 5e-4, 0.0012),
     ("regfm_b1", "voltage-up"): (0.001, 0.0027, 5e-5, 0.0012),
-    ("regfm_b1", "frequency-down"): (0.003, 0.0012, 4e-4, np.nan),
-    ("regfm_b1", "frequency-up"): (8e-4, 6e-4, 1e-4, 8e-4),
-    ("regfm_b1", "fault-0.1s"): (0.055, 0.03, 0.0011, np.nan),
-    ("regfm_b1", "fault-0.5s"): (0.04, 0.013, 0.0025, np.nan),
+    ("regfm_b1", "frequency-down"): (0.0013, 0.002, 3e-4, 0.0012),
+    ("regfm_b1", "frequency-up"): (8e-4, 6e-4, 1e-4, 0.0012),
+    ("regfm_b1", "fault-0.1s"): (0.054, 0.042, 0.003, 0.084),
+    ("regfm_b1", "fault-0.5s"): (0.018, 0.06, 0.007, 0.0075),
+    ("regfm_b1", "high-impedance-fault"): (0.08, 0.14, 0.012, 0.032),
 }
 
 
@@ -39,20 +41,9 @@ def test_the_bench_is_closer_to_pscad_than_pss_e_is(cases, model, case):
     pscad, psse = (cases["points"](model, case, by) for by in ("PSCAD", "PSS/E"))
     own = cases["traces"](model, case, cases["run"](model, case))
     ours, theirs = cases["distances"](own, pscad)[1], cases["distances"](psse, pscad)[1]
-    wanted = np.array(FOUND[model, case])
-    known = ~np.isnan(wanted)
-    assert (ours[known] <= wanted[known]).all(), ours
-    assert ours[0] < theirs[0]  # of P
-
-
-@pytest.mark.parametrize(
-    ("model", "P", "Q", "V"), [("regfm_a1", 0.018, 0.0122, 0.0016), ("regfm_b1", 5e-4, 0.03, 0.002)]
-)
-def test_during_a_fault_with_a_high_impedance_the_power_is_pscad_s(cases, model, P, Q, V):
-    case = "high-impedance-fault"
-    pscad = cases["points"](model, case, "PSCAD")
-    largest, _ = cases["distances"](cases["traces"](model, case, cases["run"](model, case)), pscad)
-    assert largest[0] <= P and largest[1] <= Q and largest[2] <= V
+    assert (ours <= FOUND[model, case]).all(), ours
+    if (model, case) != ("regfm_a1", "high-impedance-fault"):  # docs/regfm.md tells why
+        assert ours[0] < theirs[0] and not ours[3] >= theirs[3]  # of P and f
 
 
 def test_the_power_that_pscad_records_of_a1_is_its_own_filter_s(cases):
