@@ -163,10 +163,6 @@ def _make(
     conversions = int(max(par["phase_samples"]))
     if (par["phase_samples"] != conversions).any():
         raise ValueError("phases.samples: must be the same for all converters of a network")
-    if carriers and dynamic:
-        raise ValueError(
-            f"{dynamic[0][0]}: cannot be beside a switched bridge yet; set bridge.kind = 'average'"
-        )
     large = not carriers and len(wiring.order) > MOST_BY_MODES
     entries = entries_of(wiring) if large else 0
     network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries)

@@ -1,10 +1,12 @@
-"""How a plant goes on between two instants of a sampling period: averaged, or from edge to edge;
+"""How a plant goes on between two instants of a sampling period: averaged, or from edge to edge,
+there with components that have states of their own or without.
 
 A compiled function contains all that it calls, and LLVM optimises the callees again in each caller.
-Both ways are large and have several callers. So callers reach them by an address in the plant's
+The ways are large and have several callers. So callers reach them by an address in the plant's
 records: each is compiled once, and the switched bridge only for a plant that has one.
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -14,6 +16,7 @@ from numba.core import cgutils
 
 from gfm_plant.bridge import advance_bridges
 from gfm_plant.layout import intrinsic
+from gfm_plant.moving import advance_moving
 from gfm_plant.period import advance_averages
 from gfm_plant.records import PlantRecords
 from gfm_runtime.compiled import FREE, callback, inlined
@@ -21,12 +24,15 @@ from gfm_runtime.compiled import FREE, callback, inlined
 
 def find_address(plant: PlantRecords) -> int:
     """Compile, or load, the way of this plant, and return its address."""
-    return _compile(typeof(plant), bool(plant.net[0]["n_units"]))
+    n = plant.net[0]
+    way = _averaged
+    if n["n_units"]:
+        way = _moving if n["n_dynamic"] else _switched
+    return _compile(typeof(plant), way)
 
 
 @cache
-def _compile(kind: Any, switched: bool) -> int:
-    way = _switched if switched else _averaged
+def _compile(kind: Any, way: Callable[..., None]) -> int:
     signature = types.void(types.CPointer(kind), types.float64, types.float64)
     address: Any = callback(way, signature, **FREE).address
     return address
@@ -38,6 +44,10 @@ def _averaged(plant: Any, begin: float, end: float) -> None:
 
 def _switched(plant: Any, begin: float, end: float) -> None:
     advance_bridges(plant[0], begin, end)
+
+
+def _moving(plant: Any, begin: float, end: float) -> None:
+    advance_moving(plant[0], begin, end)
 
 
 @inlined

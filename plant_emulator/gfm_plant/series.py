@@ -69,6 +69,8 @@ def begin_series(plant: PlantRecords, c: int, at: float) -> None:
         E = now.sequence[k]
         source[g + k] = complex(now.V_g * E.real, now.V_g * E.imag) * unit[g + k] * to
         speed[g + k] = (omega_g if k == 0 else -omega_g) * n.omega_b
+    for k in range(g + 2, now.n_s):  # of components, which set their speeds, see `moving`
+        source[k] = source[k] * to
     if field(n, "alone")[c]:
         r, s, x = plant.par[0], plant.st[0], field(now, "vector")
         few = r.tau_dc == 0.0 and r.levels < 3 and source[g + 1] == 0j

@@ -76,7 +76,7 @@ def drive(n: Any, now: Any, c: int, part: int, k: int, E: complex, omega: float)
         E: the source's voltage over its unit phasor, p.u.
         omega: its speed, p.u.; negative for a negative sequence.
     """
-    if by_series(n, now):
+    if _by_terms(n, now):
         _set_source(n, now, part, k, E, omega)
         return
     _drive(n, now, c, part, k, k, E, omega)
@@ -102,7 +102,7 @@ def _drive(
 
 @compiled
 def _set_source(n: Any, now: Any, part: int, k: int, E: complex, omega: float) -> None:
-    """``drive`` of the series: keep the source at the beginning and in the middle of a piece."""
+    """``drive`` of a series: keep the source at the beginning and in the middle of a piece."""
     if field(now, "gain_omega")[part, k] != omega:
         field(now, "gain_omega")[part, k] = omega
         turn = turned(n.omega_b * (omega - 1.0) * field(n, "half_h")[part])
@@ -128,7 +128,7 @@ def _turn_on(now: Any, part: int, k: int) -> None:
 def draw(n: Any, now: Any, c: int, part: int, k: int, first: complex, second: complex) -> None:
     """Add to the forcing of every mode what source k does to it, which is held at one value in the
     first half of a piece and at another in the second, in the common frame."""
-    if by_series(n, now):
+    if _by_terms(n, now):
         now.held = 1
         field(now, "source")[k], field(now, "source_next")[k] = first, second
         field(now, "source_speed")[k] = n.omega_b
@@ -186,6 +186,12 @@ def _find_gains(n: Any, now: Any, c: int, part: int, k: int, source: int, omega:
 
 
 @inlined
+def _by_terms(n: Any, now: Any) -> bool:
+    """Whether a series takes the sources as they are, of a large plant or of a switched bridge."""
+    return n.n_units != 0 or by_series(n, now)
+
+
+@inlined
 def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
     """Take the modes on by half a piece: ``which`` is 0 for its first half, 1 for its second."""
     if by_series(n, now):
@@ -202,6 +208,9 @@ def state(n: Any, now: Any, c: int, i: int) -> complex:
     if by_series(n, now):
         middle: complex = middle_state(n, now, i)
         return middle
+    if n.n_units:  # where w is
+        there: complex = field(now, "w")[i]
+        return there
     states, z, w = field(n, "states"), field(now, "z"), 0j
     for m in range(field(n, "n_modes")[c]):
         w += states[c, i, m] * z[m]
@@ -294,10 +303,19 @@ def cut_to(n: Any, now: Any, c: int, h: float, longest: float) -> int:
     cut = 2 * n.n_parts
     pieces = max(1, math.ceil(h / longest))
     half = 0.5 * h / pieces
-    field(n, "pieces")[cut], field(n, "half_h")[cut] = pieces, half
+    field(n, "pieces")[cut] = pieces
     rate, decay = field(n, "rate"), field(n, "decay")
     for m in range(field(n, "n_modes")[c]):
         decay[c, cut, m] = turned(rate[c, m].imag * half) * math.exp(rate[c, m].real * half)
+    lags_to(n, now, cut, half)
+    return cut
+
+
+@compiled
+def lags_to(n: Any, now: Any, cut: int, half: float) -> None:
+    """Make the first-order lags of a cut, and the turns of its sources, those of pieces of which a
+    half lasts ``half`` s."""
+    field(n, "half_h")[cut] = half
     known, lags, weights = field(now, "gain_omega"), field(n, "lag_rate"), field(n, "lag_weights")
     for k in range(now.n_phasors):
         known[cut, k] = math.inf
@@ -307,7 +325,6 @@ def cut_to(n: Any, now: Any, c: int, h: float, longest: float) -> int:
         weights[cut, k, 1] = x * (f_1 - 3.0 * f_2 + 4.0 * f_3)
         weights[cut, k, 2] = x * (4.0 * f_2 - 8.0 * f_3)
         weights[cut, k, 3] = x * (4.0 * f_3 - f_2)
-    return cut
 
 
 @compiled

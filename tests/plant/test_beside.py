@@ -1,5 +1,5 @@
-"""One switched bridge in a network of averaged ones: against DOP853 with the same edges, and each
-converter against itself alone."""
+"""One switched bridge in a network of averaged ones, and beside what has states of its own: against
+DOP853 with the same edges, and each converter against itself alone."""
 
 import cmath
 
@@ -9,18 +9,19 @@ import pytest
 from gfm_plant import (
     Plant,
     fault,
+    grid_load,
     make_network,
     make_plant,
     plant_command,
     plant_equilibrium,
     plant_step,
 )
-from gfm_plant.components import NetworkParts
+from gfm_plant.components import ConstantPowerLoad, FiniteGrid, Machine, NetworkParts
 from gfm_plant.model import V_DC
 from gfm_plant.options import Grid
 from gfm_plant.protection import trip
 
-from ..support.switched import AtABus
+from ..support.switched import AtABus, OnASwingingGrid, WithMoving
 
 pytestmark = pytest.mark.full  # compiles the plant for several converters
 
@@ -100,6 +101,110 @@ def test_four_converters_are_exact(name):
     assert np.delete(worst, links).max() < 1e-10
     assert worst[links].max() < 1e-8
     assert (reference.zeros > 0) == ("dead" in changes)
+
+
+def beside_moving(samples, kind):
+    """The largest error in 60 periods of an averaged and a switched converter at a bus with a
+    machine and a load of constant power, after a step of both commands, and with a fault of a
+    ``kind``; ``samples`` a period cut it into as many pieces."""
+    own = ({}, {"bridge": {"kind": "two-level", "dead_time_s": 2e-6}})
+    plants = [Plant.model_validate({**SOURCE, "phases": {"samples": samples}, **x}) for x in own]
+    parts = {
+        "grid": "far",
+        "lines": {"tie": {"start": "bus", "end": "far", "L": 0.15, "R": 0.02}},
+        "loads": {"r": {"node": "bus", "P": 1.0}},
+        "capacitors": {"c": {"node": "bus", "Q": 0.1}},
+        "constant_power": {"d": {"node": "bus", "P": 0.4, "Q": 0.1}},
+        "machines": {"m": {"node": "bus", "S": 2.0, "H": 2.0, "P": 0.3, "R": 0.01, "D": 1.0}},
+    }
+    plant = make_network(
+        {f"c{k}": (one, "bus") for k, one in enumerate(plants)},
+        T_S, Grid(), NetworkParts.model_validate(parts),
+    )  # fmt: skip
+    at = [
+        plant_equilibrium(make_plant(one, T_S).par, P, 1.0)
+        for one, P in zip(plants, (0.2, 0.8), strict=True)
+    ]
+    x, u = np.array([x for x, _ in at]), np.array([[*u, 0.0] for _, u in at])
+    u[:, 1:3] += [[1e-3, 0.01], [0.0, -0.01]]
+    plant.start(x, u, [(np.array([0.1]), 1.0), (np.empty(0), 1.0)])
+    if kind:
+        fault(plant, None, 1.5, node="bus", kind=kind, phases="ca")
+    order, par, st = plant.wiring.order, plant.par, plant.st
+    places, ((one,), (load,)) = [order.index(w) for w in ("c", "tie")], map(plant.of, MOVING)
+
+    def states():
+        turn = cmath.exp(1j * par[0]["omega_b"] * T_S * int(st["tick"][0]))
+        w, rotor = plant.now["w"][0] * turn, plant.now["unit"][0, one["source"]] * turn
+        each = [[*w[3 * k : 3 * k + 3], st["x"][k, V_DC], st["i_reg"][k]] for k in range(2)]
+        own = load["v_f"] * turn, w[order.index("m")], rotor, one["omega"] - 1, one["P_turbine"]
+        return np.array([*each[1], *w[places], *each[0], *own])
+
+    turn = np.exp(1j * x[:, 6])
+    reference = WithMoving(
+        par[1], states(), others=par[:1], E=u[:1, 2] * turn[:1], u=u[:1], conductance=1.0,
+        susceptance=0.1, L_tie=0.15, R_tie=0.02, dead=2e-6, R_fault=1.5 if kind else np.inf,
+        load=load.copy(), machine=one.copy(), X=0.15, R_m=0.005,
+    )  # fmt: skip
+    reference.z[-3] = cmath.phase(reference.z[-3])
+    worst = np.zeros(len(reference.z))
+    for k in range(60):
+        command(plant, u)
+        reference.period(
+            u[1, 2] * turn[1] * cmath.exp(1j * par[1]["omega_b"] * u[1, 1] * k * T_S), u[1]
+        )
+        z = reference.z.copy()
+        z[-3] = cmath.exp(1j * z[-3].real)
+        worst = np.maximum(worst, np.abs(states() - z))
+    return worst
+
+
+MOVING = Machine, ConstantPowerLoad
+
+
+@pytest.mark.parametrize("kind", ["", "LL"])
+def test_machines_and_loads_beside_a_switched_bridge_are_of_second_order(kind):
+    """Half as long pieces have a quarter of the error, of currents and voltages of a network that
+    starts far from rest."""
+    one, two, four = (beside_moving(n, kind)[:12].max() for n in (1, 2, 4))
+    assert one < 2e-4
+    assert one / two == pytest.approx(4.0, rel=0.15)
+    assert two / four == pytest.approx(4.0, rel=0.15)
+
+
+def test_a_grid_that_reacts_to_a_switched_bridge():
+    options = Plant.model_validate(
+        {
+            **SOURCE,
+            "bridge": {"kind": "two-level", "dead_time_s": 2e-6},
+            "grid": {"finite": {"S": 2.0, "H": 3.0, "D": 1.0, "droop": 0.05, "T_gov": 0.4}},
+        }
+    )
+    plant = make_plant(options, T_S)
+    x, u = plant_equilibrium(plant.par, 0.5, 1.0)
+    u = np.array([*u, 0.0])
+    u[2] *= 1.01
+    plant.start(x, u)
+    grid_load(plant, 0.05)
+    (one,), st, turn = plant.of(FiniteGrid), plant.st, np.exp(1j * x[6])
+
+    def states():
+        now, r = plant.now[0], plant.par[0]
+        frame = cmath.exp(1j * r["omega_b"] * T_S * int(st["tick"][0]))
+        links = st["x"][0, V_DC], st["i_reg"][0]
+        swings = now["unit"][1] * frame, now["omega_g"] - 1, one["P_turbine"]
+        return np.array([*(now["w"][:3] * frame), *links, *swings])
+
+    reference = OnASwingingGrid(plant.par[0], states(), dead=2e-6, swings=one.copy())
+    reference.z[5] = cmath.phase(reference.z[5])
+    for k in range(60):
+        command(plant, u[None])
+        E = u[2] * turn * cmath.exp(1j * plant.par[0]["omega_b"] * u[1] * k * T_S)
+        reference.period(E, u)
+        z = reference.z.copy()
+        z[5] = cmath.exp(1j * z[5].real)
+        assert np.abs(states() - z).max() < 5e-7
+    assert one["P_turbine"] > 0.0 and abs(plant.now["omega_g"][0] - 1) > 2e-4
 
 
 def on_a_stiff_grid(*each, **more):

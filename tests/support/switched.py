@@ -245,6 +245,7 @@ class AtABus(Reference):
     others: Any = ()
     E: Any = ()
     u: Any = ()
+    brought: complex = 0j  # by what a subclass has at the bus besides
     conductance: float = 0.0
     susceptance: float = 0.0
     L_tie: float = 0.0
@@ -255,7 +256,8 @@ class AtABus(Reference):
         w, bus, i_g = self.par["omega_b"], z[5], z[6]
         v_a, _, v_c = (bus * AXES.conj()).real
         leak = 2 / 3 * (v_a - v_c) / self.R_fault * (AXES[0] - AXES[2])
-        arrives, more = z[2] - i_g - self.conductance * bus - leak, list[complex]()
+        arrives = self.brought + z[2] - i_g - self.conductance * bus - leak
+        more = list[complex]()
         for k, r in enumerate(self.others):
             i, v, i_o, v_dc, reg = z[7 + 5 * k : 12 + 5 * k]
             e = self.E[k] * np.exp(1j * w * self.u[k, 1] * (self.T_s * self.tick + t))
@@ -272,3 +274,57 @@ class AtABus(Reference):
         return bus, [
             w / self.susceptance * arrives, w / self.L_tie * (bus - grid - self.R_tie * i_g), *more
         ]  # fmt: skip
+
+
+@dataclass
+class WithMoving(AtABus):
+    """With a load of constant power and a machine at the bus.
+
+    Attributes:
+        load, machine: records of their parameters; the machine's voltage is behind X and R.
+        z: besides the voltage that the load has measured, the current of the machine, and the
+            angle of its voltage, its speed less 1, and the power of its turbine.
+    """
+
+    load: Any = None
+    machine: Any = None
+    X: float = 0.0
+    R_m: float = 0.0
+
+    def outside(self, t: float, z: NDArray[np.complex128]) -> tuple[complex, list[complex]]:
+        w, one, gen = self.par["omega_b"], self.load, self.machine
+        v, i, angle, speed, turbine = z[7 + 5 * len(self.others) :]
+        self.brought = i - one["S"].conjugate() * v / max(abs(v) ** 2, one["least_v2"])
+        bus, more = super().outside(t, z)
+        E = gen["E"] * np.exp(1j * angle.real)
+        power = (E * i.conjugate()).real / gen["S"]
+        return bus, [
+            *more,
+            1j * w * v + (bus - v) / one["tau"],
+            w / self.X * (E - bus - self.R_m * i),
+            w * (1 + speed.real),
+            (turbine.real - power - gen["D"] * speed.real) / (2 * gen["H"]),
+            (gen["P_set"] - speed.real / gen["droop"] - turbine.real) / gen["T_gov"],
+        ]
+
+
+@dataclass
+class OnASwingingGrid(Reference):
+    """At the end of its line a grid that swings.
+
+    Attributes:
+        swings: its parameters by name.
+        z: besides, the angle of its voltage, its speed less 1, and the power of its turbines.
+    """
+
+    swings: Any = None
+
+    def outside(self, t: float, z: NDArray[np.complex128]) -> tuple[complex, list[complex]]:
+        one, (angle, speed, turbine) = self.swings, z[5:].real
+        V = self.V_g * np.exp(1j * angle)
+        power = (V * z[2].conjugate()).real / one["S"] - one["P_load"]
+        return V, [
+            self.par["omega_b"] * (1 + speed),
+            (turbine + power - one["D"] * speed) / (2 * one["H"]),
+            (one["P_set"] - speed / one["droop"] - turbine) / one["T_gov"],
+        ]

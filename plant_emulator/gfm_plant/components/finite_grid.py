@@ -35,7 +35,8 @@ def _bound(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 @compiled
 def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    read_states(n, now, c)
+    if n.n_units == 0:  # beside a switched bridge w is there
+        read_states(n, now, c)
     one.energy += 4.0 * field(n, "half_h")[part] / 3.0 * _power(n, now, field(now, "halfway"))
 
 

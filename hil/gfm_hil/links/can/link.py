@@ -236,6 +236,7 @@ def warm_up(plan: Plan) -> None:
         put(mine.handle, mine.out[:1])
         process(theirs.handle, mine.out[0], message)
         fetch(mine.handle)
+        busy(mine.bus)  # which only a side that waits calls
         receive(mine.handle, message)
         can_port(mine)
 
