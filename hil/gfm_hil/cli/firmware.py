@@ -10,6 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner
+from gfm_hil.controllers.compile_model import compile_model
+from gfm_hil.controllers.dll import described
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
@@ -63,6 +65,16 @@ def add(command: argparse.ArgumentParser) -> None:
     _add_how(dll)
     dll.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="the folder")
     dll.set_defaults(call=call_dll)
+    own = kinds.add_parser(
+        "compile", help="compile a real-code model's own C source for Linux, and list its ports"
+    )
+    own.add_argument("source", type=Path, metavar="SOURCE", help="a C file, or a folder of them")
+    own.add_argument(
+        "-I", dest="include", type=Path, action="append", default=[], metavar="DIR",
+        help="a folder of headers; may be repeated",
+    )  # fmt: skip
+    own.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .so")
+    own.set_defaults(call=call_compile)
     unit = kinds.add_parser("fmu", help="build a law as an FMU for co-simulation")
     unit.add_argument("law", metavar="LAW", help="a name, or a .toml file")
     _add_how(unit)
@@ -166,6 +178,15 @@ def call_dll(options: argparse.Namespace) -> int:
     for file, text in files.items():
         write_text(options.out / file, text)
     print(build_dll(options.out, law.name, files))
+    return 0
+
+
+def call_compile(options: argparse.Namespace) -> int:
+    used = compile_model(options.source, options.include, options.out)
+    told, rows = described(options.out)
+    print(f"{options.out}: {', '.join(x.name for x in used)}", told, sep="\n")
+    heads = ("in a map", "width, default", "unit", "description")
+    terminal().print(Table(heads, rows, text=None), highlight=False)
     return 0
 
 

@@ -124,27 +124,7 @@ class DllController(MappedController):
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
-        try:
-            self._of = c.CDLL(str(path))
-        except OSError as problem:
-            raise UserError(f"{path}: cannot be loaded: {problem}") from None
-        for needed in ("Model_GetInfo", "Model_Initialize", "Model_Outputs"):
-            if not hasattr(self._of, needed):
-                other = (
-                    "; it has gfmhil_version: use c:" if hasattr(self._of, "gfmhil_version") else ""
-                )
-                raise UserError(
-                    f"{path}: has no function {needed}, so it is no real-code model{other}"
-                )
-        self._of.Model_GetInfo.restype = c.POINTER(_Info)
-        info = self._of.Model_GetInfo().contents
-        if info.DLLInterfaceVersion[0] != 1:
-            version = ".".join(map(str, info.DLLInterfaceVersion))
-            raise UserError(f"{path}: its interface has version {version}; this bench knows 1.x")
-        counts = (info.NumInputPorts, info.NumOutputPorts, info.NumParameters, info.NumIntStates,
-                  info.NumFloatStates, info.NumDoubleStates)  # fmt: skip
-        if not all(0 <= count <= _MOST for count in counts):
-            raise UserError(f"{path}: has {counts} ports, parameters and states")
+        self._of, info = _opened(path)
         self.name = run_name("dll", _text(info.ModelName) or path.stem)
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
@@ -225,6 +205,52 @@ class DllController(MappedController):
         if getattr(self._of, name)(c.byref(self._now)) == _ERROR:
             said = _text(self._now.LastErrorMessage) or "it does not say why"
             raise ControllerError(f"{self.name}: {name} failed: {said}")
+
+
+def _opened(path: Path) -> tuple[c.CDLL, _Info]:
+    """The library and what its model says of itself; raises as ``DllController``."""
+    try:
+        library = c.CDLL(str(path.absolute()))
+    except OSError as problem:
+        raise UserError(f"{path}: cannot be loaded: {problem}") from None
+    for needed in ("Model_GetInfo", "Model_Initialize", "Model_Outputs"):
+        if not hasattr(library, needed):
+            other = "; it has gfmhil_version: use c:" if hasattr(library, "gfmhil_version") else ""
+            raise UserError(f"{path}: has no function {needed}, so it is no real-code model{other}")
+    library.Model_GetInfo.restype = c.POINTER(_Info)
+    info: _Info = library.Model_GetInfo().contents
+    if info.DLLInterfaceVersion[0] != 1:
+        version = ".".join(map(str, info.DLLInterfaceVersion))
+        raise UserError(f"{path}: its interface has version {version}; this bench knows 1.x")
+    counts = (info.NumInputPorts, info.NumOutputPorts, info.NumParameters, info.NumIntStates,
+              info.NumFloatStates, info.NumDoubleStates)  # fmt: skip
+    if not all(0 <= count <= _MOST for count in counts):
+        raise UserError(f"{path}: has {counts} ports, parameters and states")
+    return library, info
+
+
+def described(path: Path) -> tuple[str, list[tuple[str, str, str, str]]]:
+    """A model in a sentence, and its ports and parameters: name as in a map, width or default,
+    unit, description. Raises UserError: as ``DllController``."""
+    _, info = _opened(path)
+    rows = []
+    for kind, ports, count in (
+        ("inputs", info.InputPortsInfo, info.NumInputPorts),
+        ("outputs", info.OutputPortsInfo, info.NumOutputPorts),
+    ):
+        for port in ports[:count]:
+            width = str(port.Width) if port.Width > 1 else ""
+            rows.append((f"{kind}.{_text(port.Name)}", width, port))
+    values = _parameters(path.name, info, PortMap())
+    for row in info.ParametersInfo[: info.NumParameters]:
+        is_text = row.DataType == _TEXT
+        default = "text" if is_text else f"{values.view(_text(row.Name))[0]:g}"
+        rows.append((f"parameters.{_text(row.Name)}", default, row))
+    step = info.FixedStepBaseSampleTime
+    every = f"every {step:g} s" if step else "at any step"
+    states = info.NumIntStates + info.NumFloatStates + info.NumDoubleStates
+    told = f"{_text(info.ModelName)} {_text(info.ModelVersion)}: runs {every}, {states} states"
+    return told, [(n, w, _text(x.Unit), _text(x.Description)) for n, w, x in rows]
 
 
 def _text(said: bytes | None) -> str:

@@ -167,7 +167,7 @@ def _around_jump(run: Run) -> _Recorded:
                 f"fit: {count * width * T_s:.3g} s of p {side} the jump: must be "
                 f"{least * width * T_s:.3g} s at least"
             )
-    starts = skip * T_s - 0.5 * window + width * T_s * np.arange(len(after))
+    starts = (skip - 0.5) * T_s - 0.5 * window + width * T_s * np.arange(len(after))
     smooth = [width * T_s, *filter(None, [window])]
     radians = math.radians(events[0].degrees)
     return _Recorded(radians, omega_b, X_grid, before, after, starts, smooth, lag)

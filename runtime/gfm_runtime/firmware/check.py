@@ -255,7 +255,8 @@ def called(command: Sequence[str], at: Path) -> str:
         raise LawError(command[0], f"has not ended after {_TIMEOUT_S} s") from None
     said = done.stdout + done.stderr
     if done.returncode:
-        errors = [line for line in said.splitlines() if "error" in line] or said.splitlines()
+        lines = said.splitlines()
+        errors = [x for x in lines if "error" in x or "undefined" in x] or lines
         code = done.returncode
         ended = f"code {code}" if code > 0 else f"ended by {signal.Signals(-code).name}"
         raise LawError(command[0], f"failed: {next(iter(errors), ended)}")

@@ -7,8 +7,6 @@ import pytest
 
 from gfm_hil.cli import main
 
-from ...support.firmware import cc
-
 SOURCE = Path(__file__).parents[2] / "support" / "foreign_model.c"
 
 
@@ -33,8 +31,6 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def foreign(exported: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The library of ``foreign_model.c``."""
     headers = Path(exported("dll", "vsg-2", "none").removeprefix("dll:")).parent
-    folder = tmp_path_factory.mktemp("foreign")
-    flags = ["-std=gnu99", "-Wall", "-O2", "-shared", "-fPIC", f"-I{headers}"]
-    done = cc(folder, *flags, str(SOURCE), "-o", "droop.so", "-lm")
-    assert (done.returncode, done.stderr) == (0, "")
-    return folder / "droop.so"
+    library = tmp_path_factory.mktemp("foreign") / "droop.so"
+    assert main(["firmware", "compile", str(SOURCE), "-I", str(headers), "-o", str(library)]) == 0
+    return library

@@ -1,5 +1,6 @@
 """Models that are not ours as the controller: real-code DLLs and FMUs, and how they fail."""
 
+import shutil
 import tempfile
 import zipfile
 from pathlib import Path
@@ -138,15 +139,23 @@ def test_a_model_of_others_by_its_map(foreign, tmp_path):
 
 
 @compiles
-def test_phases_of_a_library_written_for_windows(exported, tmp_path):
+def test_phases_of_a_library_written_for_windows(exported, tmp_path, capsys):
     """The same controller as a DLL by its map and as a library by our header: the same bits."""
     headers = Path(exported("dll", "vsg-2", "none").removeprefix("dll:")).parent
-    own = f"-I{CONTROLLERS}"
-    flags = ["-std=c99", "-Wall", "-O2", "-shared", "-fPIC", own, str(EXAMPLE), "-lm"]
-    shim = [f"-I{CONTROLLERS / 'windows'}", f"-I{headers}", str(PHASES)]
-    for out, more in (("library.so", []), ("dll.so", shim)):
-        done = cc(tmp_path, *flags, *more, "-o", out)
-        assert (done.returncode, done.stderr) == (0, "")
+    flags = ["-std=c99", "-Wall", "-O2", "-shared", "-fPIC", f"-I{CONTROLLERS}", str(EXAMPLE)]
+    done = cc(tmp_path, *flags, "-lm", "-o", "library.so")
+    assert (done.returncode, done.stderr) == (0, "")
+    sources = tmp_path / "sources"
+    sources.mkdir()
+    for file in (EXAMPLE, PHASES):
+        shutil.copy(file, sources)
+    (sources / "harness.c").write_text("int main(void) { return 1; }")
+    out = ["-I", str(headers), "-I", str(CONTROLLERS), "-o", str(tmp_path / "dll.so")]
+    capsys.readouterr()
+    assert main(["firmware", "compile", str(sources), *out]) == 0
+    told = capsys.readouterr().out
+    assert "controller.c, phases_model.c\n" in told and "inputs.v " in told
+    assert "parameters.period" in told
     ports = {"P": "P_ref W", "Q": "Q_ref var", "V": "V_ref V", "w": "omega_g rad/s",
              "V_dc": "V_dcref V", "v_dc": "v_dc V"}  # fmt: skip
     for name, unit in (("v", "V"), ("i", "A"), ("i_o", "A")):
@@ -383,6 +392,27 @@ def test_a_file_that_is_no_model_is_refused(model, message, tmp_path):
     (tmp_path / "text").write_text("no model")
     with pytest.raises(UserError, match=message):
         open_controller(model.format(text=tmp_path / "text"), PortMap(), BenchContext())
+
+
+@compiles
+@pytest.mark.parametrize(
+    ("source", "more", "message"),
+    [
+        ("none", [], "none: must be a C file, or a folder with C files that have no main"),
+        ("x.c", ["-I", "nowhere"], "nowhere: is no folder of headers"),
+        ("x.c", [], "x.c:1:10: fatal error: nothing.h: No such file"),
+        ("y.c", [], "undefined reference to `missing'"),
+        ("z.c", [], "has no function Model_GetInfo, so it is no real-code model"),
+    ],
+)
+def test_sources_that_do_not_compile_are_refused(source, more, message, tmp_path, capsys):
+    (tmp_path / "x.c").write_text('#include "nothing.h"\n')
+    (tmp_path / "y.c").write_text("void missing(void); void Model_GetInfo(void) { missing(); }\n")
+    (tmp_path / "z.c").write_text("int z;\n")
+    out = str(tmp_path / "z.so")
+    assert main(["firmware", "compile", str(tmp_path / source), *more, "-o", out]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
 
 
 @pytest.mark.attack(

@@ -49,7 +49,8 @@ def record(run: gfmhil.Run, place: Path, seed: int, sigma: float, lag: float) ->
     noise[3] = 0.0
     x = np.stack([run.signals[n] for n in ("p", "q", "V", "f_hz")])
     keep = math.exp(-run.scenario.T_s / lag)
-    held = lfilter([1 - keep], [1, -keep], x + noise - x[:, :1], axis=1) + x[:, :1]
+    half = (1 - keep) / 2  # of the sample and of the one before: the lag of a line between them
+    held = lfilter([half, half], [1, -keep], x + noise - x[:, :1], axis=1) + x[:, :1]
     savemat(place / "noisy.mat", {"t": run.signals["t"], **dict(zip(CHANNELS, held, strict=True))})
     lines = ["S_n = 4000.0", "V_n = 380.0", "event_s = 1.0", f"meter = {{ lag_s = {lag} }}"]
     lines += ["[channels]", *(f'{n} = "{n}"' for n in "pqV"), 'f = { channel = "f", unit = "Hz" }']

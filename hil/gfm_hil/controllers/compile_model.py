@@ -1,0 +1,62 @@
+"""Compiles the C source of a real-code model of IEEE and CIGRE for Linux, as it is."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import replacing
+from gfm_runtime.firmware.check import called
+
+_WINDOWS = Path(__file__).parent / "windows"
+_MAIN = re.compile(r"^\s*(int|void)\s+main\s*\(", re.MULTILINE)
+
+
+def compile_model(source: Path, include: Sequence[Path], library: Path) -> list[Path]:
+    """Compile a C file, or those of a folder that have no ``main``, to a shared library.
+
+    What they take from ``windows.h`` is that of ``controllers/windows``.
+
+    Args:
+        source: the file or folder.
+        include: folders of further headers.
+        library: what is written.
+
+    Returns:
+        the files that were compiled.
+
+    Raises:
+        UserError: there is no such folder, source or compiler.
+        LawError: the compiler fails; with its first error.
+    """
+    for folder in include:
+        if not folder.is_dir():
+            raise UserError(f"{folder}: is no folder of headers")
+    if source.is_dir():
+        every = sorted(source.glob("*.c"))
+        used = [x for x in every if not _MAIN.search(x.read_text("utf-8", "replace"))]
+    else:
+        used = [source] if source.is_file() else []
+    if not used:
+        raise UserError(f"{source}: must be a C file, or a folder with C files that have no main")
+    if shutil.which("gcc") is None:
+        raise UserError("gcc is not there; apt-get install gcc")
+    folders = [f"-I{x.absolute()}" for x in (_WINDOWS, *include)]
+    with replacing(library) as part:
+        command = [
+            "gcc",
+            "-O2",
+            "-w",
+            "-shared",
+            "-fPIC",
+            "-Wl,-z,defs",
+            *folders,
+            "-include",
+            "windows.h",
+        ]
+        command += ["-o", str(part.absolute()), *(str(x.absolute()) for x in used), "-lm"]
+        called(command, used[0].parent)
+    return used
