@@ -85,7 +85,8 @@ class Switch(PlantEvent):
 
         self.apply(plant)
         if self.check is not None:  # what it waits for is tried too
-            plant.now["check"] = AGREED
+            for now in plant.nows:
+                now["check"] = AGREED
             gfm_plant.finish_check(plant)
 
 
