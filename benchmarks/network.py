@@ -5,9 +5,7 @@ Every converter runs VSG-2 behind its own feeder to one bus with a load, and all
 process does is in the tick: the plant, the controllers, the recording. ``--case case39`` has a
 published case instead, with converters at the buses of ``--converters``, and ``--bridges`` the
 paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts, and
-four converters on feeders of which none, one or all are switched. ``--cores 1,2`` has two such
-buses instead, which a line of travelling waves connects, and runs its parts on one processor core
-and on two: in time of the clock, in rounds of some milliseconds, of which the least counts.
+four converters on feeders of which none, one or all are switched.
 Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
@@ -26,13 +24,11 @@ from typing import Any
 import numpy as np
 
 import gfmhil
-from gfm_hil.engine.crew import Crew
 from gfm_hil.engine.inproc import CHUNK, rows, run_ticks, stack
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario import Scenario, load_scenario
 
 TICKS = 100_000  # of all converters of a case in a round
-SHORT = 10_000  # of those on several processor cores
 
 
 def star(n: int, switched: int = 0, bridge: dict[str, Any] | None = None) -> Scenario:
@@ -54,22 +50,6 @@ def star(n: int, switched: int = 0, bridge: dict[str, Any] | None = None) -> Sce
             },
         }
     )  # fmt: skip
-
-
-def halves(n: int, cores: int) -> Scenario:
-    """n converters on the feeders of two buses, and a long line between these."""
-    content = star(n).model_dump(mode="json", exclude_none=True)
-    network, second = content["network"], [f"to_c{k}" for k in range(n // 2, n)]
-    for name in second:
-        network["lines"][name]["end"] = "other"
-    for name, load in network["loads"].items():
-        network["loads"][name] = load | {"P": 0.225 * n, "Q": 0.05 * n}
-    network["loads"]["other"] = network["loads"]["load"] | {"node": "other"}
-    network["capacitors"] = {f"at_{bus}": {"node": bus, "Q": 0.02 * n} for bus in ("bus", "other")}
-    size = 100 * np.pi * 1.3e-4  # 0.13 ms
-    long = {"start": "bus", "end": "other", "L": 2 * size / n, "R": 0.02 / n, "B": size * n / 2}
-    network["bergeron_lines"] = {"long": long}
-    return load_scenario(content | {"cores": cores})
 
 
 def rigs() -> dict[str, Scenario]:
@@ -114,12 +94,7 @@ class Case:
         benches = make_benches(scenario)
         self.set_up = time.process_time() - began
         n = len(benches)
-        self.crew, several = (
-            Crew(benches[0].plant, scenario.cores),
-            bool(scenario.network and scenario.network.bergeron_lines),
-        )
-        self.ticks = max(100, min(CHUNK, (SHORT if several else TICKS) // n))
-        self.clock = time.perf_counter if several else time.thread_time
+        self.ticks = max(100, min(CHUNK, TICKS // n))
         self.rows = rows(n, self.ticks, benches[0].inner, benches[0].options)
         self.stack, self.plant = stack(benches), benches[0].plant
         self.kept = self.plant.copy()
@@ -128,8 +103,7 @@ class Case:
         wiring = self.plant.wiring
         self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
         net = self.plant.net[0]
-        sparse = any(part.net[0]["sparse"] for part in self.plant.pieces)
-        self.way = "series" if sparse or net["n_units"] else "modes"
+        self.way = "series" if net["sparse"] or net["n_units"] else "modes"
         self.ns: list[float] = []
         self.round()  # compiles
         self.ns.clear()
@@ -139,9 +113,9 @@ class Case:
         self.plant.restore(self.kept)
         for array, old in zip(self.arrays, self.start, strict=True):
             array[:] = old
-        began, what = self.clock(), (self.plant.records, self.stack, *self.rows, 0, self.ticks)
-        done = self.crew.run(run_ticks, *what, 0, False, None, None)
-        self.ns.append((self.clock() - began) / self.ticks * 1e9)
+        began = time.thread_time()
+        done = run_ticks(self.plant.records, self.stack, *self.rows, 0, self.ticks)
+        self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
         if done != self.ticks:
             raise SystemExit(f"{self.name}: the run ended at tick {done}")
 
@@ -197,9 +171,6 @@ def main() -> None:
     parser.add_argument("--case", help="a published case instead, such as case39")
     parser.add_argument("--converters", default="30", help="its buses with converters")
     parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
-    parser.add_argument(
-        "--cores", help="1,2: two buses with a long line, on so many processor cores"
-    )
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
     if asked.case:
@@ -208,9 +179,6 @@ def main() -> None:
             cases = [Case(asked.case, scenario)]
     elif asked.bridges:
         cases = [Case(name, scenario) for name, scenario in rigs().items()]
-    elif asked.cores:
-        pairs = [(int(n), int(c)) for n in asked.sizes.split(",") for c in asked.cores.split(",")]
-        cases = [Case(f"two buses, cores: {c}", halves(n, c)) for n, c in pairs]
     else:
         cases = [Case("feeders", star(int(n))) for n in asked.sizes.split(",")]
     for _ in range(asked.rounds):

@@ -22,7 +22,6 @@ from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
-from gfm_plant.parted import Parted, Place, find_places, with_faults
 from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
 from gfm_plant.sparse import entries_of
 from gfm_plant.wiring import ConverterCircuit, Wiring
@@ -89,8 +88,7 @@ def make_network(
     opened = frozenset(name for _, name, one in each if not getattr(one, "closed", True))
     recorded = parts.recorded({name: node for name, (_, node) in converters.items()})
     network = _make(converters, T_s, grid, parts.grid, each, opened, recorded=recorded)
-    for part in (network, *network.pieces):
-        part.net["joins"] = 1
+    network.net["joins"] = 1
     return network
 
 
@@ -167,12 +165,7 @@ def _make(
         raise ValueError("phases.samples: must be the same for all converters of a network")
     large = not carriers and len(wiring.order) > MOST_BY_MODES
     entries = entries_of(wiring) if large else 0
-    cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
-    places = [] if carriers else find_places(wiring)
-    several = len(places) if len(places) > 1 else 1
-    network = _network(
-        par, st, wiring, T_s, dynamic, measured, carriers * updates, entries, cuts, several
-    )
+    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries)
     network.net["updates"] = updates
     network.net["batteries"] = par["energy"].any()
     now = network.now
@@ -186,43 +179,8 @@ def _make(
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
-    if several > 1:
-        network = _in_parts(network, places, dynamic, measured, cuts)
     network.connect(wiring)
     return network
-
-
-def _in_parts(
-    whole: Network,
-    places: Sequence[Place],
-    dynamic: Sequence[tuple[str, str, Dynamic]],
-    measured: bool,
-    cuts: Sequence[float],
-) -> Parted:
-    """The plant in parts; arguments as of ``_network``."""
-    own = []
-    for place in places:
-        wiring, (first, end) = place.of(whole.wiring), (place.first, place.end)
-        mine = dict(wiring.fed)
-        those = [
-            (table, name, mine.get(name, one))
-            for table, name, one in dynamic
-            if name in mine or (not name and wiring.grid is not None)
-        ]
-        roomy = with_faults(wiring, whole.wiring)
-        entries = entries_of(wiring) if len(wiring.order) > MOST_BY_MODES else 0
-        par, st, T_s = whole.par[first:end], whole.st[first:end], float(whole.net["T_s"][0])
-        part = _network(par, st, roomy, T_s, those, measured, 0, entries, cuts)
-        part.wiring = wiring
-        part.net["age"] = whole.net["age"][:, :, first:end]
-        part.now["unit"] = part.now["sequence"][:, 0] = 1.0
-        own.append(part)
-    found = Parted(
-        whole.par, whole.st, whole.net, whole.now, whole.parts, whole.wiring,
-        places=tuple(places), own=tuple(own),
-    )  # fmt: skip
-    found.join()
-    return found
 
 
 def _together(
@@ -250,8 +208,6 @@ def _network(
     measured: bool,
     units_of_carrier: int,
     entries: int,
-    cuts: Sequence[float],
-    several: int = 1,
 ) -> Network:
     """Return a plant whose circuits are still to be made.
 
@@ -260,9 +216,8 @@ def _network(
         measured: whether p, q and V of the connection points are looked at.
         units_of_carrier: see ``net_dtype``.
         entries: of the sums of a large plant, 0: it is solved by its modes.
-        cuts: where commands begin to act, of a period.
-        several: parts that it will have.
     """
+    cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
     lags = [name for _, name, one in dynamic if one.lag() is not None]
     carry_zero = len(wiring.units) + len(wiring.branches) + 2  # with a split line and a fault's own
@@ -284,10 +239,8 @@ def _network(
             sum(len(one.parts) or len(wiring.order) for one in wiring.recorded),
             sum(len(one.columns) for one in wiring.recorded),
         ),
-        several,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
-    net["flow_to"] = np.arange(net["flow_to"].shape[1])
     _pack_timing(par, net, cuts)
     if units_of_carrier:
         _pack_units(net, cuts)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_plant.clearing import advance_clearing, begin_clearing
-from gfm_plant.components import DYNAMIC, every_at_rest, every_tick
-from gfm_plant.components.bergeron_line import BergeronLine, stand_still
+from gfm_plant.components import every_at_rest, every_tick
 from gfm_plant.dc_link import limit_dc_source
 from gfm_plant.going_on import advance
 from gfm_plant.layout import CHECK_SIDES, field
@@ -27,7 +26,6 @@ from gfm_plant.solution import circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING, watch
 from gfm_runtime.compiled import cached, compiled, inlined
 
-_WAVES = DYNAMIC.index(BergeronLine)
 _FAR = 1e6  # a state beyond this many p.u. has diverged
 
 
@@ -138,10 +136,6 @@ def plant_step(plant: PlantRecords) -> None:
             protect(plant, k)
     else:
         go_back(plant)
-        for j in range(len(plant.parts[_WAVES])):  # those of a part: the others have gone on
-            line = plant.parts[_WAVES][j]
-            if line.last - line.first < 2:
-                stand_still(line, n.T_s)
         trip(plant, worst, DIVERGED, largest)
         enter(n, now, plant.st[0].tick, circuit(n, now))
     every_tick(plant, circuit(n, now), 0)

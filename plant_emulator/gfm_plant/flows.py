@@ -12,7 +12,6 @@ from numba import types
 
 from gfm_plant.clearing import contact_currents
 from gfm_plant.components import every_flow
-from gfm_plant.components.part import FLOW, OF_FAULT
 from gfm_plant.going_on import call_at
 from gfm_plant.layout import field
 from gfm_plant.records import PlantRecords
@@ -66,14 +65,10 @@ def _look(plant: Any, begin: float, end: float) -> None:
 
 @inlined
 def plant_flows(plant: PlantRecords, out: Any) -> None:
-    """Write what is recorded of the network at this tick to out, (columns,); of a part of a plant
-    its columns; nothing if that has no room."""
+    """Write what is recorded of the network at this tick to out, (columns,); nothing if that has no
+    room."""
     if len(out) > 0:
-        n = plant.net[0]
-        call_at(n.look, plant, 0.0, 0.0)
-        row, to = field(plant.now[0], "flow_row"), field(n, "flow_to")
-        columns = len(field(n, "flow_node")) * len(FLOW)
-        if n.flow_fault != 0:
-            columns += len(OF_FAULT)
-        for j in range(columns):
-            out[to[j]] = row[j]
+        call_at(plant.net[0].look, plant, 0.0, 0.0)
+        row = field(plant.now[0], "flow_row")
+        for j in range(len(out)):
+            out[j] = row[j]

@@ -34,10 +34,9 @@ def grid_frequency(plant: Network, omega_g: float, rate: float | None = None) ->
     if len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: such a grid sets its own frequency; use grid-load")
     _require("omega_g", omega_g, omega_g > 0, "> 0 p.u.")
-    for now in plant.nows:
-        now["omega_g_to"], now["omega_g_rate"] = omega_g, _rate(rate)
-        if rate is None:
-            now["omega_g"] = omega_g
+    plant.now["omega_g_to"], plant.now["omega_g_rate"] = omega_g, _rate(rate)
+    if rate is None:
+        plant.now["omega_g"] = omega_g
 
 
 def grid_voltage(
@@ -61,16 +60,16 @@ def grid_voltage(
     _require("V_g", V_g, V_g >= 0, ">= 0 p.u.")
     if rate is not None and duration is not None:
         raise ValueError(f"rate = {rate}, duration = {duration}: give one, a ramp or a sag")
-    if duration is not None:
+    if duration is None:
+        plant.now["sag_left"] = 0.0
+    else:
         _require("duration", duration, duration > 0, "> 0 s")
-    V_g_rate = _rate(rate)
-    for now in plant.nows:
-        if duration is not None and now["sag_left"] == 0.0:
-            now["V_g_after"] = now["V_g_to"]
-        now["sag_left"] = duration or 0.0
-        now["V_g_to"], now["V_g_rate"] = V_g, V_g_rate
-        if rate is None:
-            now["V_g"] = V_g
+        if plant.now[0]["sag_left"] == 0.0:
+            plant.now["V_g_after"] = plant.now["V_g_to"]
+        plant.now["sag_left"] = duration
+    plant.now["V_g_to"], plant.now["V_g_rate"] = V_g, _rate(rate)
+    if rate is None:
+        plant.now["V_g"] = V_g
 
 
 def grid_load(plant: Network, change: float) -> None:
@@ -79,8 +78,7 @@ def grid_load(plant: Network, change: float) -> None:
     _require("change", change, True, "finite")
     if not len(plant.of(FiniteGrid)):
         raise ValueError("plant.grid.finite: not set; an ideal grid has no load of its own")
-    for part in plant.pieces:
-        part.of(FiniteGrid)["P_load"] += change
+    plant.of(FiniteGrid)["P_load"] += change
 
 
 def fault(
@@ -142,13 +140,11 @@ def fault(
             f" grid or of a transformer; an {kind} fault needs a path to ground"
         )
     plant.rewire(changed)
-    part = next(one for one in plant.pieces if one.wiring.fault is not None)
-    now = part.now
-    now["contact"], now["clearing"] = 1, bool(part.wiring.opening)
-    now["made"], now["conducts"][0, 0] = 0, [p in phases for p in "abc"]
-    now["opens"][0, 0] = 0
-    now["fault_left"] = math.inf if duration is None else duration
-    reconnect(part.records)
+    plant.now["contact"], plant.now["clearing"] = 1, bool(plant.wiring.opening)
+    plant.now["made"], plant.now["conducts"][0, 0] = 0, [p in phases for p in "abc"]
+    plant.now["opens"][0, 0] = 0
+    plant.now["fault_left"] = math.inf if duration is None else duration
+    reconnect(plant.records)
 
 
 def _phases(kind: str, phases: str | None, Z_0: complex | None) -> str:
@@ -196,8 +192,7 @@ def _place(
 
 def clear_fault(plant: Network) -> None:
     """Clear the fault, if there is one: at once, or phase by phase as their currents pass zero."""
-    for part in plant.pieces:
-        clear(part.records)
+    clear(plant.records)
 
 
 def grid_unbalance(
@@ -226,14 +221,14 @@ def grid_unbalance(
     turn = complex(-0.5, math.sqrt(0.75))
     positive, negative = (a + b + c) / 3, (a + turn * b + turn.conjugate() * c) / 3
     # of the space vector v = v+ e^(j omega t) + conj(v-) e^(-j omega t)
+    plant.now["sequence"] = positive, negative.conjugate()
     # what turns the other way, in a frame that turns with omega_b
-    n, balanced = plant.net[0], a == b == c == 1
+    n, g = plant.net[0], _grid_source(plant)
     angle = 2 * math.remainder(float(n["omega_b"] * n["T_s"]) * int(plant.st[0]["tick"]), math.pi)
-    for part in plant.pieces:
-        now, g = part.now[0], _grid_source(part)
-        now["sequence"] = positive, negative.conjugate()
-        now["unit"][g + 1] = complex(now["unit"][g]).conjugate() * cmath.exp(-1j * angle)
-        now["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
+    unit = plant.now["unit"][0]
+    unit[g + 1] = complex(unit[g]).conjugate() * cmath.exp(-1j * angle)
+    balanced = a == b == c == 1
+    plant.now["unbalance_left"] = 0.0 if balanced else math.inf if duration is None else duration
 
 
 def phase_jump(plant: Network, degrees: float) -> None:
@@ -243,10 +238,10 @@ def phase_jump(plant: Network, degrees: float) -> None:
     _require("degrees", degrees, True, "finite")
     angle = math.radians(degrees)
     plant.st["x"][:, DELTA] -= angle
-    for part in plant.pieces:
-        unit, g = part.now["unit"][0], _grid_source(part)
-        for place, turn in ((g, angle), (g + 1, -angle)):
-            unit[place] = complex(unit[place]) * cmath.exp(1j * turn)
+    g = _grid_source(plant)
+    for place, turn in ((g, angle), (g + 1, -angle)):
+        unit = plant.now["unit"][0]
+        unit[place] = complex(unit[place]) * cmath.exp(1j * turn)
 
 
 def grid_impedance(plant: Network, L_g: float, R_g: float) -> None:
@@ -296,8 +291,7 @@ def breaker(plant: Network, closed: bool, clearing: str = "zero") -> None:
             "plant.grid.load_R, plant.grid.load_L: not set; the breaker opens only onto a load"
         )
     _switch(plant, replace(_without_check(plant, ""), closed=closed), GRID_SOURCE, closed, clearing)
-    for now in plant.nows:
-        now["closed"] = closed
+    plant.now["closed"] = closed
 
 
 def line_breaker(plant: Network, name: str, closed: bool, clearing: str = "zero") -> None:
@@ -334,8 +328,7 @@ def _switch(plant: Network, wiring: Wiring, name: str, closed: bool, clearing: s
     fault = wiring.fault if plant.conducting().get("", ("", 0))[0] else None
     plant.rewire(replace(wiring, fault=fault, opening=(*others, OpeningBreaker(name=name))))
     if fault is None:
-        for now in plant.nows:
-            now["fault_left"] = math.inf
+        plant.now["fault_left"] = math.inf
 
 
 def _require_clearing(clearing: str) -> None:
@@ -384,9 +377,9 @@ def check_synchronism(
         other = wiring.check.name or "the grid's breaker"
         raise ValueError(f"check: that of {other} is not over yet; there can be one at a time")
     plant.connect(replace(wiring, check=Check(name, (sides[0], sides[1]))))
-    there = next(one for one in plant.pieces if one.wiring.check is not None)
-    there.net["check_limits"] = V, omega * wiring.omega_b, math.radians(degrees)
-    there.net["check_lasting"], now = lasting, there.now
+    plant.net["check_limits"] = V, omega * wiring.omega_b, math.radians(degrees)
+    plant.net["check_lasting"] = lasting
+    now = plant.now
     now["check"], now["check_looks"], now["check_lasted"] = WATCHING, 0, 0.0
     now["check_seen"], now["check_left"] = 0.0, within
 
@@ -406,14 +399,10 @@ class SynchroCheckResult:
 def finish_check(plant: Network) -> SynchroCheckResult | None:
     """Close the breaker whose synchro-check has agreed, or end a check whose time is over; None if
     there is nothing to do."""
-    check = plant.wiring.check
-    if check is None:
+    state, check = int(plant.now[0]["check"]), plant.wiring.check
+    if check is None or state in (NONE, WATCHING):
         return None
-    now = next(one for one in plant.pieces if one.wiring.check is not None).now[0]
-    state = int(now["check"])
-    if state in (NONE, WATCHING):
-        return None
-    V, speed, angle = (float(x) for x in now["check_seen"])
+    V, speed, angle = (float(x) for x in plant.now[0]["check_seen"])
     if state == TIME_OVER:
         plant.wiring = _without_check(plant, check.name)
     elif check.name:
@@ -438,23 +427,18 @@ def _without_check(plant: Network, name: str) -> Wiring:
     check = plant.wiring.check
     if check is None or check.name != name:
         return plant.wiring
-    for now in plant.nows:
-        now["check"] = NONE
+    plant.now["check"] = NONE
     return replace(plant.wiring, check=None)
 
 
 def take_out(plant: Network) -> None:
     """Make the circuits for the next trip, after one of several converters has tripped."""
-    if not plant.net[0]["joins"]:
+    row = int(plant.now[0]["row"])
+    if row == 0 or not plant.net[0]["joins"]:
         return
-    out, first = set[int](), 0
-    for part in plant.pieces:
-        if row := int(part.now[0]["row"]):
-            out.add(first + row - 1)
-            part.now["row"] = 0
-        first += len(part.par)
-    if out:
-        plant.rewire(replace(plant.wiring, blocked=plant.wiring.blocked | out))
+    out = plant.wiring.blocked | {row - 1}
+    plant.now["row"] = 0
+    plant.rewire(replace(plant.wiring, blocked=out))
 
 
 def start_again(plant: Network, k: int) -> None:
@@ -468,8 +452,7 @@ def start_again(plant: Network, k: int) -> None:
         k: index of the converter, whose `protection.start_condition` is MAY_START.
     """
     plant.rewire(replace(plant.wiring, blocked=plant.wiring.blocked - {k}))
-    part, own = plant.locate(k)
-    synchronise(part.records, own)
+    synchronise(plant.records, k)
 
 
 def _needs_grid(plant: Network) -> None:

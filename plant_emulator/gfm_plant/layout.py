@@ -93,11 +93,6 @@ _NET: _Arrays = {
     "flow_from": (int, ("n_flow_sums",)),
     "flow_by": (float, ("n_flow_sums",)),
     "flow_G": (float, ("n_flows",)),
-    "flow_to": (int, ("n_flow_columns",)),  # of the whole plant, by those of this part
-    # of the parts of the plant, see `parted`, or of it alone: the address of its `PlantRecords`,
-    # which converter is its first, and before which it ends; and the part that sets its frequency
-    # in place of itself, -1: none
-    "part_at": (int, ("n_cut", 4)),
     # of a large plant, see `sparse.Sparse`, of each contact its axis alpha and its axis beta: how
     # many states, sums for the voltages, rows of ``extra_at``, sums on the way in, and sums of no
     # more than two, of three and of four entries; and of each node whose voltage is looked at its
@@ -302,7 +297,6 @@ def make_net_and_now(
     nodes: int = 0,
     entries: int = 0,
     flows: tuple[int, int, int, int] = (0, 0, 0, 0),
-    cut: int = 1,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -320,7 +314,6 @@ def make_net_and_now(
         entries: of the sums of a large plant, see `sparse`; 0: it is solved by its modes.
         flows: recorded terminals, their nodes, and currents that these are sums of, at most, and
             columns of all.
-        cut: parts that it is solved in.
     """
     modes, circuits = 2 * states - zeros, MOST_CONTACTS * (converters + 1) + 1
     if entries:
@@ -333,7 +326,7 @@ def make_net_and_now(
         "n_lags": lags, "n_nodes": CHECK_SIDES + (converters if connections else 0) + flows[1],
         "n_flows": flows[0], "n_flow_nodes": flows[1], "n_flow_sums": flows[2],
         "n_flow_sources": sources if flows[0] else 0, "n_flow_columns": flows[3],
-        "n_flow_ends": flows[0] + 1 if flows[0] else 0, "n_cut": cut,
+        "n_flow_ends": flows[0] + 1 if flows[0] else 0,
         "n_units": units, "n_rates": circuits if units else 0,
         "n_q": modes, "n_poles": breakers if modes else 0, "n_joint": breakers + 1,
         "n_sparse": 2 * MOST_CONTACTS if entries else 0, "n_sum": entries,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -48,8 +48,6 @@ class Network:
     now: Record
     parts: tuple[Record, ...]
     wiring: Wiring  # how its parts are connected now
-    fastest: float = field(default=0.0, kw_only=True)  # rate that Simpson's rule follows, rad/s
-    at_least: float = field(default=0.0, kw_only=True)  # that of another part of the plant
 
     @cached_property
     def records(self) -> PlantRecords:
@@ -57,35 +55,11 @@ class Network:
         records = PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
         self.net["advance"] = find_address(records)
         self.net["look"] = find_look(typeof(records)) if self.wiring.recorded else 0
-        self.net["part_at"][0] = self._addresses(records)
         return records
-
-    def _addresses(self, records: PlantRecords) -> NDArray[np.int64]:
-        """What ``part_at`` of `layout` has."""
-        self._words = _words_of(records)
-        return np.array([[self._words.ctypes.data, 0, len(self.par), -1]])
-
-    @property
-    def pieces(self) -> tuple[Network, ...]:
-        """The plants that are moved on: itself, or its parts, see `parted`."""
-        return (self,)
-
-    @property
-    def nows(self) -> list[Record]:
-        """All ``now`` that an event of the grid changes; the last one says how that is by now."""
-        return [self.now]
-
-    def locate(self, k: int) -> tuple[Network, int]:
-        """The one of ``pieces`` that converter k is in, and which it is there."""
-        return self, k
 
     @property
     def memory(self) -> tuple[Record, ...]:
         """All arrays of the memory."""
-        return self._own_memory
-
-    @property
-    def _own_memory(self) -> tuple[Record, ...]:
         return self.par, self.st, self.net, self.now, *self.parts
 
     def of(self, kind: type[Dynamic]) -> Record:
@@ -99,14 +73,14 @@ class Network:
 
     def _leader(self) -> Any:
         """The record of the component whose speed is that of a network without a grid, or None."""
-        leads = leader(self.wiring)
-        return next((record for name, _, record in self.fed() if name == leads), None)
+        names = [record for _, _, record in self.fed() if "leads" in record.dtype.names]
+        return next((record for record in names if record["leads"]), None)
 
     def copy(self) -> Network:
         """Return the same plant at the same instant, in memory of its own."""
-        copies = (_bytes(record).copy().view(record.dtype) for record in self._own_memory)
+        copies = (_bytes(record).copy().view(record.dtype) for record in self.memory)
         par, st, net, now, *parts = copies
-        return Network(par, st, net, now, tuple(parts), self.wiring, at_least=self.at_least)
+        return Network(par, st, net, now, tuple(parts), self.wiring)
 
     def restore(self, kept: Network) -> None:
         """Take the wiring, the parameters and the instant of a copy."""
@@ -159,8 +133,8 @@ class Network:
                 place = place_of[source]
                 now["emf"][place] = E = complex(record["E"])
                 now["unit"][place] = voltage / E
-        if (leads := self._leader()) is not None:
-            now["omega_g"] = leads["omega"]
+        if (leader := self._leader()) is not None:
+            now["omega_g"] = leader["omega"]
 
         w = rests_at(volts, turns)
         currents = [item for item in fed if not item[1].is_voltage]
@@ -174,29 +148,7 @@ class Network:
             current = float(self.par[k]["current"])
             w[N_OWN * k : N_OWN * (k + 1)] = i_f / current, v, i_o / current
         now["w"][: len(order)] = w
-        self._begin(x, told)
-
-    def _begin(self, x: NDArray[np.float64], told: NDArray[np.float64]) -> None:
         plant_start(self.records, x, told)
-
-    def _see(self, wiring: Wiring) -> None:
-        """Tell each component which state of w it sees, and whether its speed leads."""
-        banks = {unit.terminal: unit.states[1] for unit in wiring.units}
-        banks |= {bank.node: bank.name for bank in reversed(wiring.capacitors)}
-        leads, order = leader(wiring), wiring.order
-        for name, one, record in self.fed():
-            seen = one.sees(name, banks)
-            if isinstance(seen, str):
-                record["sees"] = order.index(seen)
-            else:
-                record["sees"][:] = [*map(order.index, seen)]
-            if "leads" in record.dtype.names:
-                record["leads"] = name == leads
-
-    def pieces_at(self, fastest: float) -> bool:
-        """Whether a part whose fastest rate is this would cut the period into other pieces."""
-        count, _ = _pieces(self.net["stretch"][0], fastest)
-        return bool((count != self.net["pieces"][0, :-1]).any())
 
     def rewire(self, wiring: Wiring) -> None:
         """Go on from the present state with another wiring.
@@ -269,23 +221,6 @@ class Network:
         _connect(changed, wiring)
         changed.wiring = wiring
         self.restore(changed)
-        self.fastest = changed.fastest
-
-
-def leader(wiring: Wiring) -> str | None:
-    """The component whose speed is that of a network without a grid; None: there is none."""
-    if wiring.grid is not None or wiring.led:
-        return None
-    may = (n for n, one in wiring.fed if "leads" in (one.record.names or ()))
-    return next((name for name in may if name not in wiring.opened), None)
-
-
-def _words_of(plant: PlantRecords) -> NDArray[np.uint64]:
-    """A plant's records as numba keeps them in memory: of each array no owner, its length, the size
-    of an element, its address, shape and strides."""
-    arrays = *plant[:4], *plant.parts
-    words = [(0, 0, len(x), x.itemsize, x.ctypes.data, len(x), x.itemsize) for x in arrays]
-    return np.array(words, np.uint64)
 
 
 def _bytes(record: Record) -> NDArray[np.uint8]:
@@ -300,7 +235,15 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][order.index(name)] = factor
-    plant._see(wiring)
+    banks = {unit.terminal: unit.states[1] for unit in wiring.units}
+    banks |= {bank.node: bank.name for bank in reversed(wiring.capacitors)}
+    may_lead = wiring.grid is None
+    for name, one, record in plant.fed():
+        seen = one.sees(name, banks)
+        record["sees"] = order.index(seen) if isinstance(seen, str) else [*map(order.index, seen)]
+        if "leads" in record.dtype.names:
+            record["leads"] = may_lead and name not in wiring.opened
+            may_lead = may_lead and not record["leads"]
     found, which = {}, {}
     _pack_contacts(net, wiring)
     _pack_flows(net, wiring)
@@ -316,8 +259,7 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     fastest += [np.abs(modes.rates.imag).max() for modes, _ in found.values()]
     if wiring.joint:
         fastest.append(_pack_joint(plant, wiring))
-    plant.fastest = max(fastest)
-    _pack_pieces(plant, max(plant.fastest, plant.at_least))
+    _pack_pieces(plant, max(fastest))
     places = wiring.sources()
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][circuit] = len(modes.rates)
@@ -530,7 +472,10 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
             f" are {2 * _PIECE * _MOST / longest:.6g} rad/s at this T_s; raise L_f, C_f, L_g or"
             " plant.grid.load_L"
         )
-    pieces, each = _pieces(stretch, fastest)
+    # the hardware of a peak-current limit looks at the current once a piece of the second cut
+    each = np.concatenate([stretch, stretch])
+    most = np.repeat([longest, _LOOK], parts)
+    pieces = np.ceil(each * np.maximum(fastest / (2 * _PIECE), (1 - 1e-9) / most))
     net["pieces"][:-1], net["half_h"][:-1] = pieces, each / pieces / 2
     for r in plant.par:
         per_C = r["omega_b"] / r["C_dc"]
@@ -551,16 +496,6 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
         spans = [float(r["omega_s"] * 2 * half) for r in plant.par]
         spans += [2 * half / lag for lag in lags]
         net["lag_weights"][part] = [_low_pass(float(x)) for x in spans]
-
-
-def _pieces(
-    stretch: NDArray[np.float64], fastest: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of each cut of the period the pieces of Simpson's rule, and its length, s. The hardware of a
-    peak-current limit looks at the current once a piece of the second cut."""
-    each = np.concatenate([stretch, stretch])
-    most = np.repeat([max(stretch), _LOOK], len(stretch))
-    return np.ceil(each * np.maximum(fastest / (2 * _PIECE), (1 - 1e-9) / most)), each
 
 
 @lru_cache(maxsize=256)

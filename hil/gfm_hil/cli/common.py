@@ -45,7 +45,6 @@ OPTIONS = {
     "inner": "--inner",
     "counts": "--counts",
     "waveforms": "--waveforms",
-    "cores": "--cores",
     "snapshot": "--snapshot",
     "start_from": "--from",
 }

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.engine.crew import ALL, Crew, Share, meet
 from gfm_hil.engine.loop_records import ControllerRecords, ReturnReason
 from gfm_hil.engine.replay import Trace, no_trace, replay, stands_still
 from gfm_hil.engine.setup import Bench, follow_trips
@@ -20,14 +19,12 @@ from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
-from gfm_plant.sharing import converters_of, listen, part, parts_of
 from gfm_plant.synchro_check import WATCHING
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled
 from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
 _PIECE = 1_000  # ticks of all converters that are recorded at a time, in the processor's cache
-_TICKS_OF_CREW = 200  # of several threads, which come back to Python less often
 
 
 class Stack(NamedTuple):
@@ -64,63 +61,44 @@ def stack(benches: Sequence[Bench]) -> Stack:
 
 @compiled
 def _run_ticks(
-    plant, stack, plant_rows, controller_rows, flows, start, stop, first, survives_trip, plan,
-    kept, share,
-):  # fmt: skip
+    plant, stack, plant_rows, controller_rows, flows, start, stop, first, survives_trip, plan, kept
+):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
-    begin, end = share.first, min(share.end, parts_of(plant))
+    ctl, laws, states, est = stack.controllers
+    y, u, st = stack.y, stack.u, plant.st
+    told = u if len(plan) == 0 else kept[len(kept) - 1 :]
+    delayed = plant_is_delayed(plant)
     for k in range(start, stop):
-        if parts_of(plant) > 1:
-            for p in range(begin, end):
-                listen(plant, p)
-            meet(share, False)
-        left = False
-        rows = plant_rows, controller_rows, flows[k - first]
-        for p in range(begin, end):
-            left = _tick(plant, p, stack, rows, k, k - first, survives_trip, plan, kept) or left
-        if meet(share, left):
+        changed, trips = False, 0
+        plant_flows(plant, flows[k - first])
+        for i in range(len(ctl)):
+            before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, k - first]
+            tripped = sample(plant, i, y[i], row)
+            trips += tripped
+            mine, estimate = ctl[i : i + 1], est[i : i + 1]
+            if not stands_still(plan, k):
+                answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
+            record_controller(controller_rows[i, k - first], mine, states[i], estimate)
+            if len(plan) > 0:
+                replay(plan, kept, k, u[i], told[i])
+            record_command(row, told[i])
+            changed = changed or ctl[i].changes != changes or ctl[i].state != before
+        if delayed:  # as over a link, where u[k] may come meanwhile
+            plant_step(plant)
+        for i in range(len(ctl)):
+            state = ctl[i].state
+            if apply_peer_state(plant, i, survives_trip, state) != ReturnReason.GO_ON:
+                return k + 1, False
+            if take(plant, i, told[i], st[i].trip, state, True) != ReturnReason.GO_ON:
+                return k + 1, False
+        if not delayed:
+            plant_step(plant)
+        for i in range(len(ctl)):
+            trips -= st[i].trip
+            changed = asks_to_start(plant, i, ctl[i].state) or changed
+        if changed or trips != 0 or plant.now[0].check > WATCHING:
             return k + 1, False
     return stop, True
-
-
-@inlined
-def _tick(plant, p, stack, rows, k, at, survives_trip, plan, kept):
-    """Tick k of the converters in part p; returns whether it left something to see to."""
-    ctl, laws, states, est = stack.controllers
-    plant_rows, controller_rows, flows = rows
-    y, u, one = stack.y, stack.u, part(plant, p)
-    st = one.st
-    told = u if len(plan) == 0 else kept[len(kept) - 1 :]
-    begin, end = converters_of(plant, p)
-    changed, trips = False, 0
-    plant_flows(one, flows)
-    for i in range(begin, end):
-        before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, at]
-        tripped = sample(one, i - begin, y[i], row)
-        trips += tripped
-        mine, estimate = ctl[i : i + 1], est[i : i + 1]
-        if not stands_still(plan, k):
-            answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
-        record_controller(controller_rows[i, at], mine, states[i], estimate)
-        if len(plan) > 0:
-            replay(plan, kept, k, u[i], told[i])
-        record_command(row, told[i])
-        changed = changed or ctl[i].changes != changes or ctl[i].state != before
-    delayed = plant_is_delayed(plant)
-    if delayed:  # as over a link, where u[k] may come meanwhile
-        plant_step(one)
-    for i in range(begin, end):
-        state = ctl[i].state
-        if apply_peer_state(one, i - begin, survives_trip, state) != ReturnReason.GO_ON:
-            return True
-        if take(one, i - begin, told[i], st[i - begin].trip, state, True) != ReturnReason.GO_ON:
-            return True
-    if not delayed:
-        plant_step(one)
-    for i in range(begin, end):
-        trips -= st[i - begin].trip
-        changed = asks_to_start(one, i - begin, ctl[i].state) or changed
-    return changed or trips != 0 or one.now[0].check > WATCHING
 
 
 def run_ticks(
@@ -134,7 +112,6 @@ def run_ticks(
     survives_trip: bool = False,
     trace: Trace | None = None,
     flows: NDArray[np.float64] | None = None,
-    share: Share = ALL,
 ) -> int:
     """Run ticks [start, stop); returns the tick after the last one done.
 
@@ -148,12 +125,10 @@ def run_ticks(
         survives_trip: the run does after a trip.
         trace: what the run replays, if anything.
         flows: of the network, (ticks, columns), likewise; None: nothing.
-        share: which parts of the plant, beside other threads that run the others.
     """
     of_network = np.empty((plant_rows.shape[1], 0)) if flows is None else flows
     rows, more = (plant_rows, controller_rows, of_network), trace or no_trace()
-    span = start, stop, first, survives_trip
-    return int(_run_ticks(plant, controllers, *rows, *span, *more, share)[0])
+    return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip, *more)[0])
 
 
 def run_inproc(
@@ -168,9 +143,6 @@ def run_inproc(
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
     survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
     chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
-    crew = Crew(bench.plant, bench.scenario.cores)
-    if len(crew.shares) > 1:
-        chunk, piece = max(chunk, _TICKS_OF_CREW), max(piece, _TICKS_OF_CREW)
     controllers = stack(benches)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
     flows = np.empty((piece, len(bench.flows)))
@@ -181,13 +153,21 @@ def run_inproc(
         stop, calm = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines)), True
         while k < stop and calm:
             end = min(k + piece, stop)
-            room = plant_rows, controller_rows, flows
-            done, calm = crew.run(
-                _run_ticks, plant, controllers, *room, k, end, k, survives_trip, *bench.trace
+            done, calm = _run_ticks(
+                plant,
+                controllers,
+                plant_rows,
+                controller_rows,
+                flows,
+                k,
+                end,
+                k,
+                survives_trip,
+                *bench.trace,
             )
-            for recorded, parts in sides:
-                for kept, those in zip(parts, recorded, strict=True):
-                    kept.put(k, those[: done - k])
+            for room, parts in sides:
+                for part, recorded in zip(parts, room, strict=True):
+                    part.put(k, recorded[: done - k])
             plant_parts[0].put_flows(k, flows[: done - k])
             k = done
         if bench.plant.net[0]["joins"]:

@@ -25,11 +25,10 @@ from gfm_hil.realtime.clock import (
 )
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.recorder import record_command
-from gfm_plant import plant_flows, plant_is_delayed
+from gfm_plant import plant_flows, plant_is_delayed, plant_step
 from gfm_plant.names import CONTROLLER, GONE, LEFT
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
-from gfm_plant.sharing import converters_of, listen_all, part, part_with, step_parts
 from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import PLANT_TRIP, SAFE
@@ -75,32 +74,25 @@ def plant_ticks(sides, plant, last):
         if r.realtime:
             r.unrested = 0 if due - now_ns() > AHEAD_NS else r.unrested + 1
             gap = wait_until(due, spins)
-        listen_all(plant)
         for i in range(len(sides)):
-            p = part_with(plant, i)
-            own = i - converters_of(plant, p)[0]
-            awaited += _ask(sides[i], sides[0].records.flows, part(plant, p), own, k, due)
+            awaited += _ask(sides[i], plant, i, k, due)
         if delayed:  # u[k] does not act in this period: it can come meanwhile
-            step_parts(plant)
+            plant_step(plant)
         if awaited > 0:
             gap = _await(sides, k, awaited, gap, spins, patience, repeat, hurried)
         why = ReturnReason.GO_ON
         for i in range(len(sides)):
-            p = part_with(plant, i)
-            own = i - converters_of(plant, p)[0]
-            said = _close(sides[i], part(plant, p), own, k, gap, hurried)
+            said = _close(sides[i], plant, i, k, gap, hurried)
             if why == ReturnReason.GO_ON:
                 why = said
         if why != ReturnReason.GO_ON:
             break
         if not delayed:
-            step_parts(plant)
+            plant_step(plant)
         for i in range(len(sides)):
-            p = part_with(plant, i)
-            own = i - converters_of(plant, p)[0]
-            why = _judge(sides[i], part(plant, p), own, why)
-            if why == ReturnReason.GO_ON and part(plant, p).now[0].check > WATCHING:
-                why = ReturnReason.CHANGED
+            why = _judge(sides[i], plant, i, why)
+        if why == ReturnReason.GO_ON and plant.now[0].check > WATCHING:
+            why = ReturnReason.CHANGED
         if why != ReturnReason.GO_ON:
             break
         why = ReturnReason.DONE
@@ -113,9 +105,8 @@ def plant_ticks(sides, plant, last):
 
 
 @inlined
-def _ask(side, flows, plant, i, k, due):
-    """Measure, record and send y[k] of converter i of a part of the plant, of whose first one goes
-    with what ``flows`` record of that; returns 1, or 0 if its controller is lost."""
+def _ask(side, plant, i, k, due):
+    """Measure, record and send y[k] of a converter; returns 1, or 0 if its controller is lost."""
     end, records = side
     times = records.times
     r = records.loop[0]
@@ -123,8 +114,8 @@ def _ask(side, flows, plant, i, k, due):
     if r.realtime:
         times[k, 0], times[k, 1] = due, now_ns()
     r.tripped = sample(plant, i, records.y, records.rows[k])
-    if i == 0 and flows.shape[1] > 0:
-        plant_flows(plant, flows[k])
+    if records.flows.shape[1] > 0:
+        plant_flows(plant, records.flows[k])
     if r.lost != 0:
         r.came = OVERDUE
         return 0

@@ -66,14 +66,11 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
         own = _folder(folder, bench)
         if bench.place == 0:
             kept = _read(_file(own, "plant"), where)
-            plant = bench.plant
-            nets = [plant.net, *(one.net for one in plant.pieces if one is not plant)]
-            before = [net.copy() for net in nets]
+            plant, own_net = bench.plant, bench.plant.net.copy()
             for name, record in _memory(bench).items():
                 put_back(where, kept, name, record)
-            for net, its in zip(nets, before, strict=True):
-                for name in ("advance", "look", "part_at"):  # addresses of this process
-                    net[name] = its[name]
+            for name in ("advance", "look"):  # addresses of this process
+                plant.net[name] = own_net[name]
         kept, c = _read(_file(own, "controller"), where), bench.controller
         if (kept.get("laws", np.zeros(0)).tobytes()) != c.laws.tobytes():
             raise UserError(

@@ -361,12 +361,6 @@ def _try_plant(scenario: Scenario) -> None:
         plant = plant_of(scenario)
     except ValueError as problem:
         raise UserError(str(problem)) from None
-    if scenario.cores > (parts := len(plant.pieces)):
-        raise UserError(
-            f"cores = {scenario.cores}: at most {parts}: the plant has {parts} part"
-            f"{'s' * (parts > 1)} with converters that follow each other in the file; lines of"
-            " network.bergeron_lines separate them, whose waves take at least T_s"
-        )
     for k, event in enumerate(scenario.events):
         if isinstance(event, PlantEvent):
             try:

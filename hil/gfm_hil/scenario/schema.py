@@ -216,13 +216,6 @@ class Scenario(StrictSchema):
         description="[from, to], s: the window of the figure of the three phases; from 3 cycles "
         "before the first event to 7 after it if none",
     )
-    cores: int = Field(
-        1,
-        ge=1,
-        le=64,
-        description="how many processor cores run a network in process, whose parts lines of "
-        "travelling waves separate; the results are the same to the last bit",
-    )
     snapshot: float | None = Field(
         None, gt=0, description="s: when both sides keep their state in the run folder, before the "
         "events of that tick; lockstep only",
@@ -418,11 +411,6 @@ class Scenario(StrictSchema):
             problems.append(
                 f"network.converters: link.type is {INPROC!r} of some and not of others; choose"
                 " links for all, or for none"
-            )
-        if self.cores > 1 and kinds != {INPROC}:
-            problems.append(
-                f"cores = {self.cores}: with link.type = {INPROC!r} only; over links each loop has"
-                " a processor of its own"
             )
         if kinds == {INPROC} and self.mode == "realtime":
             problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")

@@ -15,18 +15,18 @@ error falls with the square of the length of a piece, and damps.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy  # loads scipy.interpolate, and so scipy.optimize, when it is first used
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from gfm_plant.circuit import CurrentSource, Element, Shunt
 from gfm_plant.components.part import Fed, LinearPart, Matrix, Terminal
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import draw, state
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled
 
 PIECES = 1024
 """Of the past that a record keeps."""
@@ -35,24 +35,18 @@ _AT_REST = 64  # pieces of the past of a line at rest
 _ORDER = 8  # of the Pade approximant of a delay in the linear model
 
 
-@inlined
-def _left(one: Any, k: int, at: float) -> complex:
-    """Return the wave that left end k at a time, s, which does not go back."""
-    begins, s = one.begins, one.seek[k]
-    while s + 1 < one.count[k] and begins[k, (s + 1) % PIECES] <= at:
-        s += 1
-    one.seek[k], j = s, s % PIECES
-    x = (at - begins[k, j]) / one.lasts[k, j]
-    a, b, c = one.a[j, k, 0], one.a[j, k, 1], one.a[j, k, 2]
-    p, q, r = (1.0 - x) * (1.0 - 2.0 * x), 4.0 * x * (1.0 - x), x * (2.0 * x - 1.0)
-    return p * a + q * b + r * c
-
-
 @compiled
 def _arrive(one: Any, t: float, which: int) -> None:
     """Set E of both ends at a time t, s."""
-    back = t - one.tau
-    start, end = one.turn * _left(one, 0, back), one.turn * _left(one, 1, back)
+    back, k = t - one.tau, one.seek
+    while k + 1 < one.count and one.begins[(k + 1) % PIECES] <= back:
+        k += 1
+    one.seek, j = k, k % PIECES
+    x = (back - one.begins[j]) / one.lasts[j]
+    p_0, p_1, p_2 = (1.0 - x) * (1.0 - 2.0 * x), 4.0 * x * (1.0 - x), x * (2.0 * x - 1.0)
+    a = one.a
+    start = one.turn * (p_0 * a[j, 0, 0] + p_1 * a[j, 0, 1] + p_2 * a[j, 0, 2])
+    end = one.turn * (p_0 * a[j, 1, 0] + p_1 * a[j, 1, 1] + p_2 * a[j, 1, 2])
     one.E[0, which] = 0.5 * ((1.0 + one.h) * end + (1.0 - one.h) * start)
     one.E[1, which] = 0.5 * ((1.0 + one.h) * start + (1.0 - one.h) * end)
 
@@ -62,11 +56,11 @@ def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     half, w = field(n, "half_h")[part], field(now, "w")
     for which in range(3):
         _arrive(one, one.t + which * half, which)
-    for k in range(one.first, one.last):
+    for k in range(2):
         E_0, E_1, E_2 = one.E[k, 0], one.E[k, 1], one.E[k, 2]
         one.v[k, 0] = w[one.sees[k]]
         draw(
-            n, now, c, part, one.source + k - one.first,
+            n, now, c, part, one.source + k,
             -(E_0 + E_1) * (0.5 * one.G),
             -(E_1 + E_2) * (0.5 * one.G),
         )  # fmt: skip
@@ -74,71 +68,38 @@ def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 @compiled
 def _middle(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    for k in range(one.first, one.last):
+    for k in range(2):
         one.v[k, 1] = state(n, now, c, one.sees[k])
 
 
 @compiled
 def _leave(one: Any, lasts: float) -> None:
-    """Keep what left the ends in a piece of lasts s."""
-    for k in range(one.first, one.last):
-        j = _begin_piece(one, k, one.t, lasts)
+    """Keep what left both ends in a piece of lasts s."""
+    j = one.count % PIECES
+    one.begins[j], one.lasts[j] = one.t, lasts
+    for k in range(2):
         for which in range(3):
             one.a[j, k, which] = (1.0 + one.h) * one.v[k, which] - one.h * one.E[k, which]
     one.t += lasts
-
-
-@inlined
-def _begin_piece(one: Any, k: int, begins: float, lasts: float) -> int:
-    """Begin another piece of what left end k, and return its place."""
-    j: int = one.count[k] % PIECES
-    one.begins[k, j], one.lasts[k, j] = begins, lasts
-    one.count[k] += 1
-    return j
+    one.count += 1
 
 
 @compiled
 def _end(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     w = field(now, "w")
-    for k in range(one.first, one.last):
+    for k in range(2):
         one.v[k, 2] = w[one.sees[k]]
     _leave(one, 2.0 * field(n, "half_h")[part])
 
 
 @compiled
 def _keep(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    one.t_kept = one.t
-    for k in range(2):
-        one.count_kept[k], one.seek_kept[k] = one.count[k], one.seek[k]
+    one.t_kept, one.count_kept, one.seek_kept = one.t, one.count, one.seek
 
 
 @compiled
 def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    one.t = one.t_kept
-    for k in range(2):
-        one.count[k], one.seek[k] = one.count_kept[k], one.seek_kept[k]
-
-
-@compiled
-def take_waves(one: Any, other: Any) -> None:
-    """Take over what has left the other end of a line, which is in another part of the plant."""
-    for k in range(other.first, other.last):
-        while one.count[k] < other.count[k]:
-            i = one.count[k] % PIECES
-            j = _begin_piece(one, k, other.begins[k, i], other.lasts[k, i])
-            for which in range(3):
-                one.a[j, k, which] = other.a[j, k, which]
-
-
-@compiled
-def stand_still(one: Any, lasts: float) -> None:
-    """Go on by lasts s, in which the ends in a part that diverged send what they sent last."""
-    for k in range(one.first, one.last):
-        before = (one.count[k] - 1) % PIECES
-        j = _begin_piece(one, k, one.t, lasts)
-        for which in range(3):
-            one.a[j, k, which] = one.a[before, k, 2]
-    one.t += lasts
+    one.t, one.count, one.seek = one.t_kept, one.count_kept, one.seek_kept
 
 
 class BergeronLine(Fed):
@@ -163,16 +124,13 @@ class BergeronLine(Fed):
     record: ClassVar = np.dtype(
         [
             ("source", "i8"), ("sees", "i8", (2,)),
-            # the ends that are in this part of the plant, see `parted`: from the first one to
-            # before the last; and where the record of the other end is, its part and its place
-            ("first", "i8"), ("last", "i8"), ("other", "i8", (2,)),
             ("tau", "f8"), ("turn", "c16"), ("h", "f8"), ("G", "f8"),  # s; 1 / Z, p.u.
             ("t", "f8"), ("t_kept", "f8"),  # s
-            # of both ends the pieces until now; and the one in which what arrives has left
-            *((name, "i8", (2,)) for name in ("count", "count_kept", "seek", "seek_kept")),
-            # of both at the beginning, in the middle and at the end of a piece
+            # pieces until now; and the one in which what arrives has left
+            *((name, "i8") for name in ("count", "count_kept", "seek", "seek_kept")),
+            # of both ends at the beginning, in the middle and at the end of a piece
             ("v", "c16", (2, 3)), ("E", "c16", (2, 3)), ("a", "c16", (PIECES, 2, 3)),
-            ("begins", "f8", (2, PIECES)), ("lasts", "f8", (2, PIECES)),  # s
+            ("begins", "f8", (PIECES,)), ("lasts", "f8", (PIECES,)),  # s
         ],
         align=True,
     )  # fmt: skip
@@ -185,17 +143,10 @@ class BergeronLine(Fed):
     L: Positive = Field(description="p.u. of the first converter")
     R: NonNegative = Field(0.0, description="p.u. of the first converter")
     B: Positive = Field(description="charging in all, p.u. of the first converter")
-    _ends: tuple[int, ...] = PrivateAttr((0, 1))
-
-    def only(self, k: int) -> Self:
-        """Its end k alone, in the part of a plant that has that node."""
-        one = self.model_copy()
-        one._ends = (k,)
-        return one
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        return tuple((self.start, self.end)[k] for k in self._ends)
+        return self.start, self.end
 
     @property
     def Z(self) -> float:
@@ -212,7 +163,7 @@ class BergeronLine(Fed):
         return math.sqrt(self.L * self.B) / omega_b
 
     def sources(self, name: str) -> tuple[str, ...]:
-        return tuple((name, f"{name}.end")[k] for k in self._ends)
+        return name, f"{name}.end"
 
     def elements(self, name: str) -> Sequence[Element]:
         each = [*zip(self.sources(name), self.nodes, strict=True)]
@@ -237,7 +188,6 @@ class BergeronLine(Fed):
             )
         record["tau"], record["h"], record["G"] = tau, self.h, 1 / self.Z
         record["turn"] = np.exp(-1j * omega_b * tau)
-        record["first"], record["last"] = self._ends[0], self._ends[-1] + 1
 
     def check_pieces(self, name: str, shortest: float, omega_b: float) -> None:
         if (needs := self.delay(omega_b) / shortest) > (most := PIECES - _SPARE):
@@ -271,8 +221,8 @@ class BergeronLine(Fed):
         past = np.multiply.outer(turned, (1 + self.h) * np.asarray(v) - self.h * E)
         for which in range(3):
             record["a"][:_AT_REST, :, which] = past[which : len(at) - 2 + which : 2]
-        record["begins"][:, :_AT_REST] = at[:-1:2]
-        record["lasts"][:, :_AT_REST] = at[2] - at[0]
+        record["begins"][:_AT_REST] = at[:-1:2]
+        record["lasts"][:_AT_REST] = at[2] - at[0]
         record["count"], record["seek"], record["t"] = _AT_REST, 0, 0.0
         record["E"] = E[:, None]
         return -E / self.Z

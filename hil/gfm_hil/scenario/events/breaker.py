@@ -85,8 +85,7 @@ class Switch(PlantEvent):
 
         self.apply(plant)
         if self.check is not None:  # what it waits for is tried too
-            for now in plant.nows:
-                now["check"] = AGREED
+            plant.now["check"] = AGREED
             gfm_plant.finish_check(plant)
 
 

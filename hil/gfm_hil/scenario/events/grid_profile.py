@@ -87,7 +87,7 @@ class ProfilePoint(NamedTuple):
 
     def _rate(self, value: float, plant: gfm_plant.Network, name: str) -> float | None:
         """p.u./s from where the grid is now; None for a step."""
-        way = abs(value - float(plant.nows[-1][0][name]))
+        way = abs(value - float(plant.now[0][name]))
         return way / (self.ticks * float(plant.net[0]["T_s"])) if self.ticks and way else None
 
 
