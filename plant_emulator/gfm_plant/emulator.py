@@ -114,11 +114,11 @@ def plant_step(plant: PlantRecords) -> None:
         advance_clearing(plant)
     elif n.conversions > 1:
         _advance_converting(plant)
-    elif n.n_units:
-        advance(plant, 0.0, n.T_s)
+    elif n.n_units or n.n_dynamic:
+        advance(plant, 0.0, math.inf)
     else:
         for part in range(n.n_parts):
-            stretch(plant, part)
+            stretch(plant, part, True, math.inf)
 
     worst, largest = 0, 0.0
     for k in range(n.n_converters):

@@ -31,7 +31,7 @@ from gfm_plant.solution import (
     read_states,
     state,
 )
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled, inlined, inlined_as
 
 
 @inlined
@@ -98,61 +98,6 @@ def _legs_go_back(s: Any) -> None:
         s.gate[x], s.level[x], s.base[x] = int(b[0, x]), int(b[1, x]), int(b[3, x])
         s.on_at[x], s.edges[x, 0], s.edges[x, 1] = b[2, x], b[4, x], b[5, x]
     s.mid, s.limit, s.winds = b[6, 0], b[6, 1], b[6, 2]
-
-
-@inlined
-def stretch(plant: PlantRecords, part: int) -> None:
-    """Go on by one stretch of the period, under the commands that act in it."""
-    n, now = plant.net[0], plant.now[0]
-    for k in range(n.n_converters):
-        take_command(plant, k, part)
-        # the modulator divides by the v_dc that it has at the beginning of its period
-        limit_voltage(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
-    c, cut = circuit(n, now), part
-    for k in range(n.n_converters):
-        if _may_peak(plant, k, part):
-            cut = part + n.n_parts
-    for _ in range(field(n, "pieces")[cut]):
-        if cut != part:
-            for k in range(n.n_converters):
-                if plant.par[k].i_peak < math.inf and plant.st[k].trip == 0:
-                    s = plant.st[k]
-                    s.E[0], s.E[1] = _within_peak(plant, k, cut)
-        _piece(plant, c, cut)
-
-
-@compiled
-def advance_averages(plant: PlantRecords, begin: float, end: float) -> None:
-    """Go on between two instants of the period, s after its beginning; inf: to its end."""
-    n, starts = plant.net[0], 0.0
-    for part in range(n.n_parts):
-        ends = starts + field(n, "stretch")[part]
-        if begin <= starts and ends <= end:
-            stretch(plant, part)
-        elif starts < end and begin < ends:
-            _part_of_stretch(plant, part, begin <= starts, min(ends, end) - max(starts, begin))
-        starts = ends
-
-
-@compiled
-def _part_of_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> None:
-    """As ``stretch``, for h s of it; ``begins``: its first."""
-    n, now = plant.net[0], plant.now[0]
-    peaks = False
-    for k in range(n.n_converters):
-        take_command(plant, k, part)
-        if begins:
-            limit_voltage(plant.st[k], plant.par[k].m_max * plant.st[k].x[V_DC])
-        peaks = peaks or _may_peak(plant, k, part)
-    c = circuit(n, now)
-    cut = cut_to(n, now, c, h, 2.0 * field(n, "half_h")[part + (n.n_parts if peaks else 0)])
-    for _ in range(field(n, "pieces")[cut]):
-        for k in range(n.n_converters):
-            s = plant.st[k]
-            s.E[0], s.E[1] = s.E_commanded[0], s.E_commanded[1]
-            if peaks and plant.par[k].i_peak < math.inf and s.trip == 0:
-                s.E[0], s.E[1] = _within_peak(plant, k, cut)
-        _piece(plant, c, cut)
 
 
 @inlined
@@ -245,46 +190,6 @@ def _within_peak(plant: PlantRecords, k: int, part: int) -> tuple[float, float]:
 
 
 @inlined
-def _piece(plant: PlantRecords, c: int, part: int) -> None:
-    """Go on by one piece of a stretch under the commands that act."""
-    n, now = plant.net[0], plant.now[0]
-    omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
-    w, half_h = field(now, "w"), field(n, "half_h")[part]
-    clear_forced(n, now, c)
-    every_begin(plant, c, part)
-    for k in range(n.n_converters):
-        s = plant.st[k]
-        _look(plant, k, 0, field(now, "unit")[k])
-        drive(n, now, c, part, k, complex(s.E[0], s.E[1]), s.u_now[1])
-    for sequence in range(2 if now.unbalance_left > 0.0 else 1):
-        E = now.sequence[sequence]
-        E = complex(now.V_g * E.real, now.V_g * E.imag)
-        drive(n, now, c, part, grid_source(n) + sequence, E, omega_g if sequence == 0 else -omega_g)
-    every_drive(plant, c, part)
-
-    half_step(n, now, c, part, 0)
-    every_middle(plant, c, part)
-    for k in range(n.n_converters):
-        for i in range(own(k), own(k) + (3 if plant.par[k].filtered else 1)):
-            w[i] = state(n, now, c, i)
-        _look(plant, k, 1, field(now, "halfway")[k])
-
-    half_step(n, now, c, part, 1)
-    read_states(n, now, c)
-    every_end(plant, c, part)
-    for k in range(n.n_converters):
-        _look(plant, k, 2, field(now, "unit")[k])
-        r, s = plant.par[k], plant.st[k]
-        v_0 = s.x[V_DC]
-        v_1, v_2 = advance_dc_link(r, s, half_h)
-        if r.filtered:
-            _sense(n, s, k, 0, part, v_0, v_1, v_2)
-            for j in range(3):
-                _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
-        s.x[DELTA] += 2.0 * half_h * n.omega_b * (s.u_now[1] - omega_g)
-
-
-@inlined
 def _look(plant: PlantRecords, k: int, which: int, unit: complex) -> None:
     """Keep the power that bridge k draws, p.u., and what its sensors see at the beginning (0), the
     middle (1) or the end (2) of a piece, when its frame is at ``unit``."""
@@ -308,3 +213,105 @@ def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_
         + weights[part, k, 2] * f_1
         + weights[part, k, 3] * f_2
     )
+
+
+def _make_ways(kind: str, *hooks: Any) -> tuple[Any, Any]:
+    """The functions that go on by a stretch and between two instants of the period.
+
+    Args:
+        kind: of plants that they are for.
+        hooks: of its components: at the beginning of a piece, where its sources act, in its middle
+            and at its end.
+    """
+    begin_all, drive_all, at_middle, end_all = hooks
+
+    def go_on_by_piece(plant: PlantRecords, c: int, part: int) -> None:
+        n, now = plant.net[0], plant.now[0]
+        omega_g = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # in the middle of the tick
+        w, half_h = field(now, "w"), field(n, "half_h")[part]
+        clear_forced(n, now, c)
+        begin_all(plant, c, part)
+        for k in range(n.n_converters):
+            s = plant.st[k]
+            _look(plant, k, 0, field(now, "unit")[k])
+            drive(n, now, c, part, k, complex(s.E[0], s.E[1]), s.u_now[1])
+        for sequence in range(2 if now.unbalance_left > 0.0 else 1):
+            E = now.sequence[sequence]
+            E = complex(now.V_g * E.real, now.V_g * E.imag)
+            omega = omega_g if sequence == 0 else -omega_g
+            drive(n, now, c, part, grid_source(n) + sequence, E, omega)
+        drive_all(plant, c, part)
+
+        half_step(n, now, c, part, 0)
+        at_middle(plant, c, part)
+        for k in range(n.n_converters):
+            for i in range(own(k), own(k) + (3 if plant.par[k].filtered else 1)):
+                w[i] = state(n, now, c, i)
+            _look(plant, k, 1, field(now, "halfway")[k])
+
+        half_step(n, now, c, part, 1)
+        read_states(n, now, c)
+        end_all(plant, c, part)
+        for k in range(n.n_converters):
+            _look(plant, k, 2, field(now, "unit")[k])
+            r, s = plant.par[k], plant.st[k]
+            v_0 = s.x[V_DC]
+            v_1, v_2 = advance_dc_link(r, s, half_h)
+            if r.filtered:
+                _sense(n, s, k, 0, part, v_0, v_1, v_2)
+                for j in range(3):
+                    _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
+            s.x[DELTA] += 2.0 * half_h * n.omega_b * (s.u_now[1] - omega_g)
+
+    piece = inlined_as(f"piece_{kind}", go_on_by_piece)
+
+    def go_on_by_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> None:
+        n, now, peaks = plant.net[0], plant.now[0], False
+        for k in range(n.n_converters):
+            take_command(plant, k, part)
+            s = plant.st[k]
+            if begins:  # the modulator divides by the v_dc that it has then
+                limit_voltage(s, plant.par[k].m_max * s.x[V_DC])
+            else:
+                s.E[0], s.E[1] = s.E_commanded[0], s.E_commanded[1]
+        for k in range(n.n_converters):
+            peaks = _may_peak(plant, k, part) or peaks
+        c, cut = circuit(n, now), part + (n.n_parts if peaks else 0)
+        if h < math.inf:
+            cut = cut_to(n, now, c, h, 2.0 * field(n, "half_h")[cut])
+        for _ in range(field(n, "pieces")[cut]):
+            if peaks:
+                for k in range(n.n_converters):
+                    s = plant.st[k]
+                    if plant.par[k].i_peak < math.inf and s.trip == 0:
+                        s.E[0], s.E[1] = _within_peak(plant, k, cut)
+            piece(plant, c, cut)
+
+    stretch = inlined_as(f"stretch_{kind}", go_on_by_stretch)
+
+    def go_on_between(plant: PlantRecords, begin: float, end: float) -> None:
+        n, starts = plant.net[0], 0.0
+        for part in range(n.n_parts):
+            ends = starts + field(n, "stretch")[part]
+            whole = begin <= starts and ends <= end
+            if whole or (starts < end and begin < ends):
+                h = math.inf if whole else min(ends, end) - max(starts, begin)
+                stretch(plant, part, begin <= starts, h)
+            starts = ends
+
+    return stretch, inlined_as(f"advance_{kind}", go_on_between)
+
+
+@inlined
+def _none(plant: PlantRecords, c: int, part: int) -> None:
+    return
+
+
+#: (plant, part, begins, h): go on by h s of a stretch of the period, inf: by all of it, under the
+#: commands that act in it; ``begins``: from its beginning.
+#: (plant, begin, end): go on between two instants, s after the period's beginning; inf: to its end
+stretch, advance_alone = _make_ways("alone", _none, _none, _none, _none)
+#: the same for a plant with components that have records
+_, advance_with_components = _make_ways(
+    "with_components", every_begin, every_drive, every_middle, every_end
+)

@@ -22,9 +22,12 @@ All act on the functions that are decorated here and on no others: a program tha
 numba as it is.
 """
 
+import fcntl
 import hashlib
 import inspect
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -79,7 +82,30 @@ def wheel_code() -> WheelCode:
 
 class _Index(IndexDataCacheFile):
     """The index of a cache: it also holds the types of arguments, which an update may have taken
-    away. Such a cache is as good as none."""
+    away. Such a cache is as good as none.
+
+    Several processes may write at a time. numba numbers the files of a function, so that two would
+    write code for different arguments to one file, and each would write an index without the
+    other's. Here a file has the name of its arguments, and the index is changed under a lock."""
+
+    _cache_path: str
+    _save_data: Any
+    _save_index: Any
+    _data_name: Any
+
+    def save(self, key: Any, data: Any) -> None:
+        """As numba asks for it, with a function that it has compiled."""
+        name = self._data_name(int(hashlib.sha256(repr(key).encode()).hexdigest()[:15], 16))
+        self._save_data(name, data)
+        folder = os.open(self._cache_path, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # of a file system without locks
+                fcntl.flock(folder, fcntl.LOCK_EX)
+            kept = self._load_index()
+            if kept.get(key) != name:
+                self._save_index({**kept, key: name})
+        finally:
+            os.close(folder)
 
     def _load_index(self) -> Any:
         try:

@@ -18,7 +18,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba.core.caching import CompileResultCacheImpl
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler import Compiler, CompileResult, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher, cpu_target
@@ -203,8 +203,22 @@ class _Lowering(NativeLowering):
         return True
 
 
+class _Flags(Flags):
+    """numba's options of a compilation, which it compares at every call that it types."""
+
+    _defaults = Flags().values()
+
+    def values(self) -> dict[str, Any]:
+        """All values by their names."""
+        return {**self._defaults, **self._values}
+
+
 class Deferring(Compiler):
     """numba's compiler, up to the machine code."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.state.flags = _Flags(self.state.flags)
 
     def define_pipelines(self) -> Any:
         """As numba asks for it, once a compilation."""

@@ -77,6 +77,29 @@ def test_a_cache_that_names_a_type_of_an_older_version_is_as_good_as_none(tmp_pa
     assert index._load_index() == {}
 
 
+_WRITER = """
+import sys
+from gfm_runtime.compiled import _Index
+folder, me = sys.argv[1:]
+for k in range(40):
+    _Index(folder, "tick", "stamp").save((me, k), f"{me} {k}")
+"""
+
+
+@pytest.mark.processes
+def test_processes_that_compile_at_once_keep_each_other_s_functions(tmp_path):
+    (tmp_path / "writer.py").write_text(_WRITER)
+    names = [*"abcd"]
+    writers = [
+        subprocess.Popen([sys.executable, "writer.py", str(tmp_path), name], cwd=tmp_path)
+        for name in names
+    ]
+    assert [writer.wait(60) for writer in writers] == [0] * len(names)
+    index = _Index(str(tmp_path), "tick", "stamp")
+    keys = [(name, k) for name in names for k in range(40)]
+    assert [index.load(key) for key in keys] == [f"{name} {k}" for name, k in keys]
+
+
 _TWO_RECORDS = """
 import sys
 import numba

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from gfm_hil.engine.compiling import compile_sets
+from gfm_hil.engine.compiling import Set, compile_sets
 from gfm_runtime import compiled, wheel_code
 from gfm_runtime.wheel_code import TARGETS, WheelCode, environment, pack
 
@@ -128,7 +128,9 @@ def test_a_processor_without_the_features_compiles_and_says_so(made, use, monkey
     )
     module = use(WheelCode(_SOURCES, made[1]))
     said: list[str] = []
-    sets = [("a number", lambda: module.twice(3.0)), ("another", lambda: module.twice(3))]
+    sets = [
+        Set("a number", lambda: module.twice(3.0)), Set("another", lambda: module.twice(3))
+    ]  # fmt: skip
     assert compile_sets(sets, said.append) == 2
     why = f"the code in this wheel is not used (this processor lacks {', '.join(lacking)})"
     assert said[0].splitlines() == [why, "compiling a number (1 of 2, once a machine) …"]

@@ -11,18 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.bench.one_way import ANSWERED, DUE, HEARD, RECEIVED, SENT
-from gfm_hil.links.crc import crc32
-from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, pack, wire_dtype
+from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, is_sealed, pack, record_dtype
 from gfm_hil.realtime.clock import now_ns, sleep_until, spin_or_yield, wait_until, yield_processor
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import TABLE_VERSION, Vector, carried
+from gfm_runtime.signals import TABLE_VERSION, Vector
 from gfm_runtime.states import RUNNING, SAFE
 
 _Y, _U = DATA_IDS["y"], DATA_IDS["u"]
 #: why a side ends early: the other one is in SAFE or has left; the link is gone; no frame for long;
 #: a message that is no frame, such as the greeting of another bench
 LEFT, GONE, SILENT, OTHER = -2, -3, -4, -5
-_CRC_BYTES = 4
 _LOOKS, _REST_NS, _IDLE_NS = 64, 100_000, 5_000_000  # of the answerer
 
 
@@ -39,9 +37,8 @@ def frames(group: Vector, inner: bool = False, clocks: bool = False) -> Frames:
     writer = FrameWriter(group, inner)
     frame = writer.frame
     if clocks:
-        wire = wire_dtype(len(carried(group, inner)))
-        fields = {name: wire[name] for name in wire.names or ()}
-        fields["values"] = np.dtype(("<i8", wire["values"].shape))
+        fields = {name: record_dtype[name] for name in record_dtype.names or ()}
+        fields["values"] = np.dtype(("<i8", record_dtype["values"].shape))
         frame = frame.view(np.dtype([*fields.items()]))
     return Frames(writer.sequence, frame, writer.message)
 
@@ -50,7 +47,7 @@ def frames(group: Vector, inner: bool = False, clocks: bool = False) -> Frames:
 def tick_of(frame, message, size, data_id):
     """The tick of a frame that came; -1 if it is none, LEFT if it says that its sender leaves."""
     f = frame[0]
-    if size != len(message) or f.crc != crc32(message, size - _CRC_BYTES):
+    if size != len(message) or not is_sealed(message):
         return -1
     if f.magic != MAGIC or f.version != TABLE_VERSION or f.data_id != data_id:
         return -1

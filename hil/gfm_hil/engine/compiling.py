@@ -6,7 +6,8 @@ run of an installation on a machine compiles for minutes, and those after it onl
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.core import event
@@ -25,8 +26,13 @@ from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
 from gfm_runtime.compiled import wheel_code
 
-#: a name for people, and what compiles the functions, or loads them from the cache
-Set = tuple[str, Callable[[], object]]
+
+class Set(NamedTuple):
+    """Functions that a run calls."""
+
+    name: str  # for people
+    compile: Callable[[], object]  # or load from the cache
+    after: tuple[str, ...] = ()  # those it shares functions with and that had better come before
 
 
 class _Listener(event.Listener):
@@ -52,13 +58,13 @@ def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
         How many sets those were.
     """
     compiled = 0
-    for k, (name, compile_set) in enumerate(sets, 1):
-        text = f"compiling {name} ({k} of {len(sets)}, once a machine) …"
+    for k, one in enumerate(sets, 1):
+        text = f"compiling {one.name} ({k} of {len(sets)}, once a machine) …"
         if not compiled and (why := wheel_code().unfit):
             text = f"the code in this wheel is not used ({why})\n{text}"
         listener = _Listener(lambda text=text: notice(text))  # type: ignore[misc]
         with event.install_listener("numba:compile", listener):
-            compile_set()
+            one.compile()
         compiled += listener.heard
     return compiled
 
@@ -77,42 +83,45 @@ def compiled_benches(
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
-    sets: list[Set] = [("the operating point", lambda: found.extend(make_benches(scenario)))]
+    sets = [Set(_START, lambda: found.extend(make_benches(scenario)))]
     if scenario.in_process:
-        sets.append(_both(found))
+        sets.append(_both(lambda: found))
     else:
-        sets += [_role(role, found) for role in roles]
+        sets += [_role(role, lambda: found) for role in roles]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
         sets += [_link(link.type, link.options, scenario.carries) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
-            sets.append(("the link's impairment", impaired.warm_up))
+            sets.append(_IMPAIRMENT)
         if scenario.mode == "realtime":
             sets.append(_IDLE)
     compile_sets(sets, notice)
     return found
 
 
-def compile_everything(notice: Callable[[str], None]) -> tuple[int, int]:
-    """Compile what any run may call, over every link there is.
-
-    Returns:
-        How many sets of functions numba had to compile, and how many there are.
-    """
-    scenario = Scenario(title="warm-up", duration=1.0)
+def everything() -> list[Set]:
+    """What any run may call, over every link there is; but for a switched bridge's way through a
+    period, and the loops of several converters over links, which their first run compiles."""
     limited = Scenario(title="warm-up", duration=1.0, inner="virtual-stator")
-    found: list[Bench] = []
-    inner: list[Bench] = []
-    sets: list[Set] = [
-        ("the operating point", lambda: found.append(make_bench(scenario))),
-        _both(found),
-        *(_role(role, found) for role in ROLES),
-        ("the operating point of an inner stage", lambda: inner.append(make_bench(limited))),
-        *(_role(role, inner, " with an inner stage") for role in ROLES),
+
+    @cache
+    def found() -> list[Bench]:
+        return [make_bench(Scenario(title="warm-up", duration=1.0))]
+
+    def with_components() -> None:
+        plant = found()[0].plant.copy()
+        plant.net["n_dynamic"] = 1
+        assert plant.records
+
+    return [
+        Set(_START, found),
         *(_link(name, {}) for name in link_names()),
-        ("a link's impairment", impaired.warm_up),
+        _IMPAIRMENT,
         _IDLE,
+        *(_role(role, found) for role in reversed(ROLES)),
+        Set("the operating point of an inner stage", lambda: make_bench(limited), (_START,)),
+        Set("the components of networks", with_components, (_START,)),
+        _both(found),
     ]
-    return compile_sets(sets, notice), len(sets)
 
 
 def compile_external(
@@ -132,32 +141,36 @@ def compile_external(
     nothing = ExternalController()
     nothing.name = "nothing"
     bench.external = SteppedController(nothing, bench.controller, bench.u)
-    compile_sets([_role("controller", [bench], " of an external controller")], notice)
+    compile_sets([_role("controller", lambda: [bench], " of an external controller")], notice)
 
 
-_IDLE: Set = ("the thread that keeps a processor busy", prevent_idle.warm_up)
+_START = "the operating point"
+_IDLE = Set("the thread that keeps a processor busy", prevent_idle.warm_up)
+_IMPAIRMENT = Set("a link's impairment", impaired.warm_up)
 
 
-def _both(found: list[Bench]) -> Set:
-    return "the loop of both sides", lambda: compile_loop(found)
+def _both(found: Callable[[], list[Bench]]) -> Set:
+    sides = tuple(f"the {role}" for role in ROLES)
+    return Set("the loop of both sides", lambda: compile_loop(found()), (_START, *sides))
 
 
-def _role(role: Role, found: list[Bench], which: str = "") -> Set:
+def _role(role: Role, found: Callable[[], list[Bench]], which: str = "") -> Set:
     def compile_it() -> None:
+        benches = found()
         parts = [
             RolePart(
                 rows(1, 1, bench.inner, bench.options)[role == "controller"][0],
                 np.empty((0, len(kept_of(role))), np.int64),
                 np.zeros(2, np.int64),
             )
-            for bench in found
+            for bench in benches
         ]
-        compile_role(role, found, parts)
+        compile_role(role, benches, parts)
 
-    return f"the {role}{which}", compile_it
+    return Set(f"the {role}{which}", compile_it, (_START,))
 
 
 def _link(name: str, options: dict[str, Any], inner: int = False) -> Set:
     kind = link_kind(name)
     checked = kind.options.model_validate(options).of_run(inner)
-    return f"the link {name}", lambda: kind.warm_up(checked)
+    return Set(f"the link {name}", lambda: kind.warm_up(checked))

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.links.crc import crc32
+from gfm_hil.realtime.atomics import load32, store32
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import TABLE_VERSION, Vector, carried
+from gfm_runtime.signals import NU_COUNTS, NY_COUNTS, TABLE_VERSION, Vector, carried
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 MAGIC = 0x4647  # "GF"
@@ -73,11 +74,17 @@ def wire_dtype(count: int) -> np.dtype:
     return np.dtype([*_HEADER, ("values", "<f8", (count,)), ("crc", "<u4")])
 
 
+#: a frame's memory as compiled functions see it: with room for the longest vector, so that they are
+#: compiled once for frames of all lengths
+_LONGEST = max(NY_COUNTS, NU_COUNTS)
+record_dtype = np.dtype([*_HEADER, ("values", "<f8", (_LONGEST,)), ("room", "<u4")])
+
+
 def buffer(count: int, data_id: int) -> tuple[np.ndarray, np.ndarray]:
-    """Memory for one frame: a record of ``wire_dtype``, and the same memory as bytes."""
-    frame = np.zeros(1, wire_dtype(count))
+    """Memory for one frame: a record of ``record_dtype``, and the frame's bytes in it."""
+    frame = np.zeros(1, record_dtype)
     frame["magic"], frame["version"], frame["data_id"] = MAGIC, TABLE_VERSION, data_id
-    return frame, frame.view(np.uint8)
+    return frame, frame.view(np.uint8)[: wire_dtype(count).itemsize]
 
 
 def make_reader() -> np.ndarray:
@@ -96,8 +103,7 @@ def pack(sequence, frame, message, tick, state, reason, values):
 
     Args:
         sequence: counter with the number of this frame, shape (1,), int64.
-        frame, message: a buffer as one record of ``wire_dtype`` and as bytes; magic, version and
-            data id are set.
+        frame, message: of a ``buffer``; magic, version and data id are set.
         tick, state, reason: of the sender.
         values: p.u., in the order of the signal table.
     """
@@ -117,7 +123,18 @@ def pack_again(sequence, frame, message):
     f = frame[0]
     f.sequence = sequence[0]
     skip(sequence)
-    f.crc = crc32(message, len(message) - _CRC_BYTES)
+    store32(_seal_at(message), crc32(message, len(message) - _CRC_BYTES))
+
+
+@inlined
+def is_sealed(message):
+    """Whether a frame ends with its CRC."""
+    return load32(_seal_at(message)) == crc32(message, len(message) - _CRC_BYTES)
+
+
+@inlined
+def _seal_at(message):
+    return message.ctypes.data + len(message) - _CRC_BYTES
 
 
 @inlined
@@ -137,7 +154,7 @@ def unpack(reader, data_id, frame, message, size, values):
     Args:
         reader: one-element array of ``reader_dtype``.
         data_id: of the expected frame.
-        frame, message: a buffer as one record of ``wire_dtype`` and as bytes.
+        frame, message: of a ``buffer``.
         size: bytes received, which may be more than the buffer holds.
         values: written only if the frame is good and its tick newer: the first good frame of a
             tick stands.
@@ -150,7 +167,7 @@ def unpack(reader, data_id, frame, message, size, values):
     ahead = (np.int64(f.sequence) - r.next) % _WRAP
     if size != len(message):
         fault = SIZE
-    elif f.crc != crc32(message, size - _CRC_BYTES):
+    elif not is_sealed(message):
         fault = CRC
     elif f.magic != MAGIC:
         fault = BAD_MAGIC

@@ -99,3 +99,15 @@ def _make_load(bits: int, kind: types.Integer) -> Any:
 
 
 load32, load64 = _make_load(32, types.uint32), _make_load(64, types.uint64)
+
+
+@intrinsic
+def store32(typingctx, address, value):
+    """Store a uint32 at an address, little-endian."""
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = builder.inttoptr(arguments[0], ir.IntType(32).as_pointer())
+        builder.store(arguments[1], pointer, align=1)
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.uint32), make

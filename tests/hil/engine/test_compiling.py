@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from numba import njit
 
-from gfm_hil.engine.compiling import compile_everything, compile_sets
+from gfm_hil.cli import main
+from gfm_hil.engine.compiling import Set, compile_sets, everything
 from gfm_hil.links import link_names
 from gfm_hil.run.runner import run_scenario
 
@@ -68,7 +69,9 @@ def test_an_operator_s_command_loads_no_compiler(tmp_path):
 def test_only_what_is_compiled_is_said_and_which_of_how_many():
     new = njit(lambda x: x + 1)
     said: list[str] = []
-    sets = [("nothing", lambda: None), ("a sum", lambda: new(1)), ("it again", lambda: new(2))]
+    sets = [
+        Set("nothing", lambda: None), Set("a sum", lambda: new(1)), Set("it again", lambda: new(2))
+    ]  # fmt: skip
     assert compile_sets(sets, said.append) == 1
     assert said == ["compiling a sum (2 of 3, once a machine) …"]
 
@@ -81,9 +84,9 @@ def cached(folder: Path) -> dict[Path, int]:
 
 @pytest.mark.timeout(900)  # the first time it compiles everything
 def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
-    compile_everything(lambda text: None)
+    assert main(["warm-up", "--quiet"]) == 0
     said: list[str] = []
-    assert compile_everything(said.append)[0] == len(said) == 0
+    assert compile_sets(everything(), said.append) == len(said) == 0
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[3])
     before = cached(root)
     assert before
