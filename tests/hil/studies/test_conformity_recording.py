@@ -217,6 +217,7 @@ WRONG: dict[str, tuple[Callable[[Columns], Columns], str, str]] = {
     "base": (dict, "S_n = 40e3\nV_n = 380.0\n" + WAVES, r"p = 0\.05 p\.u\..*see S_n"),
     "volts": (dict, BASES.replace("380", "690") + WAVES, r"V = 0\.5.* p\.u\..*V_n"),
     "swapped": (lambda w: w | {"v_a_V": w["v_b_V"], "v_b_V": w["v_a_V"]}, BASES + WAVES, "swapped"),
+    "late": (dict, BASES + "event_s = 3.0\n" + WAVES, "event_s = 3 of its map: no event"),
     "shift": (dict, BASES + "event_s = 1.5\n" + WAVES, "shifted"),
     "channel": (lambda w: {n: x for n, x in w.items() if n != "i_oc_A"}, BASES + WAVES, "i_oc_A"),
     "rest": (lambda w: {n: x[:15000] for n, x in w.items()}, BASES + WAVES, "no event"),
