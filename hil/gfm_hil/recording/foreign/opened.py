@@ -121,9 +121,9 @@ def _event(s: Sampled, of: RecordingMap, scenario: Scenario, cycle: float) -> tu
             if (moved := np.abs(x - middle) > band).any():
                 found.append((int(np.argmax(moved)), name))
     if not found:
-        at = "" if of.event_s is None else f"event_s = {of.event_s:g} of its map: "
+        where = "" if of.event_s is None else f"event_s = {of.event_s:g} of its map: "
         raise UserError(
-            f"{at}no event: p, q and V stay as in the first {rest_s:g} s, which must be at rest"
+            f"{where}no event: p, q and V stay as in the first {rest_s:g} s, which must be at rest"
         )
     k, name = min(found)
     at = float(s.t[max(0, k - 1)])  # the last sample of before
