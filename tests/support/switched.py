@@ -245,7 +245,7 @@ class AtABus(Reference):
     others: Any = ()
     E: Any = ()
     u: Any = ()
-    brought: complex = 0j  # by what a subclass has at the bus besides
+    i_besides: complex = 0j  # by what a subclass has at the bus besides
     conductance: float = 0.0
     susceptance: float = 0.0
     L_tie: float = 0.0
@@ -256,7 +256,7 @@ class AtABus(Reference):
         w, bus, i_g = self.par["omega_b"], z[5], z[6]
         v_a, _, v_c = (bus * AXES.conj()).real
         leak = 2 / 3 * (v_a - v_c) / self.R_fault * (AXES[0] - AXES[2])
-        arrives = self.brought + z[2] - i_g - self.conductance * bus - leak
+        arrives = self.i_besides + z[2] - i_g - self.conductance * bus - leak
         more = list[complex]()
         for k, r in enumerate(self.others):
             i, v, i_o, v_dc, reg = z[7 + 5 * k : 12 + 5 * k]
@@ -294,7 +294,7 @@ class WithMoving(AtABus):
     def outside(self, t: float, z: NDArray[np.complex128]) -> tuple[complex, list[complex]]:
         w, one, gen = self.par["omega_b"], self.load, self.machine
         v, i, angle, speed, turbine = z[7 + 5 * len(self.others) :]
-        self.brought = i - one["S"].conjugate() * v / max(abs(v) ** 2, one["least_v2"])
+        self.i_besides = i - one["S"].conjugate() * v / max(abs(v) ** 2, one["least_v2"])
         bus, more = super().outside(t, z)
         E = gen["E"] * np.exp(1j * angle.real)
         power = (E * i.conjugate()).real / gen["S"]
