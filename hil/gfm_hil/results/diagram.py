@@ -4,7 +4,8 @@ Drawn from the scenario alone, with its parameters in p.u. of each converter; th
 lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,7 +16,7 @@ from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.results.figures import as_svg, in_a_page
-from gfm_hil.results.single_line import Bar, bars_of, converters_of, give_rows
+from gfm_hil.results.single_line import Bar, bars_of, converters_of, give_lanes, give_rows
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
@@ -23,6 +24,8 @@ from gfm_plant import Plant, load_converter
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
 _ROW = 1.75
+#: of a narrow page: its rows, the lines beside each other, its width
+_STACKED_ROW, _LANE, _NARROW = 1.0, 0.4, 5.1
 #: places of a report: the curves of one converter, and those of some beside each other
 OF, ONLY = "of-", "only="
 
@@ -30,22 +33,28 @@ OF, ONLY = "of-", "only="
 def draw_diagram(
     folder: Path, scenario: Scenario, report: str | None = None, leads_to: str = OF
 ) -> str:
-    """Draw the diagram into network.svg of a run folder; returns it as an element of a page.
+    """Draw the diagram into network.svg of a run folder; returns it as elements of a page, one for
+    wide screens and one for narrow ones.
 
     Args:
-        report, leads_to: as for ``fill_diagram``; the links of the element are within its own page.
+        report, leads_to: as for ``fill_diagram``; the links of the elements are within their page.
     """
-    figure = Figure()
-    fill_diagram(figure, scenario, report, leads_to)
-    drawn = as_svg(figure)
-    with replacing(folder / "network.svg") as part:
-        part.write_bytes(drawn)
-    root = in_a_page(drawn)
-    for link in root.iter("a"):
-        _, hash, place = link.attrib["href"].partition("#")
-        link.attrib = {"href": hash + place}  # in the same tab
-        link.set("aria-label", f"curves of {place.removeprefix(OF).removeprefix(ONLY)}")
-    return ElementTree.tostring(root, encoding="unicode")
+    elements = []
+    for width, fill in (("wide", fill_diagram), ("narrow", fill_narrow)):
+        figure = Figure()
+        fill(figure, scenario, report, leads_to)
+        drawn = as_svg(figure)
+        if width == "wide":
+            with replacing(folder / "network.svg") as part:
+                part.write_bytes(drawn)
+        root = in_a_page(drawn)
+        root.set("class", width)
+        for link in root.iter("a"):
+            _, hash, place = link.attrib["href"].partition("#")
+            link.attrib = {"href": hash + place}  # in the same tab
+            link.set("aria-label", f"curves of {place.removeprefix(OF).removeprefix(ONLY)}")
+        elements.append(ElementTree.tostring(root, encoding="unicode"))
+    return "".join(elements)
 
 
 def fill_diagram(
@@ -61,7 +70,6 @@ def fill_diagram(
     """
     plants, laws, nodes = converters_of(scenario)
     bars, lines = bars_of(scenario, nodes)
-    faults = [event for event in scenario.events if isinstance(event, Fault)]
     top = give_rows(bars, lines)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
     figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
@@ -70,7 +78,7 @@ def fill_diagram(
     axes.axis("off")
     passing = [(r, 0.0) for bar in bars.values() for r in bar.rows[: len(bar.converters)]]
     passing += [(r, min(_at(bars[a]), _at(bars[b]))) for r, a, b, *_ in lines.values()]
-    spots: dict[str, tuple[float, float, float]] = {}  # of lines: y, where it begins and ends
+    spots: _Spots = {}
     for name, bar in bars.items():
         x = _at(bar)
         for row, converter in zip(bar.rows, bar.converters, strict=False):
@@ -78,7 +86,7 @@ def fill_diagram(
             _wire(axes, (_LINE, -_ROW * row), (x, -_ROW * row))
             _inductor(axes, _LINE + 0.2, -_ROW * row)
             behind = not converter and plants[converter].lcl is not None
-            spots[converter] = -_ROW * row, _LINE + 1.1 if behind else _TERMINAL, x
+            spots[converter] = (_LINE + 1.1 if behind else _TERMINAL, -_ROW * row), (x, -_ROW * row)
             if report is not None:
                 _area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{leads_to}{converter}")
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
@@ -100,19 +108,111 @@ def fill_diagram(
         at_ends = [c for c, node in nodes.items() if node in (start, end)]
         if report is not None and at_ends:
             _area(axes, (left + 0.1, right - 0.1), y, f"{report}#{ONLY}{','.join(at_ends)}")
-        spots[name] = (y, left, right) if _at(bars[start]) == left else (y, right, left)
-    for event in faults:
-        _fault(axes, scenario, event, bars, spots)
+        spots[name] = (_at(bars[start]), y), (_at(bars[end]), y)
+    for name, bar in bars.items():
+        spots[f"node {name}"] = ((_at(bar), -_ROW * bar.rows[0]),) * 2
+    for event in scenario.events:
+        if not isinstance(event, Fault):
+            continue
+        x, y, text = _fault(axes, scenario, event, spots)
+        axes.text(x + 0.26, y + 0.5, text, **_MARKED)
     return axes
 
 
-def _area(axes: Axes, x: tuple[float, float], y: float, url: str) -> None:
+def fill_narrow(
+    figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
+) -> Axes:
+    """As ``fill_diagram`` for a narrow page: nodes below each other, lines at their left, and of a
+    converter its elements in words."""
+    plants, laws, nodes = converters_of(scenario)
+    bars, lines = bars_of(scenario, nodes)
+    top, lanes = give_rows(bars, lines, stacked=True), give_lanes(bars, lines)
+    height = _STACKED_ROW * (top + 0.3)
+    figure.set_size_inches(0.72 * _NARROW, 0.72 * height)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, _NARROW), ylim=(0.75 - height, 0.75), aspect="equal")
+    axes.axis("off")
+    x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
+    spots: _Spots = {}
+    labels: dict[str, tuple[float, float]] = {}  # where the text of a fault there stands
+    for name, bar in bars.items():
+        ys = [-_STACKED_ROW * row for row in bar.rows]
+        axes.plot([x, x], [ys[0] + 0.35, ys[-1] - 0.35], color=_INK, lw=3.5, solid_capstyle="butt")
+        axes.text(x - 0.03, ys[0] + 0.42, name, fontsize=8.5, color=_INK)
+        spots[f"node {name}"] = ((x, ys[-1] - 0.3),) * 2
+        labels[f"node {name}"] = x + 0.3, ys[-1] - 0.5
+        for y, converter in zip(ys, bar.converters, strict=False):
+            _in_words(axes, x, y, converter, plants[converter], laws[converter])
+            spots[converter], labels[converter] = ((x + 0.35, y), (x, y)), (x + 0.3, y - 0.5)
+            if report is not None:
+                _area(axes, (x, _NARROW), y, f"{report}#{leads_to}{converter}", 0.45)
+        for y, (symbol, text, closed) in zip(ys[len(bar.converters) :], bar.right, strict=False):
+            _hang(axes, x, y, symbol, _folded(text, x + 1.5), closed, 0.75)
+    for name, (row, start, end, symbol, text, closed) in lines.items():
+        upper, lower = sorted((bars[start].rows, bars[end].rows))
+        y, at = -_STACKED_ROW * row, x - _LANE * (1 + lanes[name])
+        ends = -_STACKED_ROW * upper[-1] - 0.22, -_STACKED_ROW * lower[0] + 0.22
+        for end_y in ends:
+            _wire(axes, (x, end_y), (at, end_y))
+        inner = [ends[0] - 0.05, ends[1] + 0.05]  # passes before the ends of others
+        axes.plot([at, at], inner, color="white", lw=4, solid_capstyle="butt", zorder=2.1)
+        axes.plot([at, at], ends, color=_INK, lw=1.1, solid_capstyle="round", zorder=2.2)
+        _IN_LINE.get(symbol, _box)(axes, at, y, True)
+        _breaker(axes, at, y + 0.57, closed)
+        label = f"{name}\n{_folded(text, x + 0.25)}"
+        axes.text(x + 0.25, y, label, va="center", **_SMALL)
+        begin, finish = ends if bars[start].rows == upper else ends[::-1]
+        spots[name] = (at, begin), (at, finish)
+        labels[name] = x + 0.3, y - 0.45
+        at_ends = [c for c, node in nodes.items() if node in (start, end)]
+        if report is not None and at_ends:
+            _area(axes, (at - 0.3, _NARROW), y, f"{report}#{ONLY}{','.join(at_ends)}", 0.45)
+    for event in scenario.events:
+        if isinstance(event, Fault):
+            *_, text = _fault(axes, scenario, event, spots)
+            axes.text(*labels[_where(event, spots)], text, **_MARKED)
+    return axes
+
+
+#: from where to where a fault of a line may be, by its name, or by "node" and that of a node
+_Spots = dict[str, tuple[tuple[float, float], tuple[float, float]]]
+
+
+def _folded(text: str, x: float) -> str:
+    """Lines of text that fit a narrow page from x on."""
+    letters = int((_NARROW - x) * 0.72 * 72 / 4.3)  # mean width of a small letter, points
+    kept = [line.replace(" ", "\xa0").replace(",\xa0", ", ") for line in text.splitlines()]
+    return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in kept)
+
+
+def _in_words(axes: Axes, x: float, y: float, name: str, plant: Plant, law: str) -> None:
+    """A converter on the right of its node, on a narrow page."""
+    parameters = load_converter(plant.converter)
+    pu = parameters.pu(plant.real_factors())
+    _wire(axes, (x, y), (x + 0.35, y))
+    _bridge(axes, x + 0.35, y)
+    said = [f"{parameters.S_n / 1e3:g} kVA"]
+    said += [f"$L_f$ {pu['L_f']:.3g}", f"$C_f$ {pu['C_f']:.3g}"]
+    if plant.lcl is not None:
+        said.append(f"$L_2$ {plant.lcl.L:.3g}")
+    if plant.lcl is None or not name:
+        said.append(f"$L_g$ {pu['L_g']:.3g}")
+    if not name:
+        said.append(f"SCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}")
+    text = f"{name}: {law}" if name else law
+    text = "\n".join(_folded(one, x + 1.2) for one in (text, ", ".join(said)))
+    axes.text(x + 1.2, y, text, va="center", **_SMALL | {"color": _INK})
+
+
+def _area(axes: Axes, x: tuple[float, float], y: float, url: str, half: float = 0.8) -> None:
     """A link as large as what is drawn along a row."""
+    low = y - half if half < 0.8 else y - 1.0
     axes.add_patch(
-        Rectangle((x[0], y - 1.0), x[1] - x[0], 1.6, fc="none", ec="none", url=url, zorder=5)
+        Rectangle((x[0], low), x[1] - x[0], 2 * half, fc="none", ec="none", url=url, zorder=5)
     )
 
 
+_MARKED: dict[str, Any] = {"fontsize": 7.5, "color": _RED}
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 
 
@@ -124,20 +224,24 @@ def _wire(axes: Axes, *points: tuple[float, float], colour: str = _INK) -> None:
     axes.plot(*zip(*points, strict=True), color=colour, lw=1.1, solid_capstyle="round")
 
 
-def _inductor(axes: Axes, x: float, y: float) -> None:
-    """Four humps over 0.8, in place of the wire below them."""
-    axes.add_patch(Rectangle((x, y - 0.05), 0.8, 0.1, fc="white", ec="none", zorder=2.5))
+def _inductor(axes: Axes, x: float, y: float, upright: bool = False) -> None:
+    """Four humps over 0.8 from x on, or around y, in place of the wire below them."""
+    place, size = ((x - 0.05, y - 0.4), (0.1, 0.8)) if upright else ((x, y - 0.05), (0.8, 0.1))
+    axes.add_patch(Rectangle(place, *size, fc="white", ec="none", zorder=2.5))
     for k in range(4):
-        axes.add_patch(Arc((x + 0.1 + 0.2 * k, y), 0.2, 0.26, theta1=0, theta2=180, ec=_INK,
-                           lw=1.1, zorder=3))  # fmt: skip
+        along = 0.1 + 0.2 * k
+        centre = (x, y - 0.4 + along) if upright else (x + along, y)
+        axes.add_patch(Arc(centre, 0.2, 0.26, angle=-90 if upright else 0, theta1=0, theta2=180,
+                           ec=_INK, lw=1.1, zorder=3))  # fmt: skip
 
 
-def _windings(axes: Axes, x: float, y: float) -> None:
+def _windings(axes: Axes, x: float, y: float, upright: bool = False) -> None:
     """Two circles that overlap, in place of the wire between them."""
-    for side in (-0.13, 0.13):
-        axes.add_patch(Circle((x + side, y), 0.24, fc="white", ec="none", zorder=2.5))
-    for side in (-0.13, 0.13):
-        axes.add_patch(Circle((x + side, y), 0.24, fc="none", ec=_INK, lw=1.1, zorder=3))
+    radius = 0.18 if upright else 0.24
+    centres = [(x, y + side) if upright else (x + side, y) for side in (-0.13, 0.13)]
+    for fill, edge, zorder in (("white", "none", 2.5), ("none", _INK, 3)):
+        for centre in centres:
+            axes.add_patch(Circle(centre, radius, fc=fill, ec=edge, lw=1.1, zorder=zorder))
 
 
 def _capacitor(axes: Axes, x: float, y: float) -> None:
@@ -150,9 +254,19 @@ def _capacitor(axes: Axes, x: float, y: float) -> None:
         _wire(axes, (x - half, y - 0.6 - 0.06 * k), (x + half, y - 0.6 - 0.06 * k))
 
 
-def _box(axes: Axes, x: float, y: float) -> None:
-    """A part without a symbol, 0.7 wide, in place of the wire below it."""
-    axes.add_patch(Rectangle((x - 0.35, y - 0.25), 0.7, 0.5, fc="white", ec=_INK, lw=1.2, zorder=3))
+def _box(axes: Axes, x: float, y: float, upright: bool = False) -> None:
+    """A part without a symbol, 0.7 long, in place of the wire below it."""
+    long, wide = (0.2, 0.7) if upright else (0.7, 0.5)
+    place = x - long / 2, y - wide / 2
+    axes.add_patch(Rectangle(place, long, wide, fc="white", ec=_INK, lw=1.2, zorder=3))
+
+
+def _bridge(axes: Axes, x: float, y: float) -> None:
+    """From DC to AC, 0.7 wide."""
+    axes.add_patch(Rectangle((x, y - 0.35), 0.7, 0.7, fc="white", ec=_INK, lw=1.2))
+    _wire(axes, (x, y - 0.35), (x + 0.7, y + 0.35))
+    axes.text(x + 0.16, y + 0.17, "=", ha="center", va="center", fontsize=9, color=_INK)
+    axes.text(x + 0.53, y - 0.19, "~", ha="center", va="center", fontsize=11, color=_INK)
 
 
 def _arrow(axes: Axes, x: float, y: float) -> None:
@@ -178,10 +292,7 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
     axes.text(0.25, y, "DC", ha="center", va="center", fontsize=6.5, color=_INK)
     _wire(axes, (0.5, y), (1.4, y))
     _capacitor(axes, 0.95, y)
-    axes.add_patch(Rectangle((1.4, y - 0.35), 0.7, 0.7, fc="white", ec=_INK, lw=1.2))
-    _wire(axes, (1.4, y - 0.35), (2.1, y + 0.35))
-    axes.text(1.56, y + 0.17, "=", ha="center", va="center", fontsize=9, color=_INK)
-    axes.text(1.93, y - 0.19, "~", ha="center", va="center", fontsize=11, color=_INK)
+    _bridge(axes, 1.4, y)
     _wire(axes, (2.1, y), (_LINE, y))
     _inductor(axes, 2.5, y)
     _capacitor(axes, _TERMINAL, y)
@@ -205,45 +316,49 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
 
 
 #: symbols of what lies between two nodes, in the middle of the wire
-_IN_LINE: dict[str, Callable[[Axes, float, float], None]] = {
-    "inductor": lambda axes, x, y: _inductor(axes, x - 0.4, y), "windings": _windings,
-}  # fmt: skip
+_IN_LINE: dict[str, Callable[..., None]] = {
+    "inductor": lambda axes, x, y, upright=False: _inductor(
+        axes, x if upright else x - 0.4, y, upright
+    ),
+    "windings": _windings,
+}
 #: of what ends at one, at the end of the wire; any other text is that of a source in its circle
 _AT_END: dict[str, Callable[[Axes, float, float], None]] = {
     "load": _arrow, "capacitor": _capacitor, "box": lambda axes, x, y: _box(axes, x + 0.35, y),
 }  # fmt: skip
 
 
-def _hang(axes: Axes, x: float, y: float, symbol: str, text: str, closed: bool) -> None:
-    """What hangs on the right of a bar, with its breaker; a bank of capacitors has none."""
-    _wire(axes, (x, y), (x + 1.2, y))
-    if symbol != "capacitor":
-        _breaker(axes, x + 0.5, y, closed)
-    if symbol in _AT_END:
-        _AT_END[symbol](axes, x + 1.2, y)
-    else:
-        axes.add_patch(Circle((x + 1.5, y), 0.3, fc="white", ec=_INK, lw=1.2))
-        size = 13 if symbol == "~" else 8
-        axes.text(x + 1.5, y - 0.02, symbol, ha="center", va="center", fontsize=size, color=_INK)
-    place = 1.5 if symbol in ("load", "capacitor") else 1.95
-    axes.text(x + place, y, text, va="center", **_SMALL)
-
-
-def _fault(
-    axes: Axes,
-    scenario: Scenario,
-    event: Fault,
-    bars: Mapping[str, Bar],
-    spots: Mapping[str, tuple[float, float, float]],
+def _hang(
+    axes: Axes, x: float, y: float, symbol: str, text: str, closed: bool, reach: float = 1.2
 ) -> None:
-    """A flash where the event puts its fault."""
-    if event.node is not None:
-        x, y = _at(bars[event.node]), -_ROW * bars[event.node].rows[0]
+    """What hangs on the right of a bar, with its breaker; a bank of capacitors has none."""
+    end = x + reach
+    _wire(axes, (x, y), (end, y))
+    if symbol != "capacitor":
+        _breaker(axes, x + reach / 2.4, y, closed)
+    if symbol in _AT_END:
+        _AT_END[symbol](axes, end, y)
     else:
-        y, start, end = spots[event.line if event.line is not None else next(iter(spots))]
-        x = start + (event.position or 0.0) * (end - start)
+        axes.add_patch(Circle((end + 0.3, y), 0.3, fc="white", ec=_INK, lw=1.2))
+        size = 13 if symbol == "~" else 8
+        axes.text(end + 0.3, y - 0.02, symbol, ha="center", va="center", fontsize=size, color=_INK)
+    place = 0.3 if symbol in ("load", "capacitor") else 0.75
+    axes.text(end + place, y, text, va="center", **_SMALL)
+
+
+def _where(event: Fault, spots: _Spots) -> str:
+    """The name of the spot of a fault."""
+    if event.node is not None:
+        return f"node {event.node}"
+    return event.line if event.line is not None else next(s for s in spots if s[:5] != "node ")
+
+
+def _fault(axes: Axes, scenario: Scenario, event: Fault, spots: _Spots) -> tuple[float, float, str]:
+    """A flash where the event puts its fault; returns the place and what to write there."""
+    (x, y), (x_end, y_end) = spots[_where(event, spots)]
+    x += (event.position or 0.0) * (x_end - x)
+    y += (event.position or 0.0) * (y_end - y)
     flash: Sequence[tuple[float, float]] = [(0.0, 0.0), (0.16, 0.3), (0.02, 0.3), (0.2, 0.62)]
     _wire(axes, *((x + a, y + b) for a, b in flash), colour=_RED)
     axes.plot([x], [y], "v", ms=5, color=_RED, zorder=4)
-    t = event.at(scenario.T_s) * scenario.T_s
-    axes.text(x + 0.26, y + 0.5, f"{event.what}, {t:g} s", fontsize=7.5, color=_RED)
+    return x, y, f"{event.what}, {event.at(scenario.T_s) * scenario.T_s:g} s"

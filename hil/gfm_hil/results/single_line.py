@@ -84,10 +84,11 @@ def _give_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> No
         bar.column = max(away.values()) - away.get(name, 0)
 
 
-def give_rows(bars: Mapping[str, Bar], lines: Lines) -> int:
+def give_rows(bars: Mapping[str, Bar], lines: Lines, stacked: bool = False) -> int:
     """Give every node, and every line, rows of its own; returns how many there are.
 
-    Nodes at the right come first, so that wires to them pass above the others.
+    Nodes at the right come first, so that wires to them pass above the others. ``stacked``: all
+    nodes are in one column for a narrow page, and converters hang on their right, above the rest.
     """
     row, done = 0, set[str]()
     for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
@@ -95,8 +96,28 @@ def give_rows(bars: Mapping[str, Bar], lines: Lines) -> int:
             if {start, end} & done and name in (start, end):
                 lines[line] = row, start, end, symbol, text, closed
                 row += 1
-        count = max(1, len(bar.converters), len(bar.right))
+        own = len(bar.converters), len(bar.right)
+        count = max(1, sum(own) if stacked else max(own))
         bar.rows = [*range(row, row + count)]
         row += count
         done.add(name)
     return row
+
+
+def give_lanes(bars: Mapping[str, Bar], lines: Lines) -> dict[str, int]:
+    """How far left of nodes that are stacked each line runs, 0 next to them, so that no two meet
+    but at a node."""
+    ends = {
+        name: sorted((bars[start].rows, bars[end].rows))
+        for name, (_, start, end, *_) in lines.items()
+    }
+    taken: list[list[tuple[int, int]]] = []  # of each lane, from row to row
+    lanes = {}
+    for name in sorted(lines, key=lambda name: ends[name][1][0] - ends[name][0][-1]):
+        top, low = ends[name][0][-1], ends[name][1][0]
+        fits = (k for k, lane in enumerate(taken) if all(low <= a or b <= top for a, b in lane))
+        lanes[name] = next(fits, len(taken))
+        if lanes[name] == len(taken):
+            taken.append([])
+        taken[lanes[name]].append((top, low))
+    return lanes

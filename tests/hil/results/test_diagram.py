@@ -2,13 +2,15 @@
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 import gfmhil
-from gfm_hil.results.diagram import draw_diagram, fill_diagram
+from gfm_hil.results.diagram import draw_diagram, fill_diagram, fill_narrow
+from gfm_hil.results.single_line import Bar, give_lanes, give_rows
 from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 from gfm_plant import NetworkParts
 from gfm_plant.components.part import Component
@@ -116,11 +118,28 @@ def test_a_component_without_a_symbol_is_a_box_with_its_name(monkeypatch):
                               and p.get_width() == 0.7]) + 2  # fmt: skip
 
 
-@pytest.mark.parametrize("name", shipped_scenarios())
-def test_every_shipped_scenario_is_drawn_within_its_picture(name):
+def test_lines_of_a_narrow_page_meet_at_nodes_alone():
+    """A ring of four: the line that closes it passes two nodes, on the left of their lines."""
+    bars = {name: Bar(column=3 - k, converters=[name]) for k, name in enumerate("abcd")}
+    bars["b"].right = [("load", "town", True)]
+    ends = {"ab": "ab", "bc": "bc", "cd": "cd", "da": "da"}
+    lines = {name: (0, *pair, "inductor", "", True) for name, pair in ends.items()}
+    assert give_rows(bars, lines, stacked=True) == 9
+    assert [bars[name].rows for name in "abcd"] == [[0], [2, 3], [5], [8]]
+    assert {name: line[0] for name, line in lines.items()} == {"ab": 1, "bc": 4, "cd": 6, "da": 7}
+    assert give_lanes(bars, lines) == {"ab": 0, "bc": 0, "cd": 0, "da": 1}
+
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+
+
+@pytest.mark.parametrize("fill", [fill_diagram, fill_narrow])
+@pytest.mark.parametrize("name", [*shipped_scenarios(), str(EXAMPLES / "ieee9" / "network.toml")])
+def test_every_shipped_scenario_is_drawn_within_its_picture(name, fill):
     figure = Figure()
-    axes = fill_diagram(figure, load_scenario(name))
+    axes = fill(figure, load_scenario(name))
     figure.draw_without_rendering()
+    assert fill is fill_diagram or 72 * figure.get_figwidth() * 4 / 3 < 358  # pixels of a phone
     for text in axes.texts:
         box = text.get_window_extent().transformed(figure.transFigure.inverted())
         assert box.x0 >= 0 and box.x1 <= 1 and box.y0 >= 0 and box.y1 <= 1, text.get_text()
@@ -140,8 +159,10 @@ def test_the_report_shows_it(make, tmp_path, undrawn):
 def test_converters_and_lines_are_links_to_their_curves(tmp_path):
     """Lines of a mesh too, each between columns of its own."""
     scenario = load_scenario("dynawo_three_converters")
-    page = ET.fromstring(draw_diagram(tmp_path, scenario, "report.html"))
-    links = [link.attrib["href"] for link in page.iter("a")]
+    page = ET.fromstring(f"<p>{draw_diagram(tmp_path, scenario, 'report.html')}</p>")
+    assert [drawn.attrib["class"] for drawn in page] == ["wide", "narrow"]
+    links, narrow = ([link.attrib["href"] for link in drawn.iter("a")] for drawn in page)
+    assert sorted(narrow) == sorted(links)
     assert links[:3] == ["#of-droop", "#of-dvoc", "#of-matching"] and len(links) == 3 + 5
     assert "#only=droop,matching" in links  # line12
     alone = (tmp_path / "network.svg").read_text("utf-8")

@@ -113,7 +113,14 @@ def test_it_is_readable_in_a_browser(report, width, dark):
 def test_the_diagram_is_the_entrance_to_the_curves(network, width, dark):
     with Browser(width, 900, dark=dark, phone=width < 500) as page:
         page.driver.get(network.as_uri())
-        page.click(".diagram a[href='#of-droop']")
+        kind = "narrow" if width < 500 else "wide"
+        diagrams, shown = page.js("""
+            const all = [...document.querySelectorAll(".diagram svg")];
+            const box = document.querySelector(".diagram");
+            return [all.filter((s) => s.checkVisibility()).map((s) => s.getAttribute("class")),
+                    box.scrollWidth <= box.clientWidth];""")
+        assert diagrams == [kind] and shown
+        page.click(f".diagram .{kind} a[href='#of-droop']")
         place = "return document.getElementById('of-droop').getBoundingClientRect().top"
         wait_for(lambda: abs(page.js(place)) < 200)  # below the list of contents
         page.js("location.hash = '#only=dvoc,matching'")

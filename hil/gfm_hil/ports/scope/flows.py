@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gfm_hil.ports.scope.watched import WatchedRun
-from gfm_hil.results.single_line import bars_of, converters_of, give_rows
+from gfm_hil.results.single_line import Bar, Lines, bars_of, converters_of, give_lanes, give_rows
 from gfm_hil.scenario.events.breaker import GRID, switched
 from gfm_runtime.states import STATES
 
@@ -47,6 +47,7 @@ class Flows:
                 {"name": name, "row": row, "start": start, "end": end, "symbol": symbol}
                 for name, (row, start, end, symbol, *_) in lines.items()
             ],
+            "stacked": _stacked(bars, lines),
         }  # fmt: skip
 
     @property
@@ -74,6 +75,16 @@ class Flows:
             for name in names
             if f"{name}.P" in columns and not name.endswith(".end")
         }
+
+
+def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
+    """Of a narrow page: the rows of each node, and the row and the lane of each line."""
+    rows = give_rows(bars, lines, stacked=True)
+    lanes = give_lanes(bars, lines)
+    return {
+        "rows": rows, "bars": {name: bar.rows for name, bar in bars.items()},
+        "lines": {name: (line[0], lanes[name]) for name, line in lines.items()},
+    }  # fmt: skip
 
 
 def _newest(run: WatchedRun) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 import { value } from "./text.js";
 
-const BOX = 204, FIRST = BOX + 66, COLUMN = 150, ROW = 58, HANG = 64, TOP = 22; // pixels
+const BOX = 204, FIRST = BOX + 66, COLUMN = 150, TOP = 22; // pixels
+const NARROW = 356, LANE = 22; // a narrow page, whose nodes are below each other
 const LEAST = 5e-4; // p.u.; a smaller power has no arrow
 const SPACE = "http://www.w3.org/2000/svg";
 
@@ -17,81 +18,119 @@ const line = (x1, y1, x2, y2, kind = "wire") => svg("line", { x1, y1, x2, y2, cl
 const text = (x, y, words, kind = "") => svg("text", { x, y, class: kind }, words);
 
 export class Diagram {
-  // network: as the server describes it; shown: the converter that the page shows
-  constructor(network, shown) {
+  // network: as the server describes it; shown: the converter that the page shows; narrow: the page
+  constructor(network, shown, narrow) {
     this.converters = new Map();
     this.breakers = new Map();
-    const at = Object.fromEntries(network.bars.map((bar) => [bar.name, FIRST + COLUMN * bar.column]));
     this.parts = new Map();
-    const wide = Math.max(...Object.values(at)) + HANG + 150;
-    const high = TOP + ROW * network.rows;
+    const { stacked } = network, lanes = Object.values(stacked.lines).map(([, lane]) => lane + 1);
+    this.narrow = narrow;
+    this.row = narrow ? 52 : 58;
+    this.reach = narrow ? 44 : 64;
+    const left = 10 + LANE * Math.max(0, ...lanes);
+    const at = Object.fromEntries(network.bars.map((bar) =>
+      [bar.name, narrow ? left : FIRST + COLUMN * bar.column]));
+    const wide = narrow ? NARROW : Math.max(...Object.values(at)) + this.reach + 150;
+    const high = TOP + this.row * (narrow ? stacked.rows : network.rows);
     this.element = svg("svg", { viewBox: `0 0 ${wide} ${high}`,
       role: "img", "aria-label": "Single-line diagram" });
     this.element.style.maxWidth = `${wide}px`;
-    const rows = new Map(network.bars.map((bar) => [bar.name, [...bar.rows]]));
+    const own = new Map(network.bars.map((bar) =>
+      [bar.name, narrow ? stacked.bars[bar.name] : bar.rows]));
+    const rows = new Map([...own].map(([name, of]) => [name, [...of]]));
     for (const part of network.lines) {
-      const [left, right] = [at[part.start], at[part.end]].sort((a, b) => a - b);
-      const y = this.y(part.row);
-      this.element.append(line(left, y, right, y), text((left + right) / 2, y + 18, part.name, "name"));
-      this.inLine((left + right) / 2, y, part.symbol);
-      this.breaker(part.name, left + 22, y);
-      this.flow(part.name, right - 24, y, at[part.start] > at[part.end],
-        text((left + right) / 2, y + 32, "", "name"));
-      for (const end of [part.start, part.end]) rows.get(end).push(part.row);
+      if (narrow) {
+        this.upright(part, left, stacked.lines[part.name], own.get(part.start), own.get(part.end));
+      } else {
+        this.across(part, at[part.start], at[part.end]);
+        for (const end of [part.start, part.end]) rows.get(end).push(part.row);
+      }
     }
     for (const bar of network.bars) {
-      const x = at[bar.name], of = rows.get(bar.name);
+      const x = at[bar.name], of = own.get(bar.name);
       bar.converters.forEach((name, k) => this.converter(name, network.laws[name], x,
-        this.y(bar.rows[k]), name === shown));
-      bar.right.forEach((part, k) => this.hang(part, x, this.y(bar.rows[k])));
-      const [top, bottom] = [Math.min(...of), Math.max(...of)].map((row) => this.y(row));
-      this.element.append(line(x, top - 12, x, bottom + 12, "bar"), text(x, top - 16, bar.name, "name"));
+        this.y(of[k]), name === shown));
+      const first = narrow ? bar.converters.length : 0;
+      bar.right.forEach((part, k) => this.hang(part, x, this.y(of[first + k])));
+      const all = rows.get(bar.name);
+      const [top, bottom] = [Math.min(...all), Math.max(...all)].map((row) => this.y(row));
+      this.element.append(line(x, top - 12, x, bottom + 12, "bar"),
+        text(narrow ? x - 2 : x, top - 16, bar.name, narrow ? "of" : "name"));
     }
+  }
+
+  // A line between two nodes beside each other.
+  across(part, start, end) {
+    const [left, right] = [start, end].sort((a, b) => a - b), middle = (left + right) / 2;
+    const y = this.y(part.row);
+    this.element.append(line(left, y, right, y), text(middle, y + 18, part.name, "name"));
+    this.inLine(middle, y, part.symbol);
+    this.breaker(part.name, left + 22, y);
+    this.flow(part.name, right - 24, y, start > end, text(middle, y + 32, "", "name"));
+  }
+
+  // A line on the left of nodes that are below each other.
+  upright(part, x, [row, lane], start, end) {
+    const [upper, lower] = start[0] < end[0] ? [start, end] : [end, start];
+    const at = x - LANE * (1 + lane) + 3, y = this.y(row);
+    const top = this.y(upper.at(-1)) + 8, bottom = this.y(lower[0]) - 8;
+    this.element.prepend(svg("path", { d: `M${x} ${top}H${at}M${at} ${bottom}H${x}` }));
+    this.element.append(line(at, top + 3, at, bottom - 3, "gap"), line(at, top, at, bottom),
+      text(x + 12, y - 3, part.name, "of"));
+    this.inLine(at, y, part.symbol);
+    this.breaker(part.name, at, y - 27);
+    this.flow(part.name, at, y + 27, start[0] > end[0], text(x + 12, y + 12, "", "flow"), true);
   }
 
   y(row) {
-    return TOP + ROW * (row + 0.5);
+    return TOP + this.row * (row + 0.5);
   }
 
   converter(name, law, x, y, shown) {
-    const numbers = text(10, y + 2, "–", "flow"), more = text(10, y + 17, "", "flow");
-    const box = svg("rect", { x: 1, y: y - 26, width: BOX, height: 50, rx: 5 });
+    const at = this.narrow ? x + 36 : 1, width = this.narrow ? NARROW - 1 - at : BOX;
+    const numbers = text(at + 9, y + 2, "–", "flow"), more = text(at + 9, y + 17, "", "flow");
+    const box = svg("rect", { x: at, y: y - 26, width, height: 50, rx: 5 });
     const link = svg("a", { href: `?of=${encodeURIComponent(name)}`, class: "converter",
       "data-converter": name, ...(shown ? { "aria-current": "page" } : {}) },
-    svg("title", {}, `${name} under ${law}`), box, text(10, y - 12, `${name} \u00b7 ${law}`, "head"),
+    svg("title", {}, `${name} under ${law}`), box, text(at + 9, y - 12, `${name} \u00b7 ${law}`, "head"),
     numbers, more);
-    this.element.append(line(BOX + 1, y, x, y), link);
+    this.element.append(line(this.narrow ? at : BOX + 1, y, x, y), link);
     this.converters.set(name, { link, numbers, more });
-    this.breaker(name, BOX + 34, y);
+    this.breaker(name, this.narrow ? x + 18 : BOX + 34, y);
   }
 
   inLine(x, y, symbol) {
     if (symbol === "windings") {
-      for (const side of [-5, 5]) this.element.append(svg("circle", { cx: x + side, cy: y, r: 9 }));
+      for (const side of [-5, 5]) {
+        const [cx, cy] = this.narrow ? [x, y + side] : [x + side, y];
+        this.element.append(svg("circle", { cx, cy, r: 9 }));
+      }
     } else {
-      this.element.append(svg("rect", { x: x - 16, y: y - 6, width: 32, height: 12 }));
+      const [width, height] = this.narrow ? [10, 26] : [32, 12];
+      this.element.append(svg("rect", { x: x - width / 2, y: y - height / 2, width, height }));
     }
   }
 
-  // A part's power, and an arrow that shows where it flows; leftwards: where a positive one does.
-  flow(name, x, y, leftwards, words) {
+  // A part's power, and an arrow that shows where it flows; back: a positive one goes to the left,
+  // or up if the part is upright.
+  flow(name, x, y, back, words, upright = false) {
     const arrow = svg("path", { class: "arrow", "data-flow": name, display: "none" });
     words.dataset.power = name;
     this.element.append(arrow, words);
-    this.parts.set(name, { arrow, words, x, y, leftwards });
+    this.parts.set(name, { arrow, words, x, y, back, upright });
   }
 
   hang({ name, symbol, feeds }, x, y) {
-    const end = x + HANG;
+    const end = x + this.reach;
     this.element.append(line(x, y, end, y), text(end + 30, y - 2, name, "part"));
-    if (symbol !== "capacitor") this.flow(name, x + 48, y, feeds, text(end + 30, y + 13, "", "flow"));
+    if (symbol !== "capacitor") this.flow(name, x + 0.75 * this.reach, y, feeds, text(end + 30, y + 13, "", "flow"));
     if (symbol === "load" || symbol === "capacitor") {
       this.element.append(svg("path", { d: `M${end} ${y}v10m-5 0h10l-5 8z`, class: "load" }));
     } else {
       this.element.append(svg("circle", { cx: end + 12, cy: y, r: 12 }),
         text(end + 12, y + 4, symbol === "box" ? "" : symbol, "name"));
     }
-    if (symbol !== "capacitor") this.breaker(name, x + 24, y);
+    if (symbol !== "capacitor") this.breaker(name, x + 0.375 * this.reach, y);
   }
 
   breaker(name, x, y) {
@@ -107,9 +146,10 @@ export class Diagram {
     for (const [name, [P, Q]] of Object.entries(flows)) {
       const part = this.parts.get(name);
       if (!part) continue;
-      const { arrow, words, x, y, leftwards } = part, to = (P < 0) === leftwards ? 6 : -6;
+      const { arrow, words, x, y, back, upright } = part, to = (P < 0) === back ? 6 : -6;
       words.textContent = `P ${value(P, "p.u.")}  Q ${value(Q, "p.u.")}`;
-      arrow.setAttribute("d", `M${x + to} ${y}l${-1.6 * to} ${-5}v10z`);
+      arrow.setAttribute("d", upright ? `M${x} ${y + to}l-5 ${-1.6 * to}h10z`
+        : `M${x + to} ${y}l${-1.6 * to} -5v10z`);
       arrow.setAttribute("display", Math.abs(P) < LEAST ? "none" : "inline");
     }
     for (const [name, now] of Object.entries(converters)) {

@@ -21,6 +21,8 @@ const RATE_S = 2; // of the run, over which misses are counted for their rate
 const events = new Events(document.querySelector("#log ol"));
 let si = false, counted = []; // counted: [ticks done, misses] of late
 let diagram = null; // of a network
+let network = null, flows = null; // what the server says of it
+const narrow = matchMedia("(max-width: 860px)");
 let about = null, strips = [], knobs = null, tools = null, cursors = null, x = new Float64Array(0);
 let summary = null, reason = "", control = false, pictures = 0, told = 0, later = 0;
 
@@ -54,14 +56,22 @@ function heard(message) {
     why();
     redraw();
   } else if (message.kind === "network") {
-    diagram = new Diagram(message, about.converter);
-    get("network").lastElementChild.replaceChildren(diagram.element);
+    network = message;
+    draw();
+    narrow.onchange = draw;
     get("network").hidden = false;
   } else if (message.kind === "flows") {
-    diagram?.show(message);
+    flows = message;
+    diagram?.show(flows);
   } else if (message.kind === "error") {
     console.error(message.text);
   }
+}
+
+function draw() {
+  diagram = new Diagram(network, about.converter, narrow.matches);
+  if (flows) diagram.show(flows);
+  get("network").lastElementChild.replaceChildren(diagram.element);
 }
 
 function begin(message) {
