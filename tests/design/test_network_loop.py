@@ -34,7 +34,7 @@ def scenario(network: dict[str, Any], **changes: Any) -> Scenario:
 
 
 def loop(of: Scenario) -> NetworkLoop:
-    each = [of.of(name) for name in of.converters]
+    each = [*of.each.values()]
     laws = [discretise(load_law(one.law, one.inner).laws[0], of.T_s) for one in each]
     return NetworkLoop.of(plant_of(of), laws, [one.references.vector() for one in each])
 
@@ -161,7 +161,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
     changed by so much."""
     benches = make_benches(of)
     for name, by in changed.items():
-        benches[0].controller.set(name, getattr(of.of(of.converters[0]).references, name) + by)
+        benches[0].controller.set(name, getattr(of.each[of.converters[0]].references, name) + by)
     inner = benches[0].inner
     names, others = (signals_of(role, inner) for role in ("plant", "controller"))
     rows = np.full((len(benches), ticks, len(names)), np.nan)

@@ -128,8 +128,9 @@ def _record(path: str | Path, line: int, fields: list[str]) -> Record | None:
     model = MODELS[name]
     if not fields[0].isdecimal():
         raise UserError(f"{where}, bus: {fields[0]!r} is no number of a bus")
-    if not re.fullmatch("[A-Za-z0-9]{1,2}", fields[2]):
-        raise UserError(f"{where}, machine: {fields[2]!r} is not one or two letters or digits")
+    machine = fields[2] if len(fields) > 2 else ""
+    if not re.fullmatch("[A-Za-z0-9]{1,2}", machine):
+        raise UserError(f"{where}, machine: {machine!r} is not one or two letters or digits")
     given, count = fields[skip:], len(model.flags) + len(model.numbers)
     if len(given) != count:
         raise UserError(f"{where}: {name} has {count} numbers behind its name, not {len(given)}")
@@ -147,7 +148,7 @@ def _record(path: str | Path, line: int, fields: list[str]) -> Record | None:
     for low, high in (("Dwmin", "Dwmax"), ("DwPLLmin", "DwPLLmax")):
         if low in numbers and numbers[low] != -numbers[high]:
             raise UserError(f"{where}, {low}: {numbers[low]:g} must be -{high}, {-numbers[high]:g}")
-    return Record(where, name, int(fields[0]), fields[2], numbers)
+    return Record(where, name, int(fields[0]), machine, numbers)
 
 
 def _number(where: str, text: str) -> float:

@@ -194,7 +194,7 @@ def run_network(
             raise UserError("controllers: take a folder")
         return runner.run_network_in_memory(checked)
     commands = {
-        name: runner.controller_program(checked.of(name), controller, ports.get(name), notice)
+        name: runner.controller_program(checked.each[name], controller, ports.get(name), notice)
         for name, controller in controllers.items()
     }
     report = write_report if figures else None

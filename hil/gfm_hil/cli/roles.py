@@ -77,7 +77,7 @@ def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
         raise UserError(f"--converter: which one this controller controls; one of {known}")
     if converter not in known:
         raise UserError(f"--converter {converter}: must be one of {known}{meant(converter, known)}")
-    return scenario.of(converter)
+    return scenario.each[converter]
 
 
 def _given(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:

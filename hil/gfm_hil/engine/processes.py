@@ -109,7 +109,7 @@ class Processes:
         with contextlib.ExitStack() as stack:
             endpoints = {}
             for name in self._places:
-                link = (self.scenario.of(name) if name else self.scenario).link
+                link = (self.scenario.each[name] if name else self.scenario).link
                 if link.endpoint is None:  # a Unix socket's path may hold 107 bytes
                     fresh = stack.enter_context(scratch.temporary("gfmhil-run-"))
                     endpoints[name] = link_kind(link.type).fresh(fresh)

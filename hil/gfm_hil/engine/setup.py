@@ -65,10 +65,11 @@ class Bench:
         those = self.plant.wiring.recorded if self.place == 0 else ()
         return tuple(name for one in those for name in one.columns)
 
-    def keep(self) -> None:
-        """Remember this instant as the start, to which a reset goes back."""
+    def keep(self, plant: Network) -> None:
+        """Remember this instant as the start, to which a reset goes back; ``plant`` is a copy of
+        the plant, one for all converters."""
         c = self.controller
-        self._plant = self.plant.copy()
+        self._plant = plant
         self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
         self._asked = c.asked
 
@@ -144,7 +145,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     controller of its own and one plant in common; as the controller of one of them sees it, the
     bench of that one. Arguments and errors as of ``make_bench``.
     """
-    each = [scenario.of(name) for name in scenario.converters] or [scenario]
+    each = [*scenario.each.values()] or [scenario]
     plant = plant_of(scenario)
     controllers = [_controller(one, plant, real) for one in each]
     laws = [controller.active_law for controller in controllers]
@@ -161,7 +162,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    inner = scenario.carries
+    inner, kept = scenario.carries, plant.copy()
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
         controller.inner = inner
@@ -176,7 +177,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         told = _commands(start, inner)
         trace = trace_of(one, told)
         bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told, trace=trace)
-        bench.keep()
+        bench.keep(kept)
         gains_of(one, controller.omega_b)
         benches.append(bench)
     if scenario.start_from is not None:

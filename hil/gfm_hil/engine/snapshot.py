@@ -119,7 +119,7 @@ def _check_same(scenario: Scenario, folder: Path) -> None:
     """Raise UserError unless two runs have what the records of a snapshot depend on."""
     was = read_scenario(folder)
     if scenario.converter is not None and was.parts:
-        was = was.of(scenario.converter)
+        was = was.each[scenario.converter]
     for key in _SAME:
         mine, theirs = (_plain(one, key) for one in (scenario, was))
         if mine != theirs:

@@ -218,7 +218,7 @@ def _write_page(
         resolved = scenario_toml(scenario)
     else:  # which names the files of its events there
         resolved = (source / "scenario.toml").read_text("utf-8")
-    for one in [scenario, *map(scenario.of, scenario.converters)]:
+    for one in [scenario, *scenario.each.values()]:
         for law in {*one.laws(), *one.compare}:
             resolved = resolved.replace(f'"{law}"', f'"{Path(law).name}"')
     curves, script = PackedCurves(), plot_script()

@@ -23,7 +23,7 @@ def converters_of(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str],
     """The plant, what results call the law, and the node of each converter, by its name."""
     if scenario.network is None:
         return {"": scenario.plant}, {"": law_titles([scenario.law])[scenario.law]}, {"": ""}
-    each = {name: scenario.of(name) for name in scenario.converters}
+    each = scenario.each
     nodes = {name: member.node for name, member in scenario.network.converters.items()}
     titles = law_titles(s.law for s in each.values())
     laws = {name: titles[s.law] for name, s in each.items()}

@@ -248,7 +248,7 @@ def check_scenario(
     except LawError as problem:
         ours = "" if ("counts",) in overrides else f"{where}: "
         raise UserError("\n".join(ours + line for line in problem.lines)) from None
-    for member in [scenario.of(name) for name in scenario.converters]:
+    for member in scenario.each.values():
         key = "inner" if _stage_mistakes(member.inner) else "law"
         at = f"{where}: network.converters.{member.converter}.{key}: "
         wrong += [at + line for law in member.laws() for line in _law_mistakes(law, member)]
@@ -256,7 +256,7 @@ def check_scenario(
         ours = "" if law == scenario.law and ("law",) in overrides else f"{where}: "
         wrong += [ours + line for line in _law_mistakes(law, scenario)]
     if not wrong:  # what is exchanged follows from all laws
-        each = [scenario.of(name) for name in scenario.converters] or [scenario]
+        each = [*scenario.each.values()] or [scenario]
         for member in each:
             for law in member.laws():
                 wrong += [f"{where}: {line}" for line in _counts_mistakes(law, member)]
@@ -330,9 +330,8 @@ def plant_of(scenario: Scenario) -> Network:
         return make_plant(options, scenario.T_s)
     converters = {}
     for name, member in scenario.network.converters.items():
-        options = scenario.of(name).plant
-        if scenario.seed:
-            options = options.with_seed(scenario.seed)
+        options = scenario.each[name].plant
+        options = options.with_seed(scenario.seed) if scenario.seed else options
         converters[name] = (options, member.node)
     return make_network(converters, scenario.T_s, scenario.plant.grid, scenario.network)
 
@@ -340,7 +339,7 @@ def plant_of(scenario: Scenario) -> Network:
 def _try_plant(scenario: Scenario) -> None:
     """Build the plant and try those of its events that not every plant can carry out."""
     plants = {"plant.": scenario.plant} | {
-        f"network.converters.{name}.plant.": scenario.of(name).plant for name in scenario.converters
+        f"network.converters.{name}.plant.": one.plant for name, one in scenario.each.items()
     }
     for of, options in plants.items():
         place = f"{of}converter = {options.converter!r}"

@@ -262,27 +262,39 @@ class Scenario(StrictSchema):
         """Names of the converters that have a run folder of their own within the run's."""
         return self.converters if self.converter is None else []
 
-    def of(self, name: str) -> Scenario:
-        """The scenario as one converter of the network sees it: with its law, references and plant,
-        and the events of the network and of itself."""
-        assert self.network is not None
+    @cached_property
+    def each(self) -> dict[str, Scenario]:
+        """The scenario as each converter of the network sees it: with its law, references and
+        plant, and the events of the network and of itself; none without a network."""
+        if self.network is None:
+            return {}
         given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
+        plant = self.plant.model_copy(update={"grid": Plant().grid})
 
         def whole(member: NetworkConverter) -> NetworkConverter:
             if self.converter is not None:  # it was made whole before
                 return member
             own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
-            if "plant" in own:
-                own["plant"] = self.plant.model_copy(update={"grid": Plant().grid})
-            return member.model_copy(update=own)
+            return member.model_copy(update=own | ({"plant": plant} if "plant" in own else {}))
 
-        members = {key: whole(member) for key, member in self.network.converters.items()}
-        own = {key: getattr(members[name], key) for key in given}
-        own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
-        own["network"] = self.network.model_copy(update={"converters": members})
-        events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
-        copy = self.model_copy(update={**own, "events": events, "converter": name})
-        copy.__dict__.pop("carries", None)
+        members = {name: whole(member) for name, member in self.network.converters.items()}
+        network = self.network.model_copy(update={"converters": members})
+
+        def seen(name: str, member: NetworkConverter) -> Scenario:
+            own = {key: getattr(member, key) for key in given}
+            own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
+            events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
+            return self.model_copy(
+                update={**own, "network": network, "events": events, "converter": name}
+            )
+
+        return {name: seen(name, member) for name, member in members.items()}
+
+    def __copy__(self) -> Scenario:
+        """A copy that may get other fields, so without what has been derived from these."""
+        copy = super().__copy__()
+        for derived in ("each", "carries"):
+            copy.__dict__.pop(derived, None)
         return copy
 
     @property
@@ -310,7 +322,7 @@ class Scenario(StrictSchema):
     @property
     def links(self) -> list[LinkSettings]:
         """The link of each converter that runs here."""
-        return [self.of(name).link for name in self.parts] or [self.link]
+        return [self.each[name].link for name in self.parts] or [self.link]
 
     def laws(self) -> list[str]:
         """Names of all laws that the run uses, each once, the initial law first."""
@@ -341,7 +353,7 @@ class Scenario(StrictSchema):
         if self.network is not None:
             members = content["network"]["converters"]
             for name, member in members.items():
-                own = self.of(name)
+                own = self.each[name]
                 for key in ("link", "expect", "law", "inner"):
                     del member[key]
                 if member["plant"] is not None:
@@ -369,7 +381,7 @@ class Scenario(StrictSchema):
         """What frames and recording have beside y and u of Phi. With an inner stage in one of the
         laws these are its signals (``INNER``), with laws that measure and modulate also counts
         (``COUNTS``), else nothing (``PLAIN``)."""
-        each = [self.of(name) for name in self.converters] or [self]
+        each = [*self.each.values()] or [self]
         files = [(one, law_file(name)) for one in each for name in one.laws()]
         counts = named_counts(self.counts) if self.counts is not None else None
         if any(counts if self.counts is not None else file.counts for _, file in files):
@@ -381,7 +393,7 @@ class Scenario(StrictSchema):
     def optional_signals(self) -> tuple[str, ...]:
         """What the recording has by options of a plant, which are power and voltage at the
         connection point behind a transformer, and the charge of a battery."""
-        plants = [self.of(name).plant for name in self.converters] or [self.plant]
+        plants = [one.plant for one in self.each.values()] or [self.plant]
         connection = any(one.lcl is not None for one in plants)
         battery = any(one.dc_source.battery is not None for one in plants)
         return (CONNECTION if connection else ()) + (BATTERY if battery else ())

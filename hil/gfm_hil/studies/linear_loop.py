@@ -160,7 +160,7 @@ def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> Clos
 
 
 def _linearised(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
-    each = [scenario.of(name) for name in scenario.converters]
+    each = [*scenario.each.values()]
     built = [
         discretise(laws[name], scenario.T_s) if name in laws else initial_law(one)[0]
         for name, one in zip(scenario.converters, each, strict=True)

@@ -3,7 +3,7 @@ refused in one line."""
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gfm_hil.api.dyr import read_dyr
@@ -123,6 +123,7 @@ WORDS = st.sampled_from(
 )
 
 
+@example(text="0 REGFMA1/")
 @given(text=st.one_of(st.text(), st.lists(WORDS, max_size=50).map(" ".join)))
 def test_any_text_is_records_or_a_user_error(tmp_path_factory, text):
     path = tmp_path_factory.getbasetemp() / "any.dyr"

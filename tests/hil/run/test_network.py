@@ -298,7 +298,7 @@ def test_converter_names_the_one_that_gets_a_law(tmp_path):
 
 def test_a_law_for_all_reaches_those_that_name_none():
     given = content()
-    assert [load_scenario(given, law="vsg-2").of(name).law for name in "AB"] == ["vsg-2"] * 2
+    assert [load_scenario(given, law="vsg-2").each[name].law for name in "AB"] == ["vsg-2"] * 2
     given["network"]["converters"]["B"]["law"] = "droop-5"
     with pytest.raises(UserError, match="does not replace the own law of B"):
         load_scenario(given, law="vsg-2")
@@ -406,11 +406,11 @@ def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole():
     given = content()
     given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
     whole = load_scenario(given)
-    part = load_scenario(tomllib.loads(scenario_toml(whole.of("B"))))
-    assert part == whole.of("B") and part.converter == "B"
+    part = load_scenario(tomllib.loads(scenario_toml(whole.each["B"])))
+    assert part == whole.each["B"] and part.converter == "B"
     for name in "AB":
-        assert part.of(name) == whole.of(name).model_copy(update={"converter": name})
-    assert (part.of("A").law, part.of("A").inner) == ("droop-3", None)
+        assert part.each[name] == whole.each[name].model_copy(update={"converter": name})
+    assert (part.each["A"].law, part.each["A"].inner) == ("droop-3", None)
 
 
 def test_a_load_of_constant_power_draws_it_at_any_voltage():

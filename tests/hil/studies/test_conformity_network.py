@@ -49,7 +49,7 @@ def test_a_network_of_one_answers_as_its_converter_behind_both_lines(alone, tmp_
     content = {
         "title": "alone", "duration": 7.0, "law": "vsg-2", "inner": "virtual-stator",
         "references": {"P_ref": 0.5}, "link": {"type": "inproc"},
-        "plant": {"factors": factors, "converter": scenario.of("A").plant.converter},
+        "plant": {"factors": factors, "converter": scenario.each["A"].plant.converter},
         "events": [{"t": 2.0, "type": "grid-phase-jump", "degrees": -10.0}],
     }  # fmt: skip
     same = run_in_memory(load_scenario(content))
@@ -81,11 +81,11 @@ def test_the_short_circuit_ratio_is_over_all_ratings_and_steps_by_breakers(tmp_p
 
 def test_all_converters_get_the_references_and_the_frequency_of_the_test(tmp_path):
     scenario = laid("plant_of_two", "miso/3-phase-jump", folder=tmp_path, judged="B", law="vsg-1")
-    assert [scenario.of(name).laws()[0] for name in "AB"] == ["vsg-2", "vsg-1"]
+    assert [scenario.each[name].laws()[0] for name in "AB"] == ["vsg-2", "vsg-1"]
     asked = load_cases(["miso/3-phase-jump"])[0].test.scenario["references"]["P_ref"]
-    assert {scenario.of(name).references.P_ref for name in "AB"} == {asked}
+    assert {scenario.each[name].references.P_ref for name in "AB"} == {asked}
     for name in "AB":
-        nominal = load_converter(scenario.of(name).plant.converter)
+        nominal = load_converter(scenario.each[name].plant.converter)
         assert nominal.omega_n == pytest.approx(2 * np.pi * 60)
 
 

@@ -66,7 +66,9 @@ def _chosen(options: argparse.Namespace) -> tuple[Scenario, Law]:
     scenario = chosen_scenario(options.scenario, options)
     if scenario.network is not None and options.converter is None:
         raise UserError(f"--converter: must name one of {scenario.converters}")
-    return scenario, as_law((scenario.of(options.converter) if options.converter else scenario).law)
+    return scenario, as_law(
+        (scenario.each[options.converter] if options.converter else scenario).law
+    )
 
 
 def _sweep(options: argparse.Namespace) -> int:

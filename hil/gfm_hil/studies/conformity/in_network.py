@@ -56,7 +56,7 @@ class NetworkUnderTest:
     @property
     def own(self) -> Scenario:
         """The scenario as the judged converter sees it."""
-        return self.scenario.of(self.judged)
+        return self.scenario.each[self.judged]
 
     @property
     def plant(self) -> Plant:
@@ -81,10 +81,10 @@ class NetworkUnderTest:
         content = {key: value for key, value in content.items() if key not in _DROPPED}
         network = content["network"]
         for name, member in network["converters"].items():
-            references = self.scenario.of(name).references.model_dump()
+            references = self.scenario.each[name].references.model_dump()
             member["references"] = references | test.get("references", {})
             plant = member.setdefault("plant", dict(content["plant"], grid={}))
-            converter = self.scenario.of(name).plant.converter
+            converter = self.scenario.each[name].plant.converter
             plant["converter"] = converter_at(converter, case.test.f_n, 1.0, converters)
         plant = content["plant"]
         plant["converter"] = converter_at(plant["converter"], case.test.f_n, 1.0, converters)
@@ -113,7 +113,7 @@ class NetworkUnderTest:
     def _share(self) -> float:
         """The rating of all converters over that of the first, whose bases the network has."""
         ratings = [
-            load_converter(self.scenario.of(name).plant.converter).S_n
+            load_converter(self.scenario.each[name].plant.converter).S_n
             for name in self.scenario.converters
         ]
         return sum(ratings) / ratings[0]
