@@ -14,7 +14,7 @@ from gfm_hil.core.files import check_empty
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.scenario.schema import laws_digest
-from gfm_hil.studies import clearing, envelopes
+from gfm_hil.studies import clearing, unit_fit
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
 from gfm_hil.studies.certificate import CertifiedLaws, certify_laws
@@ -276,7 +276,7 @@ def measure_unit(
         for file in files.values():
             changes = {**changes, "law": file}
         scenario = load_scenario(on, in_process=True, **changes)
-        return envelopes.measure_unit(scenario, degrees, seconds)
+        return unit_fit.measure_unit(scenario, degrees, seconds)
 
 
 def clearing_time(

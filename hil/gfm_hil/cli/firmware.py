@@ -68,7 +68,9 @@ def add(command: argparse.ArgumentParser) -> None:
     own = kinds.add_parser(
         "compile", help="compile a real-code model's own C source for Linux, and list its ports"
     )
-    own.add_argument("source", type=Path, metavar="SOURCE", help="a C file, or a folder of them")
+    own.add_argument(
+        "sources", type=Path, nargs="+", metavar="SOURCE", help="C files, and folders of them"
+    )
     own.add_argument(
         "-I", dest="include", type=Path, action="append", default=[], metavar="DIR",
         help="a folder of headers; may be repeated",
@@ -182,7 +184,7 @@ def call_dll(options: argparse.Namespace) -> int:
 
 
 def call_compile(options: argparse.Namespace) -> int:
-    used = compile_model(options.source, options.include, options.out)
+    used = compile_model(options.sources, options.include, options.out)
     told, rows = described(options.out)
     print(f"{options.out}: {', '.join(x.name for x in used)}", told, sep="\n")
     heads = ("in a map", "width, default", "unit", "description")

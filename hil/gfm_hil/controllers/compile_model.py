@@ -15,13 +15,13 @@ _WINDOWS = Path(__file__).parent / "windows"
 _MAIN = re.compile(r"^\s*(int|void)\s+main\s*\(", re.MULTILINE)
 
 
-def compile_model(source: Path, include: Sequence[Path], library: Path) -> list[Path]:
-    """Compile a C file, or those of a folder that have no ``main``, to a shared library.
+def compile_model(sources: Sequence[Path], include: Sequence[Path], library: Path) -> list[Path]:
+    """Compile C files, and those of folders that have no ``main``, to a shared library.
 
     What they take from ``windows.h`` is that of ``controllers/windows``.
 
     Args:
-        source: the file or folder.
+        sources: files and folders.
         include: folders of further headers.
         library: what is written.
 
@@ -35,13 +35,14 @@ def compile_model(source: Path, include: Sequence[Path], library: Path) -> list[
     for folder in include:
         if not folder.is_dir():
             raise UserError(f"{folder}: is no folder of headers")
-    if source.is_dir():
-        every = sorted(source.glob("*.c"))
-        used = [x for x in every if not _MAIN.search(x.read_text("utf-8", "replace"))]
-    else:
-        used = [source] if source.is_file() else []
-    if not used:
-        raise UserError(f"{source}: must be a C file, or a folder with C files that have no main")
+    used: list[Path] = []
+    for source in sources:
+        every = sorted(source.glob("*.c")) if source.is_dir() else []
+        found = [x for x in every if not _MAIN.search(x.read_text("utf-8", "replace"))]
+        found += [source] if source.is_file() else []
+        if not found:
+            raise UserError(f"{source}: must be a C file, or a folder with C files without main")
+        used += found
     if shutil.which("gcc") is None:
         raise UserError("gcc is not there; apt-get install gcc")
     folders = [f"-I{x.absolute()}" for x in (_WINDOWS, *include)]

@@ -120,8 +120,6 @@ class DllController(MappedController):
         UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
 
-    gives_state = True
-
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
         self._of, info = _opened(path)
@@ -140,6 +138,8 @@ class DllController(MappedController):
         step_s, self._T_s = declared or ports.step_s or context.T_s, context.T_s
         self._every = ticks_a_step(where, step_s, context.T_s)
         self._frame = Frame(context, self._every)
+        # one that declares none keeps it in variables of its own
+        self.gives_state = info.NumIntStates + info.NumFloatStates + info.NumDoubleStates > 0
         self._states = (
             np.zeros(max(info.NumIntStates, 1), np.int32),
             np.zeros(max(info.NumFloatStates, 1), np.float32),

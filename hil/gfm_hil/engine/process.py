@@ -98,7 +98,7 @@ def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
         raise UserError(f"mode = 'realtime': {external.name} keeps no time; choose --mode lockstep")
     if (scenario.snapshot is not None or scenario.start_from) and not external.gives_state:
         key = "snapshot" if scenario.start_from is None else "start_from"
-        raise UserError(f"{key}: {external.name} has no interface that gives its state")
+        raise UserError(f"{key}: {external.name} gives no state, so it has no snapshot")
     try:
         found = SteppedController(
             external, bench.controller, bench.u, gains_of(scenario, bench.controller.omega_b)

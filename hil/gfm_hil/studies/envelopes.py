@@ -30,9 +30,6 @@ from pydantic import ConfigDict, Field
 from scipy.optimize import least_squares
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario import Scenario, load_scenario
-from gfm_plant import make_plant
 
 Vector = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -44,7 +41,6 @@ _TUNNEL_S, _TUNNEL_FROM = 0.3, 0.02  # s; how the tunnel opens
 _T_90 = 0.01  # s; reactive current after a step of the grid's voltage
 _HALF, _HALF_S, _HALF_LEAST = 0.5, 0.03, 0.005  # after an SCR jump: of the change, s, p.u.
 _WIDE_S = 0.08  # s; until when its upper limit is wider
-_REST_S, _SAMPLES = 0.1, 4000  # before the jump of a measurement, and at most in its fit
 
 
 @dataclass(frozen=True)
@@ -426,44 +422,6 @@ def fit_ramp(t: Vector, change: Vector, rate: float, settled_s: float) -> tuple[
         )
     slope, level = np.polyfit(t[used], change[used], 1)
     return float(-slope / rate), float(-level / (2 * rate))
-
-
-def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) -> Unit:
-    """D, H and X_eff of a converter, fitted to its power after a phase jump.
-
-    Args:
-        start: scenario, of which no event counts; its line is not part of X_eff, but
-            its transformer is.
-        degrees: of the jump; a small one, so that nothing limits and nothing bends.
-        seconds: of the fit, after the jump.
-
-    Raises:
-        UserError: a mistake, a run that does not complete, or no swing equation fits.
-    """
-    if not (0 < abs(degrees) <= 30 and 0.1 <= seconds <= 60):
-        raise UserError(
-            f"degrees = {degrees:g}, seconds = {seconds:g}: must lie in [-30, 30] without 0, and "
-            "in [0.1, 60]"
-        )
-    kept = {"inner", "T_s", "seed", "references", "plant", "law"}
-    content = start.model_dump(mode="json", exclude_none=True, include=kept)
-    jump = {"type": "grid-phase-jump", "t": _REST_S, "degrees": degrees}
-    more = {"title": start.title, "duration": _REST_S + seconds, "events": [jump]}
-    made = run_in_memory(load_scenario(content | more, in_process=True))
-    if made.status not in ("completed", "oscillating"):
-        reason = made.summary["reason"]
-        raise UserError(f"the run after the jump ended as {made.status}: {reason}")
-    par, lcl = make_plant(start.plant, start.T_s).par[0], start.plant.lcl
-    first, cycle = round(_REST_S / start.T_s), round(2 * math.pi / par["omega_b"] / start.T_s)
-    p = made.signals["p"]
-    # a mean over one cycle takes the offset of the line's current out of it
-    means = np.convolve(p - p[first - 1], np.ones(cycle) / cycle, "valid")[first - cycle // 2 :]
-    t = np.asarray(start.T_s * np.arange(len(means)), float)
-    every = max(1, len(t) // _SAMPLES)
-    return fit_jump(
-        t[::every], means[::every], math.radians(degrees), float(par["omega_b"]),
-        float(par["L_g"]) - (lcl.L if lcl else 0.0), 1.5 * cycle * start.T_s,
-    )  # fmt: skip
 
 
 def _reactance(scr: float) -> float:

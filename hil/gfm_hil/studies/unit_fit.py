@@ -22,8 +22,10 @@ from scipy.stats import t as student
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.foreign import ABOUT
 from gfm_hil.recording.run import Run
+from gfm_hil.run.runner import run_in_memory
+from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.scenario.events.phase_jump import PhaseJump
-from gfm_hil.studies.envelopes import fit_swing, modes
+from gfm_hil.studies.envelopes import Unit, fit_swing, modes
 from gfm_plant import make_plant
 
 Vector = NDArray[np.float64]
@@ -31,6 +33,7 @@ Vector = NDArray[np.float64]
 _SKIP = 1.5  # cycles after the jump: the circuit's own transient
 _LAGS = 5.0  # of a meter, after which its own transient is gone
 _FAR = 30.0  # of the logarithm of an interval's end
+_REST_S = 0.2  # before the jump of a measurement
 _ORDERS = 5  # of the autoregression, less one
 
 
@@ -135,6 +138,35 @@ def fit_run(run: Run) -> UnitFit:
         )
     left = float(np.sqrt(np.mean(best.fun[len(seen.before) :] ** 2)))
     return UnitFit(D, H, X_eff, interval, noise, left)
+
+
+def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) -> Unit:
+    """D, H and X_eff of a converter, fitted to its power after a phase jump.
+
+    Args:
+        start: scenario, of which no event counts; its line is not part of X_eff, but
+            its transformer is.
+        degrees: of the jump; a small one, so that nothing limits and nothing bends.
+        seconds: of the fit, after the jump.
+
+    Raises:
+        UserError: a mistake, a run that does not complete, or no swing equation fits.
+    """
+    if not (0 < abs(degrees) <= 30 and 0.5 <= seconds <= 60):
+        raise UserError(
+            f"degrees = {degrees:g}, seconds = {seconds:g}: must lie in [-30, 30] without 0, and "
+            "in [0.5, 60]"
+        )
+    kept = {"inner", "T_s", "seed", "references", "plant", "law"}
+    content = start.model_dump(mode="json", exclude_none=True, include=kept)
+    jump = {"type": "grid-phase-jump", "t": _REST_S, "degrees": degrees}
+    more = {"title": start.title, "duration": _REST_S + seconds, "events": [jump]}
+    made = run_in_memory(load_scenario(content | more, in_process=True))
+    if made.status not in ("completed", "oscillating"):
+        reason = made.summary["reason"]
+        raise UserError(f"the run after the jump ended as {made.status}: {reason}")
+    fit = fit_run(made)
+    return Unit(fit.D, fit.H, fit.X_eff)
 
 
 def _around_jump(run: Run) -> _Recorded:

@@ -174,6 +174,11 @@ def test_phases_of_a_library_written_for_windows(exported, tmp_path, capsys):
         place.mkdir()
         options = [*options, str(tmp_path / "map.toml")] if options else []
         runs[kind] = run(place, f"{kind}:{tmp_path / out}", *options, **content)
+    scenario, map_file = tmp_path / "dll" / "scenario.toml", str(tmp_path / "map.toml")
+    scenario.write_text(f"snapshot = 0.05\n{scenario.read_text()}")
+    model = ["--controller", f"dll:{tmp_path / 'dll.so'}", "--map", map_file]
+    assert main(["run", str(scenario), *model, "--out", str(tmp_path / "cut")]) == 2
+    assert "snapshot: dll phases gives no state, so it has no snapshot" in capsys.readouterr().err
     assert np.ptp(runs["c"].columns["true_p"][:]) > 0.05
     for name in ("true_p", "true_q", "u_E_u", "u_E_q", "u_i_u", "u_omega_u"):
         a, b = (one.columns[name][:] for one in runs.values())
@@ -398,7 +403,7 @@ def test_a_file_that_is_no_model_is_refused(model, message, tmp_path):
 @pytest.mark.parametrize(
     ("source", "more", "message"),
     [
-        ("none", [], "none: must be a C file, or a folder with C files that have no main"),
+        ("none", [], "none: must be a C file, or a folder with C files without main"),
         ("x.c", ["-I", "nowhere"], "nowhere: is no folder of headers"),
         ("x.c", [], "x.c:1:10: fatal error: nothing.h: No such file"),
         ("y.c", [], "undefined reference to `missing'"),

@@ -1,6 +1,8 @@
 """Networks of several models, and runs that go on from a snapshot: the bits of the run that was not
 cut."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from gfm_hil.run import runner
 from gfm_plant import plant_sample
 from gfm_runtime.switchover import settle_into
 
+EMTHUB = Path(__file__).parents[3] / "examples" / "emthub"
 RIG = {"dc_source": {"mode": "regulated"}}
 CUT = 500  # tick of the snapshot
 T_S = 1e-4
@@ -92,6 +95,36 @@ def test_two_dlls_and_a_law_in_a_network_and_their_snapshot(exported, tmp_path, 
     ours = gfmhil.run_network(network())
     for name, run in whole.items():
         check_equal(run, ours[name], 0, OF_LAWS if name != "C" else set())
+
+
+@compiles
+@pytest.mark.parametrize("whose", ["tests", "EPRI's"])
+def test_a_model_of_others_beside_ours_and_a_law(exported, foreign, whose, tmp_path):
+    """EPRI's is ``GFMHIL_EMTHUB_MODEL``, compiled from one's own checkout: see examples/emthub."""
+    from .test_controllers import MAP
+
+    map_, changes = tmp_path / "map.toml", dict[str, Any]()
+    map_.write_text(MAP + "parameters.droop = 2e-4\n")
+    if whose != "tests":
+        foreign, map_ = os.environ.get("GFMHIL_EMTHUB_MODEL", ""), EMTHUB / "gfm.toml"
+        if not foreign:
+            pytest.skip("GFMHIL_EMTHUB_MODEL is not set")
+        plant = RIG | {"converter": str(EMTHUB / "converter.toml"), "modulation": "space-vector"}
+        changes = {"T_s": 1e-5, "inner": "virtual-stator", "plant": plant}
+    T_s, inner = changes.get("T_s", T_S), changes.get("inner", "none")
+    how = {
+        "controllers": {"A": f"dll:{foreign}", "B": exported("dll", "droop-5", inner)},
+        "ports": {"A": map_}, "figures": False,
+    }  # fmt: skip
+    more = changes | {"duration": 1000 * T_s, "snapshot": CUT * T_s}
+    whole = gfmhil.run_network(network(**more), tmp_path / "cut", **how)
+    assert {run.ticks for run in whole.values()} == {1000}  # none trips
+    assert len({run.summary["controller"] for run in whole.values()}) == 3
+    rest = changes | {"duration": 500 * T_s, "events": steps(700 - CUT, converter="A")}
+    rest["events"][0]["P_ref"] = network()["events"][1]["P_ref"]
+    rest["start_from"] = str(tmp_path / "cut")
+    for name, run in gfmhil.run_network(network(**rest), tmp_path / "rest", **how).items():
+        check_equal(run, whole[name], CUT, OF_TIME | (OF_LAWS if name != "C" else set()))
 
 
 @compiles

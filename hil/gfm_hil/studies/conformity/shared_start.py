@@ -21,6 +21,7 @@ from gfm_hil.recording.run import Run, bases
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import Scenario
 
+_HELD = 1e-9  # p.u.; by so much a voltage that is held may differ, by rounding
 CHECKED_S = 0.05  # how long a run from the snapshot has to repeat the start, s
 _FREE = {"title", "description", "duration", "events"}  # what may differ after the start
 
@@ -120,8 +121,18 @@ def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | N
 def _of_bridge(columns: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
     """Angle and frequency of the bridge's voltage, in place of the frame's: a controller that
     commands phases has the frame turn at one speed, and they show nothing of it."""
-    angle = np.unwrap(np.arctan2(columns["u_E_q"], columns["u_E_u"]))
-    speed = np.gradient(angle, bases(scenario).omega_b * scenario.T_s)
+    radians = bases(scenario).omega_b * scenario.T_s
+    e = columns["u_E_u"] + 1j * columns["u_E_q"]
+    angle = np.unwrap(np.angle(e))
+    # a voltage that is held for several ticks turns back in the frame in the meantime
+    held = np.abs(e[1:] - e[:-1] * np.exp(-1j * radians * columns["true_omega_u"][0])) < _HELD
+    new = 1 + np.flatnonzero(~held)
+    if len(new) > 1:
+        at, there = (
+            np.pad(x[new], 1, "reflect", reflect_type="odd") for x in (columns["tick"], angle)
+        )
+        angle = np.interp(columns["tick"], at, np.unwrap(there))
+    speed = np.gradient(angle, radians)
     return {
         "true_delta": columns["true_delta"] + angle,
         "true_omega_u": columns["true_omega_u"] + speed,

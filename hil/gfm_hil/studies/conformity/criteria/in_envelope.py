@@ -16,7 +16,8 @@ from gfm_hil.scenario.events.grid_impedance import GridImpedance
 from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.conformity.criteria.base import Moment, UnderTest, Vector, Windowed
 from gfm_hil.studies.conformity.verdict import CONSISTENT, Verdict
-from gfm_hil.studies.envelopes import Envelope, Unit, measure_unit, phase_jump, rocof, scr_jump
+from gfm_hil.studies.envelopes import Envelope, Unit, phase_jump, rocof, scr_jump
+from gfm_hil.studies.unit_fit import measure_unit
 
 _CURVE = 600  # points of a limit in the figure
 
