@@ -137,6 +137,8 @@ def call(options: argparse.Namespace) -> int:
         return 0
     if options.recording is not None:
         return _recording(options)
+    if options.part is not None:
+        raise UserError("--part: is of a --recording; name the test alone")
     if not options.law and options.controller is None and options.network is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
     laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]

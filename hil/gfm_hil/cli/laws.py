@@ -118,9 +118,10 @@ def call(options: argparse.Namespace) -> int:
 
 
 def call_import(options: argparse.Namespace) -> int:
-    for record in read_dyr(options.file):
-        law = record.law(*options.impedance)
-        print(law.save(Path(options.out) / f"{law.name}.toml"))
+    laws, folder = [x.law(*options.impedance) for x in read_dyr(options.file)], Path(options.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for law in laws:
+        print(law.save(folder / f"{law.name}.toml"))
     return 0
 
 

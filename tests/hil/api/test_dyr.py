@@ -81,6 +81,9 @@ def test_the_record_of_a_law_read_again_has_the_swing_of_the_law(tmp_path, model
     assert swing == pytest.approx(-2.93 + 23.08j, abs=0.01)
     assert abs(theirs - swing).min() < apart * abs(swing)
     capsys.readouterr()
+    new = tmp_path / "laws" / "new"
+    assert main(["laws", "import", str(path), "--impedance", "0.03", "0.15", "-o", str(new)]) == 0
+    assert Law.load(next(new.iterdir())).gains == law.gains
 
 
 @pytest.mark.parametrize("name", ["regfm-a1", "regfm-b1"])
