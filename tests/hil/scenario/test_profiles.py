@@ -155,6 +155,8 @@ def test_a_recorded_voltage_is_played_as_the_grid_that_made_it(tmp_path):
     (tmp_path / "map.toml").write_text(
         'S_n = 4e3\nV_n = 380.0\nv.phases = ["va", "vb", "vc"]\ni.phases = ["va", "vb", "vc"]\n'
     )
+    with pytest.raises(UserError, match=r"site\.mat: f = 2.* p\.u\..* must lie in \[0\.8, 1\.2\]"):
+        gfmhil.grid_profile(tmp_path / "site.mat", tmp_path / "map.toml", tmp_path / "no", f_n=25.0)
     file = gfmhil.grid_profile(tmp_path / "site.mat", tmp_path / "map.toml", tmp_path / "grid.csv")
     played = [{"t": 0.0, "type": "grid-profile", "file": str(file)}]
     again = gfmhil.run(asked | {"events": played}, "vsg-2")

@@ -59,8 +59,10 @@ def grid_profile(
         raise UserError(
             f"{file}: would make {count} lines: must be <= {MOST_LINES}; give a larger T_s"
         )
-    if s.vectors:  # what a jump makes of the frequency, the column degrees makes up for
-        columns["omega_g"] = np.clip(columns["omega_g"], *RANGES["omega_g"])
+    low, high = RANGES["omega_g"]
+    if s.vectors and low <= np.median(columns["omega_g"]) <= high:
+        # what a jump makes of the frequency, the column degrees makes up for
+        columns["omega_g"] = np.clip(columns["omega_g"], low, high)
     for name, said in ("omega_g", "f"), ("V_g", "V"):
         low, high = RANGES[name]
         x = columns[name]
