@@ -1,8 +1,8 @@
 """What a page of the scope costs the loop: a network in real time, with and without a page in turn.
 
 One run of four converters with its scope and one headless Chromium. In every round the browser
-shows the page for a while and then an empty one; the misses are counted from the recording of each
-turn, and the pictures are those that the page has drawn.
+shows the page for a while and then an empty one; misses and round trips are those of the recording
+of each turn, and the pictures are those that the page has drawn.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from gfm_hil.realtime.environment import environment
 from gfm_hil.recording.live import LiveRun
-from gfm_hil.recording.timing import count_misses
+from gfm_hil.recording.timing import PERCENTILES, ROUND_TRIP, count_misses
 
 PAGE, NONE = "with a page", "without"
 _SETTLE_S = 3.0  # of each turn, which do not count
@@ -71,7 +71,8 @@ def browser() -> Any:
 
 
 def turn(driver: Any, address: str, runs: list[LiveRun], seconds: float) -> dict[str, Any]:
-    """Show a page for a while; ticks and misses of all converters, and pictures a second."""
+    """Show a page for a while; ticks, misses and round trips of all converters, µs, and pictures a
+    second."""
     driver.get(address)
     time.sleep(_SETTLE_S)
     begin, began = [run.done("plant") for run in runs], time.monotonic()
@@ -87,7 +88,12 @@ def turn(driver: Any, address: str, runs: list[LiveRun], seconds: float) -> dict
         for run, first, last in zip(runs, begin, end, strict=True)
     ]
     ticks = sum(last - first for first, last in zip(begin, end, strict=True))
-    return {"ticks": ticks, "missed": sum(missed), "pictures": pictures}
+    trips = [
+        ROUND_TRIP.us(run.columns, run.T_s, first, last)
+        for run, first, last in zip(runs, begin, end, strict=True)
+    ]
+    trip = np.concatenate(trips)
+    return {"ticks": ticks, "missed": sum(missed), "trip": trip[trip == trip], "pictures": pictures}
 
 
 def measure(seconds: float, rounds: int) -> dict[str, Any]:
@@ -118,8 +124,7 @@ def measure(seconds: float, rounds: int) -> dict[str, Any]:
             driver.quit()
             process.terminate()
             process.wait()
-    return {"turns": turns, "rows": [row(kind, turns[kind]) for kind in turns],
-            "environment": environment()}  # fmt: skip
+    return {"rows": [row(kind, turns[kind]) for kind in turns], "environment": environment()}
 
 
 def row(kind: str, turns: list[dict[str, Any]]) -> dict[str, Any]:
@@ -127,6 +132,8 @@ def row(kind: str, turns: list[dict[str, Any]]) -> dict[str, Any]:
     ticks, missed = (sum(one[key] for one in turns) for key in ("ticks", "missed"))
     pictures = [rate for one in turns for rate in one["pictures"]]
     found = {"what": kind, "ticks": ticks, "missed": missed, "missed_pct": 100 * missed / ticks}
+    trip = np.percentile(np.concatenate([one["trip"] for one in turns]), [*PERCENTILES.values()])
+    found["trip_us"] = dict(zip(PERCENTILES, trip.tolist(), strict=True))
     found["by_turn_pct"] = [round(100 * one["missed"] / one["ticks"], 3) for one in turns]
     if pictures:
         p5, p50 = np.percentile(pictures, (5, 50))
@@ -144,13 +151,15 @@ def main() -> None:
     if options.json:
         print(json.dumps(found))
         return
+    print(f"| | ticks | missed | round trip {', '.join(PERCENTILES)}, µs | frames a second, 5 % |")
+    print("|---|--:|--:|--:|--:|")
     for one in found["rows"]:
+        trip = ", ".join(f"{x:.3g}" for x in one["trip_us"].values())
         rate = one.get("frames_per_s")
-        said = f", {rate['p50']:.0f} frames/s (5 %: {rate['p5']:.0f})" if rate else ""
-        print(
-            f"{one['what']}: {one['missed']} of {one['ticks']} ticks missed, "
-            f"{one['missed_pct']:.3f} %, by turn {one['by_turn_pct']}{said}"
-        )
+        said = f"{rate['p50']:.0f}, {rate['p5']:.0f}" if rate else "–"
+        print(f"| {one['what']} | {one['ticks']} | {one['missed_pct']:.3f} % | {trip} | {said} |")
+    turns = [", ".join(f"{x:g}" for x in one["by_turn_pct"]) for one in found["rows"]]
+    print(f"\nMissed turn by turn, %: {found['rows'][0]['what']} {turns[0]}; without {turns[1]}.")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ _LONGEST = 1 << 17  # bytes of an entry, at most: a name and an extra field of 6
 def check_empty(folder: Path) -> None:
     """Raise UserError if a folder to write to holds something already, or is none."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder}: is not empty; choose another folder (--out)")
+        raise UserError(f"{folder}: is not empty; choose another folder")
 
 
 def open_file(path: Path, most: int | None = None) -> io.BufferedReader:

@@ -14,7 +14,9 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
+from gfm_hil.realtime.environment import available_memory
 from gfm_hil.realtime.priority import processors
+from gfm_hil.recording.columns import bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events
 from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.scenario import Scenario
@@ -106,6 +108,7 @@ class Processes:
             UserError: a process refused to start, for example because the endpoint is occupied.
         """
         self._places = {name: self.folder / name for name in self.scenario.parts or [""]}
+        recording = self._recording()
         with contextlib.ExitStack() as stack:
             endpoints = {}
             for name in self._places:
@@ -120,7 +123,7 @@ class Processes:
                     keep_in_memory(
                         self._places[name], self.scenario.ticks, self.notice, flows=flows
                     )
-            self._say_what_starts()
+            self._say_what_starts(recording)
             self._plant = _Process("plant", "plant", self.folder, self._plant_command(endpoints))
             self._controllers = {
                 name: _Process(
@@ -143,7 +146,22 @@ class Processes:
                         process.popen.wait()
         return began, self._judge()
 
-    def _say_what_starts(self) -> None:
+    def _recording(self) -> float:
+        """What a run in real time records in memory, which it locks, GB; 0 in lockstep. Raises
+        UserError: there is less."""
+        if self.scenario.mode != "realtime":
+            return 0.0
+        of_each = len(self._places) * bytes_per_tick() + 8 * len(self.scenario.flows)
+        needed, free = self.scenario.ticks * of_each / 1e9, available_memory() / 1e9
+        if needed > free:
+            raise UserError(
+                f"duration = {self.scenario.duration:g}: in real time the recording takes "
+                f"{needed:.1f} GB of memory, and {free:.1f} GB are free; run for a shorter time"
+                + (", or record less by network.record" if self.scenario.flows else "")
+            )
+        return needed
+
+    def _say_what_starts(self, recording: float) -> None:
         loops, room = len(self._places) + 1, processors()
         if self.scenario.mode == "realtime" and loops > max(room, 2):
             self.notice(
@@ -155,6 +173,8 @@ class Processes:
         if self.scenario.mode == "realtime":
             end = time.strftime("%H:%M:%S", time.localtime(time.time() + self.scenario.duration))
             lasts = f": {self.scenario.duration:g} s in real time, to about {end}; Ctrl-C ends it"
+            if recording >= 1.0:
+                lasts += f"; the recording takes {recording:.1f} GB of memory"
         self.notice(f"starting {which} and plant{lasts} …")
 
     def _ours(self, role: Role, folder: Path) -> list[str]:

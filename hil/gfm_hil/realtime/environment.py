@@ -1,5 +1,6 @@
 """What timing on this machine depends on: its badge, and caveats for readers of its times."""
 
+import math
 import os
 import platform
 import re
@@ -124,6 +125,12 @@ def _done(work: Callable[[], None]) -> bool:
     except OSError:
         return False
     return True
+
+
+def available_memory() -> float:
+    """What this machine has left for processes, bytes; infinite where it does not say."""
+    left = re.search(r"^MemAvailable:\s*(\d+) kB", _read(Path("/proc/meminfo")) or "", re.M)
+    return 1024.0 * int(left[1]) if left else math.inf
 
 
 def _mlock() -> str:

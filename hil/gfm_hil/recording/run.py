@@ -344,7 +344,8 @@ def nominal_frequency(scenario: Scenario) -> float:
 def _written_by_another(folder: Path) -> str:
     """What a refusal adds if another version of gfmhil has written the folder."""
     try:
-        then, now = printable(written_by(folder))[:40], version("gfmhil")
+        one = next(iter(converters_of(folder)), "")  # of a network, whose own summary does not say
+        then, now = printable(written_by(folder / one))[:40], version("gfmhil")
     except (OSError, UserError):
         return ""
     return "" if then == now else f"; gfmhil {then} has written it, and this is {now}"

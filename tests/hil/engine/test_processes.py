@@ -11,8 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
+from gfm_hil.core.stopping import Interrupt
+from gfm_hil.engine.processes import Processes
 from gfm_hil.recording.parts import RolePart
+from gfm_hil.scenario import load_scenario
 
 from ...support.processes import (
     end,
@@ -120,6 +124,23 @@ def test_both_roles_started_by_hand_over_tcp(start, tmp_path):
     (tmp_path / "plant" / "summary.json").write_text(json.dumps(found | {"run": "another"}))
     code, _, err = end(start("merge", "plant", "controller"))
     assert code == 2 and "are not of the same run: run = 'another', " in err
+
+
+def test_a_recording_beyond_the_memory_of_the_machine_is_refused(tmp_path, monkeypatch):
+    """9e6 ticks of y and u at least, 8 bytes each, of each converter; 1 GB is left."""
+    monkeypatch.setattr("gfm_hil.engine.processes.available_memory", lambda: 1e9)
+    scenario = load_scenario(
+        "three_share_a_load", mode="realtime", duration=900.0, T_s=1e-4, link={"type": "shm"}
+    )
+    with pytest.raises(UserError) as problem:
+        Processes(scenario, tmp_path / "run", print, print, Interrupt(), {}).run()
+    said = re.fullmatch(
+        r"duration = 900: in real time the recording takes (\S+) GB of memory, and 1\.0 GB are "
+        "free; run for a shorter time",
+        str(problem.value),
+    )
+    assert said is not None and float(said[1]) > 3 * 9e6 * 8 * 8 / 1e9
+    assert not (tmp_path / "run").exists()
 
 
 def test_real_time_runs_to_its_end_and_records_its_timing(start, tmp_path):
