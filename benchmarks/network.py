@@ -5,7 +5,8 @@ Every converter runs VSG-2 behind its own feeder to one bus with a load, and all
 process does is in the tick: the plant, the controllers, the recording. ``--case case39`` has a
 published case instead, with converters at the buses of ``--converters``, and ``--bridges`` the
 paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts, and
-four converters on feeders of which none, one or all are switched.
+four converters on feeders of which none, one or all are switched. ``--record`` has each number of
+converters twice, the second time with all that ``network.record`` can name.
 Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
@@ -31,7 +32,9 @@ from gfm_hil.scenario import Scenario, load_scenario
 TICKS = 100_000  # of all converters of a case in a round
 
 
-def star(n: int, switched: int = 0, bridge: dict[str, Any] | None = None) -> Scenario:
+def star(
+    n: int, switched: int = 0, bridge: dict[str, Any] | None = None, record: tuple[str, ...] = ()
+) -> Scenario:
     """n converters on feeders, the first of which have a switched bridge."""
     own = [{"plant": {"bridge": bridge}} if k < switched else {} for k in range(n)]
     names = [f"c{k}" for k in range(n)]
@@ -40,6 +43,7 @@ def star(n: int, switched: int = 0, bridge: dict[str, Any] | None = None) -> Sce
             "title": f"{n} converters", "duration": 10.0, "law": "vsg-2",
             "link": {"type": "inproc"},
             "network": {
+                "record": [*record],
                 "converters": {
                     name: {"node": f"at_{name}", **more}
                     for name, more in zip(names, own, strict=True)
@@ -96,6 +100,7 @@ class Case:
         n = len(benches)
         self.ticks = max(100, min(CHUNK, TICKS // n))
         self.rows = rows(n, self.ticks, benches[0].inner, benches[0].options)
+        self.flows = np.empty((self.ticks, len(benches[0].flows)))
         self.stack, self.plant = stack(benches), benches[0].plant
         self.kept = self.plant.copy()
         self.arrays = [*self.stack.controllers, self.stack.y, self.stack.u]
@@ -114,7 +119,9 @@ class Case:
         for array, old in zip(self.arrays, self.start, strict=True):
             array[:] = old
         began = time.thread_time()
-        done = run_ticks(self.plant.records, self.stack, *self.rows, 0, self.ticks)
+        done = run_ticks(
+            self.plant.records, self.stack, *self.rows, 0, self.ticks, flows=self.flows
+        )
         self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
         if done != self.ticks:
             raise SystemExit(f"{self.name}: the run ended at tick {done}")
@@ -171,6 +178,7 @@ def main() -> None:
     parser.add_argument("--case", help="a published case instead, such as case39")
     parser.add_argument("--converters", default="30", help="its buses with converters")
     parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
+    parser.add_argument("--record", action="store_true", help="with and without network.record")
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
     if asked.case:
@@ -179,6 +187,12 @@ def main() -> None:
             cases = [Case(asked.case, scenario)]
     elif asked.bridges:
         cases = [Case(name, scenario) for name, scenario in rigs().items()]
+    elif asked.record:
+        cases = [
+            Case("all recorded" if record else "feeders", star(int(n), record=record))
+            for n in asked.sizes.split(",")
+            for record in ((), ("all",))
+        ]
     else:
         cases = [Case("feeders", star(int(n))) for n in asked.sizes.split(",")]
     for _ in range(asked.rounds):
@@ -199,6 +213,12 @@ def main() -> None:
             f"| {case.name} | {sizes} | {case.way} | {case.set_up:.2g} | {least:.3g} |"
             f" {middle:.3g} | {100 / least:.3g} |{theirs}"
         )
+    if asked.record:
+        for plain, case in zip(cases[::2], cases[1::2], strict=True):
+            ratio = np.median(np.divide(case.ns, plain.ns))
+            print(
+                f"{case.sizes[0]} converters: {case.flows.shape[1]} columns, {ratio:.3f} of a tick"
+            )
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from asammdf import MDF
 from pyarrow import parquet
 from scipy.io import loadmat
 
+import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import (
@@ -102,6 +103,19 @@ def test_mat_is_read_again_as_it_was(table, tmp_path):
     assert [int(t) for t in found["events"]["tick"]] == [e["tick"] for e in table.events]
     assert "phase jump 1°" in list(found["events"]["text"])
     assert found["scenario"] == table.text("scenario.toml")
+
+
+def test_parquet_holds_the_currents_of_a_network(tmp_path):
+    """Those that ``network.record`` names, in the folder of the first converter."""
+    network = {"network__record": ["feeder", "base"], "duration": 0.02, "events": []}
+    run = gfmhil.run_network("three_share_a_load", tmp_path / "run", **network)
+    names = [n for n in run.flows if n not in ("t", "tick")]
+    export_run(tmp_path / "run" / "A", "parquet", tmp_path / "run.parquet")
+    found = parquet.read_table(tmp_path / "run.parquet")
+    assert {"feeder.P", "feeder.end.i_im", "base.Q"} <= {*names} <= {*found.column_names}
+    for name in names:
+        assert same(found[name].to_numpy(), np.asarray(run.flows[name][:])), name
+    assert found.schema.field("feeder.P").metadata[b"unit"] == b"p.u. (S_n)"
 
 
 def test_parquet_is_read_again_as_it_was(table, tmp_path):
