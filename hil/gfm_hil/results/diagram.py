@@ -16,7 +16,7 @@ from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.results.figures import as_svg, in_a_page
-from gfm_hil.results.single_line import Bar, bars_of, converters_of, give_lanes, give_rows
+from gfm_hil.results.single_line import Bar, bars_of, collide, converters_of, give_lanes, give_rows
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
@@ -61,6 +61,7 @@ def fill_diagram(
     figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
 ) -> Axes:
     """Fill a figure, whose size it sets, with the diagram; events that make faults are marked.
+    Where columns do not hold a mesh it is as ``fill_narrow`` has it.
 
     Args:
         report: address of the page on whose curves converters and lines are links, a line on those
@@ -71,6 +72,8 @@ def fill_diagram(
     plants, laws, nodes = converters_of(scenario)
     bars, lines = bars_of(scenario, nodes)
     top = give_rows(bars, lines)
+    if collide(bars, lines):
+        return fill_narrow(figure, scenario, report, leads_to)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
     figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

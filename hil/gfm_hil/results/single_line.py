@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario
@@ -102,6 +103,20 @@ def give_rows(bars: Mapping[str, Bar], lines: Lines, stacked: bool = False) -> i
         row += count
         done.add(name)
     return row
+
+
+def collide(bars: Mapping[str, Bar], lines: Lines) -> bool:
+    """Whether two nodes of a column would share rows, which have them, as in meshes: their bars
+    would look like one."""
+    taken: dict[int, list[tuple[int, int]]] = {}
+    for name, bar in bars.items():
+        rows = [*bar.rows, *(row for row, *ends in lines.values() if name in ends[:2])]
+        taken.setdefault(bar.column, []).append((min(rows), max(rows)))
+    return any(
+        later[0] <= earlier[1]
+        for column in map(sorted, taken.values())
+        for earlier, later in pairwise(column)
+    )
 
 
 def give_lanes(bars: Mapping[str, Bar], lines: Lines) -> dict[str, int]:

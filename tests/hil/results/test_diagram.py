@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -139,6 +140,10 @@ def test_every_shipped_scenario_is_drawn_within_its_picture(name, fill):
     figure = Figure()
     axes = fill(figure, load_scenario(name))
     figure.draw_without_rendering()
+    bars = [(line.get_xdata()[0], *sorted(line.get_ydata()))
+            for line in axes.lines if line.get_linewidth() == 3.5]  # fmt: skip
+    for (x, _, top), (other_x, low, _) in pairwise(sorted(bars)):  # none is on another
+        assert x != other_x or low > top
     assert fill is fill_diagram or 72 * figure.get_figwidth() * 4 / 3 < 358  # pixels of a phone
     for text in axes.texts:
         box = text.get_window_extent().transformed(figure.transFigure.inverted())

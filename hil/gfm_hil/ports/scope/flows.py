@@ -5,7 +5,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from gfm_hil.ports.scope.watched import WatchedRun
-from gfm_hil.results.single_line import Bar, Lines, bars_of, converters_of, give_lanes, give_rows
+from gfm_hil.results.single_line import (
+    Bar,
+    Lines,
+    bars_of,
+    collide,
+    converters_of,
+    give_lanes,
+    give_rows,
+)
 from gfm_hil.scenario.events.breaker import GRID, switched
 from gfm_runtime.states import STATES
 
@@ -47,7 +55,7 @@ class Flows:
                 {"name": name, "row": row, "start": start, "end": end, "symbol": symbol}
                 for name, (row, start, end, symbol, *_) in lines.items()
             ],
-            "stacked": _stacked(bars, lines),
+            "mesh": collide(bars, lines), "stacked": _stacked(bars, lines),
         }  # fmt: skip
 
     @property

@@ -69,7 +69,7 @@ function heard(message) {
 }
 
 function draw() {
-  diagram = new Diagram(network, about.converter, narrow.matches);
+  diagram = new Diagram(network, about.converter, narrow.matches || network.mesh);
   if (flows) diagram.show(flows);
   get("network").lastElementChild.replaceChildren(diagram.element);
 }
