@@ -154,7 +154,8 @@ def main() -> None:
     print(f"| | ticks | missed | round trip {', '.join(PERCENTILES)}, µs | frames a second, 5 % |")
     print("|---|--:|--:|--:|--:|")
     for one in found["rows"]:
-        trip = ", ".join(f"{x:.3g}" for x in one["trip_us"].values())
+        us = one["trip_us"].values()
+        trip = ", ".join(np.format_float_positional(x, 3, fractional=False, trim="-") for x in us)
         rate = one.get("frames_per_s")
         said = f"{rate['p50']:.0f}, {rate['p5']:.0f}" if rate else "–"
         print(f"| {one['what']} | {one['ticks']} | {one['missed_pct']:.3f} % | {trip} | {said} |")
