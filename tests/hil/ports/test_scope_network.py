@@ -125,4 +125,12 @@ def test_four_converters_of_a_network(tmp_path):
         wait_for(lambda: breaker(page, "step") == "true")
         wait_for(lambda: sum(flow(page, name) for name in "ABCD") > before + 0.05)
         page.driver.save_screenshot(str(tmp_path / "network.png"))
+        size = {"width": 390, "height": 844, "deviceScaleFactor": 2, "mobile": True}
+        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        wide = "return document.querySelector('#network svg').viewBox.baseVal.width"
+        wait_for(lambda: page.js(wide) < 390)  # drawn anew
+        box = "const box = document.querySelector('#network');"
+        assert page.js(f"{box} return box.scrollWidth <= box.clientWidth")
+        assert breaker(page, "step") == "true" and all(flow(page, name) > 0.05 for name in "ABCD")
+        wait_for(lambda: page.js(f"{tip}.width") > 5 and page.js(f"{tip}.x") < 40)  # at the left
         assert page.complaints() == []
