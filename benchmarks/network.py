@@ -25,8 +25,11 @@ from typing import Any
 import numpy as np
 
 import gfmhil
-from gfm_hil.engine.inproc import CHUNK, rows, run_ticks, stack
+from gfm_hil.core.roles import Role
+from gfm_hil.engine.inproc import CHUNK, run_inproc, stack
 from gfm_hil.engine.setup import make_benches
+from gfm_hil.engine.timeline import TimelineInMemory
+from gfm_hil.recording.parts import Kept
 from gfm_hil.scenario import Scenario, load_scenario
 
 TICKS = 100_000  # of all converters of a case in a round
@@ -93,19 +96,24 @@ class Case:
     """A network ready to run the same ticks again and again."""
 
     def __init__(self, name: str, scenario: Scenario) -> None:
-        self.name = name
+        self.name, n = name, max(1, len(scenario.converters))
+        ticks = max(500, min(CHUNK, TICKS // n))
+        scenario = scenario.model_copy(update={"duration": ticks * scenario.T_s})
         began = time.process_time()
-        benches = make_benches(scenario)
+        self.benches = benches = make_benches(scenario)
         self.set_up = time.process_time() - began
-        n = len(benches)
-        self.ticks = max(100, min(CHUNK, TICKS // n))
-        self.rows = rows(n, self.ticks, benches[0].inner, benches[0].options)
-        self.flows = np.empty((self.ticks, len(benches[0].flows)))
-        self.stack, self.plant = stack(benches), benches[0].plant
-        self.kept = self.plant.copy()
-        self.arrays = [*self.stack.controllers, self.stack.y, self.stack.u]
-        self.start = [array.copy() for array in self.arrays]
+        roles: tuple[Role, ...] = ("plant", "controller")
+        what = ticks, benches[0].inner, benches[0].options
+        self.kept = [[Kept(role, *what, flows=b.flows) for b in benches] for role in roles]
+        stack(benches)
+        self.plant = benches[0].plant
+        self.start = self.plant.copy()
+        each = [bench.controller for bench in benches]
+        self.arrays = [a for c in each for a in (c.ctl, c.laws, c.states, c.est)]
+        self.arrays += [array for bench in benches for array in (bench.y, bench.u)]
+        self.old = [array.copy() for array in self.arrays]
         wiring = self.plant.wiring
+        self.ticks = ticks
         self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
         net = self.plant.net[0]
         self.way = "series" if net["sparse"] or net["n_units"] else "modes"
@@ -114,17 +122,18 @@ class Case:
         self.ns.clear()
 
     def round(self) -> None:
-        """Run ticks from the start, and keep what one took, in ns."""
-        self.plant.restore(self.kept)
-        for array, old in zip(self.arrays, self.start, strict=True):
+        """Run from the start as ``gfmhil.run`` does in memory; keep what a tick took, in ns."""
+        self.plant.restore(self.start)
+        for array, old in zip(self.arrays, self.old, strict=True):
             array[:] = old
+        timelines = [TimelineInMemory(bench) for bench in self.benches]
         began = time.thread_time()
-        done = run_ticks(
-            self.plant.records, self.stack, *self.rows, 0, self.ticks, flows=self.flows
-        )
+        done = run_inproc(self.benches, *self.kept, timelines, lambda ticks: True)
         self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
         if done != self.ticks:
             raise SystemExit(f"{self.name}: the run ended at tick {done}")
+        for timeline in timelines:
+            timeline.close()
 
 
 def dpsim(n: int, steps: int) -> float:

@@ -25,6 +25,8 @@ from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
 _PIECE = 1_000  # ticks of all converters that are recorded at a time, in the processor's cache
+# ticks of a network of many, for each of which Python sees to every converter at either place
+_LEAST_CHUNK, _LEAST_PIECE = 1_000, 100
 
 
 class Stack(NamedTuple):
@@ -142,7 +144,8 @@ def run_inproc(
     timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
     survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
-    chunk, piece = max(1, CHUNK // len(benches)), max(1, _PIECE // len(benches))
+    chunk = max(_LEAST_CHUNK, CHUNK // len(benches))
+    piece = max(_LEAST_PIECE, _PIECE // len(benches))
     controllers = stack(benches)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
     flows = np.empty((piece, len(bench.flows)))

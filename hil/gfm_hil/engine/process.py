@@ -91,7 +91,7 @@ def _stepped(external: ExternalController, bench: Bench) -> SteppedController:
     or the scenario has events that are about a law."""
     scenario = bench.scenario
     if not external.has_laws:
-        for event in scenario.events:
+        for event in scenario.sorted_events():
             if event.changes_law:
                 raise UserError(f"events, {event.label()}: {external.name} has a law of its own")
     elif scenario.mode == "realtime":

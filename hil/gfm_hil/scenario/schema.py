@@ -264,8 +264,8 @@ class Scenario(StrictSchema):
 
     @cached_property
     def each(self) -> dict[str, Scenario]:
-        """The scenario as each converter of the network sees it: with its law, references and
-        plant, and the events of the network and of itself; none without a network."""
+        """The scenario as each converter of the network sees it, with its law, references and
+        plant; none without a network."""
         if self.network is None:
             return {}
         given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
@@ -283,10 +283,7 @@ class Scenario(StrictSchema):
         def seen(name: str, member: NetworkConverter) -> Scenario:
             own = {key: getattr(member, key) for key in given}
             own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
-            events = [e for e in self.events if getattr(e, "converter", None) in (None, name)]
-            return self.model_copy(
-                update={**own, "network": network, "events": events, "converter": name}
-            )
+            return self.model_copy(update={**own, "network": network, "converter": name})
 
         return {name: seen(name, member) for name, member in members.items()}
 
@@ -330,8 +327,11 @@ class Scenario(StrictSchema):
         return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
-        """Events in order of their tick; within a tick in the order of the file."""
-        return sorted(self.events, key=lambda e: e.at(self.T_s))
+        """Events in order of their tick; within a tick in the order of the file. As a converter
+        sees them, those of the network and its own."""
+        others = {*self.converters} - {self.converter} if self.converter is not None else ()
+        ours = [e for e in self.events if getattr(e, "converter", None) not in others]
+        return sorted(ours, key=lambda e: e.at(self.T_s))
 
     def shifted(self, by_s: float) -> Scenario:
         """This scenario with its events ``by_s`` later (s; earlier if negative), and as much

@@ -19,6 +19,7 @@ from gfm_hil.recording.log import read_log
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import run_network
 from gfm_hil.scenario import find_scenario, load_scenario, scenario_toml, toml_text
+from gfm_runtime.signals import INNER
 
 from ...support.page import unpacked
 
@@ -405,12 +406,22 @@ def test_a_machine_and_a_converter_share_a_load_by_their_droops():
 def test_the_scenario_in_the_folder_of_a_converter_is_that_of_the_whole():
     given = content()
     given["network"]["converters"]["B"] |= {"law": "vsg-2", "inner": "virtual-stator"}
+    given["events"] = [{"t": 0.1, "type": "law", "law": "regfm-a1", "converter": "A"}]
     whole = load_scenario(given)
     part = load_scenario(tomllib.loads(scenario_toml(whole.each["B"])))
     assert part == whole.each["B"] and part.converter == "B"
+    assert (part.laws(), part.each["A"].laws()) == (["vsg-2"], ["droop-3", "regfm-a1"])
     for name in "AB":
         assert part.each[name] == whole.each[name].model_copy(update={"converter": name})
     assert (part.each["A"].law, part.each["A"].inner) == ("droop-3", None)
+
+
+def test_all_sides_of_a_network_carry_what_a_later_law_of_one_needs():
+    """So that the frames of the other converters have their length as well."""
+    later = {"t": 0.1, "type": "law", "law": "regfm-a1", "converter": "A"}
+    whole = load_scenario(content(events=[later]))
+    parts = [load_scenario(tomllib.loads(scenario_toml(one))) for one in whole.each.values()]
+    assert {one.carries for one in (whole, *whole.each.values(), *parts)} == {INNER}
 
 
 def test_a_load_of_constant_power_draws_it_at_any_voltage():
