@@ -82,6 +82,7 @@ def cached(folder: Path) -> dict[Path, int]:
     return {file: file.stat().st_mtime_ns for file in files}
 
 
+@pytest.mark.alone  # another test may compile something meanwhile
 @pytest.mark.timeout(900)  # the first time it compiles everything
 def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
     assert main(["warm-up", "--quiet"]) == 0
