@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 import gfmhil
-from gfm_hil.core.roles import Role
-from gfm_hil.engine.inproc import CHUNK, run_inproc, stack
+from gfm_hil.engine.inproc import CHUNK, run_inproc
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.engine.timeline import TimelineInMemory
 from gfm_hil.recording.parts import Kept
@@ -102,29 +101,30 @@ class Case:
         began = time.process_time()
         self.benches = benches = make_benches(scenario)
         self.set_up = time.process_time() - began
-        roles: tuple[Role, ...] = ("plant", "controller")
+        self.ticks, self.columns = ticks, len(benches[0].flows)
         what = ticks, benches[0].inner, benches[0].options
-        self.kept = [[Kept(role, *what, flows=b.flows) for b in benches] for role in roles]
-        stack(benches)
+        plants = [Kept("plant", *what, flows=bench.flows) for bench in benches]
+        self.kept = plants, [Kept("controller", *what) for _ in benches]
         self.plant = benches[0].plant
-        self.start = self.plant.copy()
-        each = [bench.controller for bench in benches]
-        self.arrays = [a for c in each for a in (c.ctl, c.laws, c.states, c.est)]
-        self.arrays += [array for bench in benches for array in (bench.y, bench.u)]
-        self.old = [array.copy() for array in self.arrays]
+        self.start, self.old = self.plant.copy(), [array.copy() for array in self.arrays()]
         wiring = self.plant.wiring
-        self.ticks = ticks
         self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
         net = self.plant.net[0]
         self.way = "series" if net["sparse"] or net["n_units"] else "modes"
         self.ns: list[float] = []
+        self.ends: list[Any] = []
         self.round()  # compiles
         self.ns.clear()
+
+    def arrays(self) -> list[Any]:
+        """What a run changes of its controllers; a run puts it into memory of its own."""
+        each = [(bench.controller, bench) for bench in self.benches]
+        return [a for c, b in each for a in (c.ctl, c.laws, c.states, c.est, b.y, b.u)]
 
     def round(self) -> None:
         """Run from the start as ``gfmhil.run`` does in memory; keep what a tick took, in ns."""
         self.plant.restore(self.start)
-        for array, old in zip(self.arrays, self.old, strict=True):
+        for array, old in zip(self.arrays(), self.old, strict=True):
             array[:] = old
         timelines = [TimelineInMemory(bench) for bench in self.benches]
         began = time.thread_time()
@@ -132,6 +132,9 @@ class Case:
         self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
         if done != self.ticks:
             raise SystemExit(f"{self.name}: the run ended at tick {done}")
+        self.ends = [*self.ends[:1], [bench.u.tolist() for bench in self.benches]]
+        if self.ends[0] != self.ends[-1]:
+            raise SystemExit(f"{self.name}: a round was another run than the first one")
         for timeline in timelines:
             timeline.close()
 
@@ -225,9 +228,7 @@ def main() -> None:
     if asked.record:
         for plain, case in zip(cases[::2], cases[1::2], strict=True):
             ratio = np.median(np.divide(case.ns, plain.ns))
-            print(
-                f"{case.sizes[0]} converters: {case.flows.shape[1]} columns, {ratio:.3f} of a tick"
-            )
+            print(f"{case.sizes[0]} converters: {case.columns} columns, {ratio:.3f} of a tick")
 
 
 if __name__ == "__main__":

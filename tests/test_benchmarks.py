@@ -45,3 +45,14 @@ def test_prevent_idle():
         ("never", 3000),
         ("always", 3000),
     ]
+
+
+def test_network_runs_the_same_ticks_with_and_without_all_currents():
+    words = ["--sizes", "2,30", "--rounds", "2", "--record"]
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.network", *words],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    ratios = [line.split(":")[0] for line in done.stdout.splitlines() if "of a tick" in line]
+    assert ratios == ["2 converters", "30 converters"]

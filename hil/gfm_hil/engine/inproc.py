@@ -25,7 +25,7 @@ from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
 _PIECE = 1_000  # ticks of all converters that are recorded at a time, in the processor's cache
-# ticks of a network of many, for each of which Python sees to every converter at either place
+# the least of both in a network: Python handles each converter at the end of each
 _LEAST_CHUNK, _LEAST_PIECE = 1_000, 100
 
 

@@ -151,8 +151,9 @@ class Processes:
         UserError: there is less."""
         if self.scenario.mode != "realtime":
             return 0.0
-        of_each = len(self._places) * bytes_per_tick() + 8 * len(self.scenario.flows)
-        needed, free = self.scenario.ticks * of_each / 1e9, available_memory() / 1e9
+        what = self.scenario.carries, self.scenario.optional_signals
+        a_tick = len(self._places) * bytes_per_tick(*what) + 8 * len(self.scenario.flows)
+        needed, free = self.scenario.ticks * a_tick / 1e9, available_memory() / 1e9
         if needed > free:
             raise UserError(
                 f"duration = {self.scenario.duration:g}: in real time the recording takes "

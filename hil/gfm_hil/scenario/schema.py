@@ -290,8 +290,8 @@ class Scenario(StrictSchema):
     def __copy__(self) -> Scenario:
         """A copy that may get other fields, so without what has been derived from these."""
         copy = super().__copy__()
-        for derived in ("each", "carries"):
-            copy.__dict__.pop(derived, None)
+        for derived in copy.__dict__.keys() - type(self).model_fields.keys():
+            del copy.__dict__[derived]
         return copy
 
     @property
