@@ -28,7 +28,7 @@ import gfmhil
 from gfm_hil.engine.inproc import CHUNK, run_inproc
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.engine.timeline import TimelineInMemory
-from gfm_hil.recording.parts import Kept
+from gfm_hil.run.runner import make_room
 from gfm_hil.scenario import Scenario, load_scenario
 
 TICKS = 100_000  # of all converters of a case in a round
@@ -85,9 +85,9 @@ def rigs() -> dict[str, Scenario]:
     return made
 
 
-def published(case: str, converters: str, folder: str) -> Scenario:
+def published(case: str, converters: str, share: float, folder: str) -> Scenario:
     """A power-flow case, with droop-3 at some of its buses; its files stay in a folder."""
-    made = gfmhil.network_from(case, dict.fromkeys(converters.split(","), "droop-3"))
+    made = gfmhil.network_from(case, dict.fromkeys(converters.split(","), ("droop-3", share)))
     return load_scenario(made.save(Path(folder) / "net"), in_process=True)
 
 
@@ -96,15 +96,13 @@ class Case:
 
     def __init__(self, name: str, scenario: Scenario) -> None:
         self.name, n = name, max(1, len(scenario.converters))
-        ticks = max(500, min(CHUNK, TICKS // n))
+        ticks = max(2000, min(CHUNK, TICKS // n))
         scenario = scenario.model_copy(update={"duration": ticks * scenario.T_s})
         began = time.process_time()
         self.benches = benches = make_benches(scenario)
         self.set_up = time.process_time() - began
         self.ticks, self.columns = ticks, len(benches[0].flows)
-        what = ticks, benches[0].inner, benches[0].options
-        plants = [Kept("plant", *what, flows=bench.flows) for bench in benches]
-        self.kept = plants, [Kept("controller", *what) for _ in benches]
+        self.kept = [*zip(*make_room(benches), strict=True)]
         self.plant = benches[0].plant
         self.start, self.old = self.plant.copy(), [array.copy() for array in self.arrays()]
         wiring = self.plant.wiring
@@ -189,13 +187,14 @@ def main() -> None:
     parser.add_argument("--sizes", default="1,2,4,10,30,100,300", help="converters on feeders")
     parser.add_argument("--case", help="a published case instead, such as case39")
     parser.add_argument("--converters", default="30", help="its buses with converters")
+    parser.add_argument("--share", type=float, default=1.0, help="of them, beside machines")
     parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
     parser.add_argument("--record", action="store_true", help="with and without network.record")
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
     if asked.case:
         with tempfile.TemporaryDirectory() as folder:
-            scenario = published(asked.case, asked.converters, folder)
+            scenario = published(asked.case, asked.converters, asked.share, folder)
             cases = [Case(asked.case, scenario)]
     elif asked.bridges:
         cases = [Case(name, scenario) for name, scenario in rigs().items()]

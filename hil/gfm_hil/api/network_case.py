@@ -82,20 +82,25 @@ class NetworkCase:
 
 
 def network_from(
-    case: Any, converters: Mapping[str | int, str], slack: str = "machine", title: str = ""
+    case: Any,
+    converters: Mapping[str | int, str | tuple[str, float]],
+    slack: str = "machine",
+    title: str = "",
 ) -> NetworkCase:
     """Make a network of a power-flow case.
 
     Each bus with generators gets one synchronous machine of order 6 with a voltage regulator and a
     governor, or the converter that is named for it, which has the rating and the operating point
-    of what it replaces. Loads become constant impedances that draw at the case's voltage what they
-    draw there, the charging of transformers capacitors at the buses.
+    of what it replaces, or a share of both beside a machine with the rest. Loads become constant
+    impedances that draw at the case's voltage what they draw there, the charging of transformers
+    capacitors at the buses.
 
     Args:
         case: a net of pandapower, the name of one of its cases (case9, case39, ...), or the path
             of a net as JSON.
-        converters: by the name of a bus with generators, the law of the converter there; the first
-            one's rating is the network's base.
+        converters: by the name of a bus with generators, the law of the converter there, and, if
+            it does not take all, its share, in (0, 1]; the rating of the first one, in the order
+            of the case's buses, is the network's base.
         slack: machine, or grid: what stands at the slack bus, if no converter does.
         title: of the scenario.
 
@@ -106,7 +111,10 @@ def network_from(
     """
     flow = read_pandapower(case, title)
     names = [bus.name for bus in flow.buses]
-    laws = {str(bus): law for bus, law in converters.items()}
+    laws = {
+        str(bus): (one, 1.0) if isinstance(one, str) else (one[0], float(one[1]))
+        for bus, one in converters.items()
+    }
     feeding = [b.name for b in flow.buses if b.machine or b.name == names[flow.slack]]
     if not laws:
         raise UserError(
@@ -116,6 +124,10 @@ def network_from(
         if name not in feeding:
             what = "has no generator" if name in names else "is no bus of the case"
             raise UserError(f"{flow.title}: bus {name}: {what}; {', '.join(feeding)} have one")
+        if not 0.0 < laws[name][1] <= 1.0:
+            raise UserError(
+                f"{flow.title}: bus {name}: share = {laws[name][1]:g}: must lie in (0, 1]"
+            )
     if slack not in ("machine", "grid"):
         raise UserError(f"slack = {slack!r}: must be machine or grid")
     return _Build(flow, laws, slack == "grid").case()
@@ -124,10 +136,10 @@ def network_from(
 class _Build:
     """A network of a solved case, being written; p.u. of the first converter from here on."""
 
-    def __init__(self, flow: PowerFlow, laws: Mapping[str, str], grid: bool) -> None:
+    def __init__(self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool) -> None:
         self.flow, self.laws = flow, laws
-        at = {bus.name: k for k, bus in enumerate(flow.buses)}
-        self.S_b = self._rating(at[next(iter(laws))])
+        first, name = next((k, bus.name) for k, bus in enumerate(flow.buses) if bus.name in laws)
+        self.S_b = laws[name][1] * self._rating(first)
         self.scale = flow.S_b / self.S_b
         self.grid = flow.slack if grid and flow.buses[flow.slack].name not in laws else None
         self.ignored = list(flow.ignored)
@@ -153,16 +165,13 @@ class _Build:
     def case(self) -> NetworkCase:
         for k, bus in enumerate(self.flow.buses):
             if bus.name in self.laws:
-                self._converter(k, self.laws[bus.name])
+                self._converter(k, *self.laws[bus.name])
         self._branches()
         for k, bus in enumerate(self.flow.buses):
             self._load(k)
-            if (
-                bus.name not in self.laws
-                and k != self.grid
-                and (bus.machine or k == self.flow.slack)
-            ):
-                self._machine(k)
+            left = 1.0 - self.laws.get(bus.name, ("", 0.0))[1]
+            if left and k != self.grid and (bus.machine or k == self.flow.slack):
+                self._machine(k, left)
         content = {
             "title": self.flow.title,
             "description": "Made from a power-flow case. " + " ".join(self.ignored),
@@ -231,18 +240,19 @@ class _Build:
         if capacitor:
             self._put("capacitors", f"charging{bus.name}", {"node": self._node(k), "Q": capacitor})
 
-    def _machine(self, k: int) -> None:
+    def _machine(self, k: int, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
         i = (bus.machine / bus.V).conjugate() * self.flow.S_b / S
         R = float(_default("synchronous_machines", "R"))
         P = bus.machine.real * self.flow.S_b / S + R * abs(i) ** 2
-        values = {"node": self._node(k), "S": S / self.S_b, "P": P, "V": abs(bus.V), **_MACHINE}
+        values = {"node": self._node(k), "S": share * S / self.S_b, "P": P, "V": abs(bus.V)}
+        values |= _MACHINE
         self._put("synchronous_machines", f"G{bus.name}", values)
 
-    def _converter(self, k: int, law: str) -> None:
+    def _converter(self, k: int, law: str, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
         name, file = f"C{bus.name}", f"converter{bus.name}.toml"
-        self.files[file] = _converter_file(S, self.flow.f)
+        self.files[file] = _converter_file(share * S, self.flow.f)
         power = bus.machine * self.flow.S_b / S
         if self.par is None:
             self.par = _parameters(self.files[file])

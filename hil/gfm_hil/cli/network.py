@@ -21,8 +21,9 @@ def add(command: argparse.ArgumentParser) -> None:
         "case", help="a case of pandapower (case9, case39, case118, ...), or its net as .json"
     )
     read.add_argument(
-        "--converter", action="append", default=[], metavar="BUS=LAW",
-        help="a converter in place of the machine at this bus, with its law; several times",
+        "--converter", action="append", default=[], metavar="BUS=LAW[:SHARE]",
+        help="a converter in place of the machine at this bus, with its law, or beside it with a"
+        " share of its rating and power, such as 0.5; several times",
     )  # fmt: skip
     read.add_argument(
         "--slack", choices=("machine", "grid"), default="machine",
@@ -33,12 +34,16 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call_import(options: argparse.Namespace) -> int:
-    converters = {}
+    converters = dict[str | int, str | tuple[str, float]]()
     for text in options.converter:
-        bus, equals, law = text.partition("=")
+        bus, equals, rest = text.partition("=")
+        law, colon, share = rest.partition(":")
         if not (bus and equals and law) or bus in converters:
-            raise UserError(f"--converter {text}: must be BUS=LAW, each bus once")
-        converters[bus] = law
+            raise UserError(f"--converter {text}: must be BUS=LAW or BUS=LAW:SHARE, each bus once")
+        try:
+            converters[bus] = (law, float(share)) if colon else law
+        except ValueError:
+            raise UserError(f"--converter {text}: {share!r} must be a number in (0, 1]") from None
     case = network_from(options.case, converters, options.slack)
     file = case.save(options.out or Path(options.case).stem)
     network, console = case.content["network"], terminal()

@@ -4,8 +4,8 @@ The result is bit for bit that of two processes over a link, because a frame car
 each tick calls the same functions in the same order.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from gfm_hil.engine.replay import Trace, no_trace, replay, stands_still
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
+from gfm_hil.realtime.atomics import row_at
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
@@ -47,40 +48,64 @@ def stack(benches: Sequence[Bench]) -> Stack:
         return Stack(one, b.y[None], b.u[None])
     all_c = [b.controller for b in benches]
     most = max(len(c.laws) for c in all_c)
-    ctl = np.concatenate([c.ctl for c in all_c])
-    est = np.concatenate([c.est for c in all_c])
-    laws = np.zeros((len(all_c), most), all_c[0].laws.dtype)
-    states = np.zeros((len(all_c), most), all_c[0].states.dtype)
+    ctl, est = _below([c.ctl for c in all_c], 1), _below([c.est for c in all_c], 1)
+    laws, states = _below([c.laws for c in all_c], most), _below([c.states for c in all_c], most)
     y, u = np.stack([b.y for b in benches]), np.stack([b.u for b in benches])
     for k, (b, c) in enumerate(zip(benches, all_c, strict=True)):
         n = len(c.laws)
-        laws[k, :n], states[k, :n] = c.laws, c.states
-        c.ctl, c.est = ctl[k : k + 1], est[k : k + 1]
-        c.laws, c.states = laws[k, :n], states[k, :n]
+        c.ctl, c.est, c.laws, c.states = ctl[k], est[k], laws[k, :n], states[k, :n]
         b.y, b.u = y[k], u[k]
-    return Stack(ControllerRecords(ctl, laws, states, est), y, u)
+    return Stack(ControllerRecords(ctl[:, 0], laws, states, est[:, 0]), y, u)
+
+
+def _below(arrays: Sequence[NDArray[Any]], most: int) -> NDArray[Any]:
+    """Arrays of records, each at most ``most`` long, one below the other; as bytes, since numpy
+    takes a millisecond to copy a record of many fields by its fields."""
+    dtype = arrays[0].dtype
+    whole = np.zeros((len(arrays), most * dtype.itemsize), np.uint8)
+    for room, array in zip(whole, arrays, strict=True):
+        room[: array.nbytes] = np.ascontiguousarray(array).view(np.uint8)
+    return whole.view(dtype)
+
+
+class Places(NamedTuple):
+    """Addresses of rows: of each converter's plant, (N,), and controller, and of the network."""
+
+    plant: NDArray[np.int64]
+    controller: NDArray[np.int64]
+    flows: NDArray[np.int64]
+    widths: NDArray[np.int64]  # how many columns each of them has, (3,)
+
+
+def places(*rows: Iterable[NDArray[np.float64]]) -> Places:
+    """Where rows are, (ticks, columns) each. Raises ValueError: not one after the other."""
+    all_rows = [[*each] for each in rows]
+    if not all(array.flags.c_contiguous for each in all_rows for array in each):
+        raise ValueError("rows must follow each other without gaps")
+    plant, controller, flows = (np.array([a.ctypes.data for a in each]) for each in all_rows)
+    return Places(plant, controller, flows, np.array([each[0].shape[1] for each in all_rows]))
 
 
 @compiled
-def _run_ticks(
-    plant, stack, plant_rows, controller_rows, flows, start, stop, first, survives_trip, plan, kept
-):
+def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, kept):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
     ctl, laws, states, est = stack.controllers
-    y, u, st = stack.y, stack.u, plant.st
+    y, u, st, widths = stack.y, stack.u, plant.st, places.widths
     told = u if len(plan) == 0 else kept[len(kept) - 1 :]
     delayed = plant_is_delayed(plant)
     for k in range(start, stop):
         changed, trips = False, 0
-        plant_flows(plant, flows[k - first])
+        plant_flows(plant, row_at(places.flows[0], widths[2], k - first))
         for i in range(len(ctl)):
-            before, changes, row = ctl[i].state, ctl[i].changes, plant_rows[i, k - first]
+            before, changes = ctl[i].state, ctl[i].changes
+            row = row_at(places.plant[i], widths[0], k - first)
             tripped = sample(plant, i, y[i], row)
             trips += tripped
             mine, estimate = ctl[i : i + 1], est[i : i + 1]
             if not stands_still(plan, k):
                 answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
-            record_controller(controller_rows[i, k - first], mine, states[i], estimate)
+            other = row_at(places.controller[i], widths[1], k - first)
+            record_controller(other, mine, states[i], estimate)
             if len(plan) > 0:
                 replay(plan, kept, k, u[i], told[i])
             record_command(row, told[i])
@@ -129,8 +154,8 @@ def run_ticks(
         flows: of the network, (ticks, columns), likewise; None: nothing.
     """
     of_network = np.empty((plant_rows.shape[1], 0)) if flows is None else flows
-    rows, more = (plant_rows, controller_rows, of_network), trace or no_trace()
-    return int(_run_ticks(plant, controllers, *rows, start, stop, first, survives_trip, *more)[0])
+    where, more = places(plant_rows, controller_rows, [of_network]), trace or no_trace()
+    return int(_run_ticks(plant, controllers, where, start, stop, first, survives_trip, *more)[0])
 
 
 def run_inproc(
@@ -144,34 +169,25 @@ def run_inproc(
     timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
     survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
+    controllers = stack(benches)
     chunk = max(_LEAST_CHUNK, CHUNK // len(benches))
     piece = max(_LEAST_PIECE, _PIECE // len(benches))
-    controllers = stack(benches)
+    where = _where_they_stay(plant_parts, controller_parts)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
     flows = np.empty((piece, len(bench.flows)))
-    sides = (plant_rows, plant_parts), (controller_rows, controller_parts)
+    here = where or places(plant_rows, controller_rows, [flows])
     while k < ticks and any(timeline.running for timeline in timelines):
         for timeline in timelines:
             timeline.carry_out(k)
         stop, calm = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines)), True
         while k < stop and calm:
-            end = min(k + piece, stop)
+            end, first = (stop, 0) if where else (min(k + piece, stop), k)
             done, calm = _run_ticks(
-                plant,
-                controllers,
-                plant_rows,
-                controller_rows,
-                flows,
-                k,
-                end,
-                k,
-                survives_trip,
-                *bench.trace,
+                plant, controllers, here, k, end, first, survives_trip, *bench.trace
             )
-            for room, parts in sides:
-                for part, recorded in zip(parts, room, strict=True):
-                    part.put(k, recorded[: done - k])
-            plant_parts[0].put_flows(k, flows[: done - k])
+            if where is None:
+                _put(k, plant_parts, plant_rows[:, : done - k], flows[: done - k])
+                _put(k, controller_parts, controller_rows[:, : done - k], flows[:0])
             k = done
         if bench.plant.net[0]["joins"]:
             follow_trips(bench.plant)
@@ -186,6 +202,29 @@ def run_inproc(
     for timeline in timelines:
         timeline.finish(k)
     return k
+
+
+def _put(
+    first: int,
+    parts: Sequence[RolePart | Kept],
+    rows: NDArray[np.float64],
+    flows: NDArray[np.float64],
+) -> None:
+    """Put rows into those parts that take them."""
+    for part, own in zip(parts, rows, strict=True):
+        if isinstance(part, Kept):
+            part.put(first, own, flows)
+
+
+def _where_they_stay(
+    plant_parts: Sequence[RolePart | Kept], controller_parts: Sequence[RolePart | Kept]
+) -> Places | None:
+    """The places of the rows of all ticks in the parts; None if one takes them by ``put``."""
+    sides = [[part.rows for part in parts] for parts in (plant_parts, controller_parts)]
+    own = [[rows for rows in each if rows is not None] for each in sides]
+    if list(map(len, own)) != list(map(len, sides)):
+        return None
+    return places(*own, [plant_parts[0].flow_rows])
 
 
 def rows(

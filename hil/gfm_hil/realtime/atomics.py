@@ -9,7 +9,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
-from numba.core.cgutils import raw_memcpy
+from numba.core.cgutils import pack_array, raw_memcpy
 from numba.extending import intrinsic as _numba_intrinsic
 
 intrinsic: Any = _numba_intrinsic  # its stubs count typingctx among the caller's arguments
@@ -71,6 +71,23 @@ def prefetch(typingctx, address):
         return context.get_dummy_value()
 
     return types.void(types.int64), make
+
+
+@intrinsic
+def row_at(typingctx, address, n, k):
+    """Return row k of a table of n float64 columns at an address."""
+    array = types.Array(types.float64, 1, "C")
+
+    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        address, n, k = arguments
+        made, stride = context.make_array(array)(context, builder), _WORD(8)
+        first = builder.add(address, builder.mul(k, builder.mul(n, stride)))
+        made.data = builder.inttoptr(first, made.data.type)
+        made.shape, made.strides = pack_array(builder, [n]), pack_array(builder, [stride])
+        made.itemsize, made.nitems = stride, n
+        return made._getvalue()
+
+    return array(types.int64, types.int64, types.int64), make
 
 
 @intrinsic

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,13 +90,15 @@ class RolePart:
             of_network,
         )
 
-    def put_flows(self, first: int, rows: NDArray[np.float64]) -> None:
-        """As ``put``, of the network."""
-        self.flows[first : first + len(rows)] = rows
+    @property
+    def rows(self) -> NDArray[np.float64] | None:
+        """The rows of all ticks, where a loop may write them."""
+        return self.signals
 
-    def put(self, first: int, rows: NDArray[np.float64]) -> None:
-        """Record rows of consecutive ticks, the first of which is ``first``."""
-        self.signals[first : first + len(rows)] = rows
+    @property
+    def flow_rows(self) -> NDArray[np.float64]:
+        """Those of the network, likewise."""
+        return self.flows
 
     @staticmethod
     def open(folder: Path, role: Role) -> RolePart | None:
@@ -185,20 +187,20 @@ class Kept:
     ) -> None:
         recorded = signals_of(role, inner, options)
         self._names = [name for name in recorded if only is None or name in only]
-        # a slice takes a fifth of the time of a list of all
-        places = [recorded.index(name) for name in self._names]
-        self._places = slice(None) if only is None else places
-        self._columns = np.empty((len(self._names), ticks))
+        self._places = [recorded.index(name) for name in self._names]
+        shapes = (len(self._names), ticks), (len(flows), ticks)
+        # all columns together are kept row by row, where the loop writes them
+        order: Literal["F", "C"] = "F" if only is None else "C"
+        self._columns, self._flows = (np.empty(shape, order=order) for shape in shapes)
         self._of_network = flows
-        self._flows = np.empty((len(flows), ticks))
+        self.rows = self._columns.T if only is None else None
+        self.flow_rows = self._flows.T
 
-    def put(self, first: int, rows: NDArray[np.float64]) -> None:
-        """As ``RolePart.put``."""
+    def put(self, first: int, rows: NDArray[np.float64], flows: NDArray[np.float64]) -> None:
+        """Record rows of consecutive ticks, the first of which is ``first``, and the network's."""
         self._columns[:, first : first + len(rows)] = rows.T[self._places]
-
-    def put_flows(self, first: int, rows: NDArray[np.float64]) -> None:
-        """As ``RolePart.put_flows``."""
-        self._flows[:, first : first + len(rows)] = rows.T
+        if len(self._flows):
+            self._flows[:, first : first + len(rows)] = flows.T
 
     def named(self, done: int) -> dict[str, NDArray[np.float64]]:
         """The columns of the first ``done`` ticks by name, as views of shape (done,)."""

@@ -308,7 +308,7 @@ def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> 
         UserError: the scenario has no operating point.
     """
     bench = make_bench(scenario)
-    (run,) = _in_memory([bench], [kept or _room(bench)])
+    (run,) = _in_memory([bench], [kept] if kept else make_room([bench]))
     return run
 
 
@@ -316,14 +316,17 @@ def run_network_in_memory(scenario: Scenario) -> NetworkRun:
     """Run a scenario with a network in this process and leave nothing on the disk. Raises
     UserError: the scenario has no operating point."""
     benches = make_benches(scenario)
-    runs = _in_memory(benches, [_room(bench) for bench in benches])
+    runs = _in_memory(benches, make_room(benches))
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
-def _room(bench: Bench) -> tuple[Kept, Kept]:
-    """Room for all columns of a bench."""
-    what = bench.scenario.ticks, bench.inner, bench.options
-    return Kept("plant", *what, flows=bench.flows), Kept("controller", *what)
+def make_room(benches: Sequence[Bench]) -> list[tuple[Kept, Kept]]:
+    """Room for all columns of the benches of a run, of the plant and of the controller each."""
+    whats = [(bench.scenario.ticks, bench.inner, bench.options) for bench in benches]
+    return [
+        (Kept("plant", *what, flows=bench.flows), Kept("controller", *what))
+        for bench, what in zip(benches, whats, strict=True)
+    ]
 
 
 def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:

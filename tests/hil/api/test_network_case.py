@@ -32,12 +32,13 @@ def small():
     [
         ("case9", {"2": "droop-3", "3": "mimo-gfm"}),
         ("case14", {"1": "vsg-2"}),  # taps, and a converter at the slack
+        ("case9", {"2": ("droop-3", 0.4), "1": ("vsg-2", 0.5)}),  # beside machines
         pytest.param("case39", {"30": "droop-3", "38": "vsg-2"}, marks=pytest.mark.full),
         pytest.param("case118", {"69": "droop-3"}, marks=pytest.mark.full),
     ],
 )
 def test_the_steady_state_is_the_power_flow(case, converters, tmp_path):
-    slack = "grid" if case == "case9" else "machine"
+    slack = "grid" if "3" in converters else "machine"
     made = gfmhil.network_from(case, converters, slack)
     assert made.distance(made.save(tmp_path / "net")) < 1e-8
     net = getattr(networks, case)()
@@ -117,10 +118,12 @@ def test_what_no_network_can_be_made_of(change, line):
     [
         (["case8", "--converter", "2=droop-3"], "'case8': must be one of case118, "),
         (["case9"], "case9: name a bus for a converter; 1, 2, 3 have generators"),
+        (["case9", "--converter", "2=droop-3:1.5"], "case9: bus 2: share = 1.5: must lie"),
+        (["case9", "--converter", "2=droop-3:h"], "--converter 2=droop-3:h: 'h' must be a number"),
         (["case9", "--converter", "5=droop-3"], "case9: bus 5: has no generator; 1, 2, 3 have one"),
         (["case9", "--converter", "99=droop-3"], "case9: bus 99: is no bus of the case; 1, 2, 3"),
         (["case9", "--converter", "2=no-law"], "no-law"),
-        (["case9", "--converter", "2"], "--converter 2: must be BUS=LAW, each bus once"),
+        (["case9", "--converter", "2"], "--converter 2: must be BUS=LAW or BUS=LAW:SHARE, each"),
     ],
 )
 def test_wrong_input_is_one_line(arguments, line, tmp_path, capsys):
