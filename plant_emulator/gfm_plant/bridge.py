@@ -21,6 +21,7 @@ from gfm_plant.dc_link import discharge
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, terminal
 from gfm_plant.period import limit_voltage, take_command
+from gfm_plant.port import begin_port, end_port
 from gfm_plant.powers import begin_powers
 from gfm_plant.records import COMPARE, N_GATES, PlantRecords
 from gfm_plant.series import (
@@ -35,8 +36,10 @@ from gfm_plant.series import (
     choose_powers,
     end_series,
     find_path,
+    find_tangent,
     find_terms,
     hold_current,
+    is_plain,
     limit_of,
     look,
     make_powers,
@@ -180,7 +183,7 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
                     else:
                         _load(plant, k, c, unit)
             a, b = max(begin, first) - first, min(end, last) - first
-            _advance_unit(plant, c, a, b)
+            _advance_unit(plant, c, a, b, a == 0.0 and b == last - first)
             for k in range(n.n_converters):
                 s = plant.st[k]
                 half = turned(0.5 * n.omega_b * s.u_now[1] * (b - a))
@@ -257,9 +260,11 @@ def _watch_source(r: Any, s: Any) -> None:
 
 
 @inlined
-def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None:
-    """Go on from edge to edge, between two instants of a unit, s after its beginning."""
+def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float, whole: bool) -> None:
+    """Go on from edge to edge, between two instants of a unit, s after its beginning; ``whole``:
+    it is all of it."""
     n, t, events = plant.net[0], begin, 0
+    behind = whole and begin_port(plant)
     longest = LARGEST / field(n, "fastest")[c]
     for k in range(n.n_converters):
         s = plant.st[k]
@@ -280,26 +285,32 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float) -> None
             until = min(until, s.soonest)
             limited = limited or _limited(r, s)
             watched = watched or limited or s.open >= 0 or _flows(s)
-        if field(n, "alone")[c]:
+        alone, only = field(n, "alone")[c], n.switched if behind else 0
+        if alone:
             begin_powers(plant.now[0], plant.st[0].slot)
-            # a limit might be reached before edges that are passed already
-            if plant.par[0].dead > 0.0 and not limited and plant.st[0].open < 0:
-                until = _pass_edges(plant, c, t, last)
+        passes = plant.st[only].open < 0 if alone else behind and is_plain(plant, only)
+        # a limit might be reached before edges that are passed already
+        if passes and plant.par[only].dead > 0.0 and not limited:
+            until = _pass_edges(plant, only, c, t, last)
         h, tau, which, what = until - t, 1.0, -1, _NOTHING
-        terms = find_terms(plant, c, h)
+        terms = find_terms(plant, c, h, t)
         if watched and events < _MOST_EVENTS:
             tau, which, what = _first_event(plant, c, h, terms)
         for k in range(n.n_converters):
+            if behind and plant.par[k].levels == 0:
+                continue
             if t == begin and plant.par[k].filtered:
                 _see(plant.par[k], plant.st[k], 0)
             if tau < 1.0 and k != which:
                 look(plant, k, c, h, terms, tau)
             _sense(plant, k, c, h, terms, tau)
-        accept(plant, c, tau * h, terms, tau)
+        accept(plant, c, h, t, terms, tau)
         t = until if tau == 1.0 else t + tau * h
         if what != _NOTHING:
             events += 1
             _change(plant, which, c, what)
+    if behind:
+        end_port(plant)
 
 
 @inlined
@@ -337,11 +348,11 @@ def _switched(r: Any, s: Any, x: int, t: float) -> tuple[int, int, float]:
 
 
 @compiled
-def _pass_edges(plant: PlantRecords, c: int, t: float, last: float) -> float:
+def _pass_edges(plant: PlantRecords, k: int, c: int, t: float, last: float) -> float:
     """Let the gates of the only bridge change as long as its equations stay the same, since each
     current that decides keeps its sign; returns when they do not, at the latest ``last``."""
-    r, s = plant.par[0], plant.st[0]
-    while s.soonest < last and _stay(plant, c, t):
+    r, s, path = plant.par[k], plant.st[k], find_tangent(plant, k, c)
+    while s.soonest < last and _stay(plant.net[0], r, s, path, c, t):
         _switch(r, s, s.soonest)
         for x in range(3):
             if not r.wide[s.gate[x]]:
@@ -350,16 +361,16 @@ def _pass_edges(plant: PlantRecords, c: int, t: float, last: float) -> float:
 
 
 @inlined
-def _stay(plant: PlantRecords, c: int, t: float) -> bool:
+def _stay(n: Any, r: Any, s: Any, path: Any, c: int, t: float) -> bool:
     """Return whether the equations stay the same at the next change of the gates of the only
-    bridge, in an interval from t on."""
-    n, r, s, x = plant.net[0], plant.par[0], plant.st[0], field(plant.now[0], "vector")
+    bridge, in an interval from t on in which its current has this path."""
     at = s.soonest
-    unsure = 4.0 * bend(plant, 0, c, at + r.dead - t)  # from a tangent; bend: from a chord
+    i_a, i_b, di_a, di_b, bends = path
+    unsure = (at + r.dead - t) ** 2 * bends
     for y in range(3):
         changes = s.next[y] <= at + _INSTANT
         if changes or s.flows[y] != 0:
-            i, slope = _of_leg(n, c, y, x[0, 0], x[0, 1]), _of_leg(n, c, y, x[1, 0], x[1, 1])
+            i, slope = _of_leg(n, c, y, i_a, i_b), _of_leg(n, c, y, di_a, di_b)
             begin = i if s.flows[y] != 0 else i + slope * (at - t)
             end = i + slope * (at - t + (r.dead if changes else 0.0))
             if not (min(begin, end) > unsure or max(begin, end) < -unsure):

@@ -165,8 +165,11 @@ def _make(
         raise ValueError("phases.samples: must be the same for all converters of a network")
     large = not carriers and len(wiring.order) > MOST_BY_MODES
     entries = entries_of(wiring) if large else 0
-    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries)
-    network.net["updates"] = updates
+    switched = np.flatnonzero(par["levels"])
+    port = len(switched) == 1 < len(par) and len(wiring.order) <= MOST_BY_MODES
+    port = port and not par["filtered"][par["levels"] == 0].any()
+    network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries, port)
+    network.net["updates"], network.net["switched"] = updates, switched[0] if port else -1
     network.net["batteries"] = par["energy"].any()
     now = network.now
     st["x"][:, V_DC] = 1.0
@@ -208,6 +211,7 @@ def _network(
     measured: bool,
     units_of_carrier: int,
     entries: int,
+    port: bool,
 ) -> Network:
     """Return a plant whose circuits are still to be made.
 
@@ -216,6 +220,7 @@ def _network(
         measured: whether p, q and V of the connection points are looked at.
         units_of_carrier: see ``net_dtype``.
         entries: of the sums of a large plant, 0: it is solved by its modes.
+        port: whether units of the carrier may go on behind a `gfm_plant.port`.
     """
     cuts = [0.0, *sorted({float(f) for f in par["fraction"]} - {0.0}), 1.0]
     places = wiring.sources()
@@ -239,6 +244,7 @@ def _network(
             sum(len(one.parts) or len(wiring.order) for one in wiring.recorded),
             sum(len(one.columns) for one in wiring.recorded),
         ),
+        len(par) + 1 if port else 0,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)

@@ -135,6 +135,7 @@ class Rates:
     by_w: NDArray[np.float64]
     by_s: NDArray[np.float64]
     fastest: float  # the norm of ``by_w`` in energy coordinates, 1/s
+    free: NDArray[np.float64]  # (n_w, n): a basis of the w that the nodes allow
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,9 @@ def find_rates(circuit: Circuit, omega_b: float, order: Sequence[str]) -> Rates:
     by_w[np.ix_(at, at)] = A / one.root[:, None] * one.root
     by_s = np.zeros((len(order), drive.shape[1]))
     by_s[at] = omega_b * drive / one.root[:, None]
-    return Rates(by_w, by_s, fastest)
+    free = np.zeros((len(order), one.K.shape[1]))
+    free[at] = one.K / one.root[:, None]
+    return Rates(by_w, by_s, fastest, free)
 
 
 def _reduce(circuit: Circuit) -> _Reduced:

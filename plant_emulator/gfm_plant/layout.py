@@ -35,6 +35,10 @@ TERMS = 24
 POWERS, ORDER, SLOTS = 5, 16, 256
 """How many powers of a matrix `powers` keeps, of which order, and of how many matrices."""
 
+SPEEDS, MOMENTS, DRIVES, LANES = 6, 5, 24, 16
+"""Behind a `port`: powers of time that a source has, moments of a current, powers of time in a
+unit, and those in an interval, at most."""
+
 _LINE = 64  # bytes of a line of the processor's cache, at which every array begins
 
 _NET: _Arrays = {
@@ -129,6 +133,20 @@ _NET: _Arrays = {
     "alone": (int, ("n_rates",)),
     "link_place": (int, ("n_rates", 2, "n_entries", 2)),
     "link": (float, ("n_rates", 2, "n_entries", 4)),
+    # with one switched bridge in a network, see `port`, of each row of circuits without a contact:
+    # how many powers of time (0: it has no tables), rows, and states and sources that give all
+    # else, whose places follow; what these do, by columns, and what the moments of the bridge's
+    # voltage do, to the powers of what drives its line, to all other states at the end of a unit,
+    # and to the moments of the currents of averaged bridges
+    "port_powers": (int, ("n_ports",)),
+    "port_rows": (int, ("n_ports",)),
+    "port_states": (int, ("n_ports",)),
+    "port_sources": (int, ("n_ports",)),
+    "port_state": (int, ("n_ports", "n_w")),
+    "port_source": (int, ("n_ports", "n_s")),
+    "port_table": (float, ("n_ports", "n_port_columns", "n_port_rows")),
+    "port_moment": (float, ("n_ports", DRIVES, "n_port_rows")),
+    "port_most": (float, ("n_ports", DRIVES)),  # of its first row, the largest from here on
 }
 _NOW: _Arrays = {
     # modes, what drives them in the first and in the second half of the present piece, and states
@@ -164,6 +182,15 @@ _NOW: _Arrays = {
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),
+    # behind a port: states and powers of the sources at the beginning of a unit; the sums that they
+    # give; the moments of the bridge's voltage, in this unit and in an interval; and in an interval
+    # the terms of that voltage and of what drives the line
+    "port_x": (float, (2, "n_port_columns")),
+    "port_y": (float, (2, "n_port_rows")),
+    "port_moments": (float, (2, DRIVES)),
+    "port_more": (float, (2, DRIVES)),
+    "port_E": (float, (2, TERMS)),
+    "port_g": (float, (2, LANES)),
     # of a large plant: the sources in the middle of a piece, and along it; the present term and the
     # next of states, sources and voltages; and the states in the middle and at the end of a piece
     "source_next": (complex, ("n_s",)),
@@ -207,6 +234,7 @@ net_dtype = _header(
         ("n_units", "i8"),
         ("updates", "i8"),
         ("unit_s", "f8"),
+        ("switched", "i8"),  # the only converter with a switched bridge in a network, -1: none
         # whether p, q and V of the connection points, and the charge of batteries, are recorded
         ("connections", "i8"),
         ("batteries", "i8"),
@@ -248,6 +276,7 @@ now_dtype = _header(
         ("upright", "c16"),
         ("back", "c16"),
         ("order", "i8"),  # of the matrices of `powers`
+        ("behind", "i8"),  # whether the network goes on behind a `port` in this unit
         # e^(j omega_b t) at the beginning of a period, and its tick
         ("stands", "c16"),
         ("stands_tick", "i8"),
@@ -297,6 +326,7 @@ def make_net_and_now(
     nodes: int = 0,
     entries: int = 0,
     flows: tuple[int, int, int, int] = (0, 0, 0, 0),
+    ports: int = 0,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -314,6 +344,7 @@ def make_net_and_now(
         entries: of the sums of a large plant, see `sparse`; 0: it is solved by its modes.
         flows: recorded terminals, their nodes, and currents that these are sums of, at most, and
             columns of all.
+        ports: rows of circuits with tables of a `port`.
     """
     modes, circuits = 2 * states - zeros, MOST_CONTACTS * (converters + 1) + 1
     if entries:
@@ -333,6 +364,9 @@ def make_net_and_now(
         "n_columns": 4 * states + 2 * sources + 4 * (nodes + 4) if entries else 0,
         "n_entries": states * max(states, sources) if units else 0,
         "n_terms": TERMS if units else 0,
+        "n_ports": ports,
+        "n_port_rows": DRIVES + -(-(states + MOMENTS * converters) // 12) * 12 if ports else 0,
+        "n_port_columns": states + SPEEDS * sources if ports else 0,
         "n_slots": SLOTS if units and converters == 1 else 0,
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)

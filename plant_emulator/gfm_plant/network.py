@@ -24,6 +24,7 @@ from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.phases import convert_nothing
+from gfm_plant.port import pack_port
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
@@ -298,7 +299,17 @@ def _pack_rates(
     net["leg_axis"][circuit] = np.exp(1j * (2 * np.pi / 3 * np.arange(3) - angle))
     fastest = max(one.fastest for one in axes)
     net["fastest"][circuit] = max(_fastest_with_dc(r, fastest) for r in plant.par if r["levels"])
-    by_w = [one.by_w.copy() for one in axes]
+    free = [_free_states(one.free, N) for one in axes]
+    by_w = [one.by_w @ by for one, (_, by) in zip(axes, free, strict=True)]
+    for A, one in zip(by_w, axes, strict=True):
+        A[np.abs(A) < 1e-13 * one.fastest] = 0.0
+    if circuit < net["n_ports"]:
+        B = np.zeros((len(axes[0].by_s), len(places) + 1))
+        for column, name in zip(axes[0].by_s.T, names, strict=True):
+            B[:, places[name]] = column
+            if name == GRID_SOURCE:  # its negative sequence
+                B[:, places[name] + 1] = column
+        pack_port(net, circuit, net["switched"], by_w[0], B, free[0][0], axes[0].fastest)
     for k in range(N):
         i_f, v, i_o = range(N_OWN * k, N_OWN * (k + 1))
         for axis, A in enumerate(by_w):
@@ -324,6 +335,22 @@ def _pack_rates(
             )
         for axis, factors in enumerate((alpha, beta)):
             net["link"][circuit, which, : len(entries), axis] = factors[tuple(entries.T)]
+
+
+def _free_states(basis: Any, N: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Choose states that give all others, those of converters first; returns which, and the matrix
+    that gives all by these, of a basis of what the nodes allow."""
+    left, chosen = basis.copy(), list[int]()
+    sizes = np.linalg.norm(basis, axis=1)
+    for x in range(len(basis)):
+        size = np.linalg.norm(left[x])
+        if size > 1e-6 * sizes[x] > 0.0:
+            chosen.append(x)
+            left -= np.outer(left @ left[x], left[x]) / size**2
+    which, by = np.zeros(len(basis), bool), np.zeros((len(basis), len(basis)))
+    which[chosen] = True
+    by[:, chosen] = np.linalg.solve(basis[chosen].T, basis.T).T
+    return which, by
 
 
 def _fastest_with_dc(r: Any, circuit: float) -> float:

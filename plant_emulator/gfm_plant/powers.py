@@ -17,6 +17,7 @@ from llvmlite import ir
 from numba import types
 
 from gfm_plant.layout import ORDER, POWERS, SLOTS, field, intrinsic
+from gfm_plant.vectors import FOUR, INT, ZERO, add, all_four, load, pointer, splat, store
 from gfm_runtime.compiled import compiled, inlined
 
 ONE, P, SOURCE_AT, MID_AT, N = 8, 9, 12, 13, 14
@@ -33,40 +34,14 @@ _BLOCKS: dict[int, list[tuple[int, ...]]] = {
 }
 _SLOTS_TRIED = 32
 
-_REAL, _INT = ir.DoubleType(), ir.IntType(64)
-_FOUR = ir.VectorType(_REAL, 4)
-_VOID = ir.Constant(_FOUR, ir.Undefined)
-
-
-def _splat(builder: Any, vector: Any, lane: int) -> Any:
-    lanes = ir.Constant(ir.VectorType(ir.IntType(32), 4), [lane] * 4)
-    return builder.shuffle_vector(vector, _VOID, lanes)
-
-
-def _all_four(builder: Any, value: Any) -> Any:
-    return _splat(builder, builder.insert_element(_VOID, value, _INT(0)), 0)
-
-
-def _at(builder: Any, base: Any, place: int) -> Any:
-    return builder.bitcast(builder.gep(base, [_INT(place)]), _FOUR.as_pointer())
-
-
-def _add(builder: Any, a: Any, b: Any, to: Any) -> Any:
-    """a b + to, in one rounding where the processor can."""
-    if to is None:
-        return builder.fmul(a, b)
-    name, kind = "llvm.fmuladd.v4f64", ir.FunctionType(_FOUR, [_FOUR] * 3)
-    call = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    return builder.call(call, [a, b, to])
-
 
 def _column(builder: Any, matrix: Any, column: int, block: int) -> Any:
-    return builder.load(_at(builder, matrix, column * ORDER + 4 * block), align=8)
+    return load(builder, matrix, column * ORDER + 4 * block)
 
 
 def _sum(builder: Any, highest: Any, x: Any, h: Any, levels: int, size: int) -> list[Any]:
     """Return x(h) in blocks by A^k x, k < POWERS, in blocks; ``highest``: A^POWERS."""
-    blocks, one = range(size // 4), _all_four(builder, h)
+    blocks, one = range(size // 4), all_four(builder, h)
     power, scaled = one, [x[0]]
     for k in range(1, POWERS):
         scaled.append([builder.fmul(part, power) for part in x[k]])
@@ -75,18 +50,18 @@ def _sum(builder: Any, highest: Any, x: Any, h: Any, levels: int, size: int) -> 
     def partial(i: int) -> list[Any]:
         found: list[Any] = [None for _ in blocks]
         for k in range(POWERS):
-            factor = ir.Constant(_FOUR, [1 / math.factorial(POWERS * i + k)] * 4)
-            found = [_add(builder, scaled[k][block], factor, found[block]) for block in blocks]
+            factor = ir.Constant(FOUR, [1 / math.factorial(POWERS * i + k)] * 4)
+            found = [add(builder, scaled[k][block], factor, found[block]) for block in blocks]
         return found
 
     y = partial(levels - 1)
     for i in range(levels - 2, -1, -1):
         y, sums = [builder.fmul(part, power) for part in y], [partial(i), [None for _ in blocks]]
         for column, those in enumerate(_BLOCKS[size]):
-            value, to = _splat(builder, y[column // 4], column % 4), sums[column % 2]
+            value, to = splat(builder, y[column // 4], column % 4), sums[column % 2]
             for block in those:
                 entry = _column(builder, highest, column, block)
-                to[block] = _add(builder, entry, value, to[block])
+                to[block] = add(builder, entry, value, to[block])
         y = [
             one if other is None else builder.fadd(one, other)
             for one, other in zip(*sums, strict=True)
@@ -94,13 +69,9 @@ def _sum(builder: Any, highest: Any, x: Any, h: Any, levels: int, size: int) -> 
     return y
 
 
-def _pointer(context: Any, builder: Any, kind: Any, array: Any) -> Any:
-    return context.make_array(kind)(context, builder, array).data
-
-
 def _store(builder: Any, vectors: Any, row: int, values: list[Any]) -> None:
     for block, value in enumerate(values):
-        builder.store(value, _at(builder, vectors, row * ORDER + 4 * block), align=8)
+        store(builder, value, vectors, row * ORDER + 4 * block)
 
 
 @intrinsic
@@ -115,26 +86,25 @@ def _series(
     n_levels, n = (one.literal_value for one in literals)
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kinds, first = signature.args, builder.mul(arguments[1], _INT(POWERS * ORDER * ORDER))
-        base = builder.gep(_pointer(context, builder, kinds[0], arguments[0]), [first])
-        matrix = [builder.gep(base, [_INT(k * ORDER * ORDER)]) for k in range(POWERS)]
-        rows = _pointer(context, builder, kinds[2], arguments[2])
+        kinds, first = signature.args, builder.mul(arguments[1], INT(POWERS * ORDER * ORDER))
+        base = builder.gep(pointer(context, builder, kinds[0], arguments[0]), [first])
+        matrix = [builder.gep(base, [INT(k * ORDER * ORDER)]) for k in range(POWERS)]
+        rows = pointer(context, builder, kinds[2], arguments[2])
         x: list[list[Any]] = [
-            [builder.load(_at(builder, rows, k * ORDER + 4 * b), align=8) for b in range(n // 4)]
+            [load(builder, rows, k * ORDER + 4 * b) for b in range(n // 4)]
             for k in range(POWERS if n_levels else 1)
         ]
         if n_levels:
             y = _sum(builder, matrix[-1], x, arguments[3], n_levels, n)
             _store(builder, rows, POWERS, y)
         else:
-            zero = ir.Constant(_FOUR, [0.0] * 4)
-            x += [[zero] * (n // 4) for _ in range(POWERS - 1)]
+            x += [[ZERO] * (n // 4) for _ in range(POWERS - 1)]
             for column, those in enumerate(_BLOCKS[n]):
-                value = _all_four(builder, builder.load(builder.gep(rows, [_INT(column)])))
+                value = all_four(builder, builder.load(builder.gep(rows, [INT(column)])))
                 for k in range(1, POWERS):
                     for b in those:
                         entry = _column(builder, matrix[k - 1], column, b)
-                        x[k][b] = _add(builder, entry, value, x[k][b])
+                        x[k][b] = add(builder, entry, value, x[k][b])
             for k in range(1, POWERS):
                 _store(builder, rows, k, x[k])
         return context.get_dummy_value()

@@ -22,6 +22,7 @@ import numpy as np
 from gfm_plant.beside import average_rates, set_average
 from gfm_plant.layout import ORDER, POWERS, TERMS, field
 from gfm_plant.model import V_DC
+from gfm_plant.port import drive_by_itself, drive_port, keep_moments
 from gfm_plant.powers import MID_AT, ONE, SMALL, SOURCE_AT, N, P, fill_powers, find_slot, go_to
 from gfm_plant.records import I_F, I_O, N_PATH, PlantRecords, V
 from gfm_plant.solution import grid_source, own
@@ -143,9 +144,10 @@ def hold_current(plant: PlantRecords, k: int, c: int, i: complex) -> None:
 
 
 @inlined
-def find_terms(plant: PlantRecords, c: int, h: float) -> int:
-    """Find the series of an interval of h s from the present states on, and where it leads to;
-    returns how many terms of ``terms`` it has. `begin_powers` comes before."""
+def find_terms(plant: PlantRecords, c: int, h: float, t: float) -> int:
+    """Find the series of an interval of h s from the present states on, t s after the beginning of
+    a unit, and where it leads to; returns how many terms of ``terms`` it has. `begin_powers` comes
+    before."""
     n, now = plant.net[0], plant.now[0]
     if field(n, "alone")[c]:
         terms, s, x = 0, plant.st[0], field(now, "vector")
@@ -154,10 +156,21 @@ def find_terms(plant: PlantRecords, c: int, h: float) -> int:
         _lead(plant, c, h)
     else:
         terms = how_many(h * field(n, "fastest")[c])
-        _find_together(plant, c, h, terms)
+        if now.behind:
+            drive_port(plant, h, t)
+            if is_plain(plant, n.switched):
+                _find_plain(plant, c, h, terms)
+            else:
+                _find_own(plant, c, h, terms)
+            if not plant.par[n.switched].filtered:
+                return terms
+        else:
+            _find_together(plant, c, h, terms)
         x_1 = field(now, "terms")
         for k in range(n.n_converters):
             s, per_h = plant.st[k], 1.0 / h
+            if now.behind and k != n.switched:
+                continue
             v, i_o = x_1[1, own(k) + V], x_1[1, own(k) + I_O]
             s.slopes[0, 0], s.slopes[0, 1] = per_h * v.real, per_h * v.imag
             s.slopes[0, 2], s.slopes[0, 3] = per_h * i_o.real, per_h * i_o.imag
@@ -252,6 +265,34 @@ def look(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float) 
 
 
 @inlined
+def is_plain(plant: PlantRecords, k: int) -> bool:
+    """Return whether bridge k has two levels and no drops, and all its legs have a voltage."""
+    r = plant.par[k]
+    return bool(r.cancels and plant.st[k].open < 0 and r.levels == 2 and r.tau_dc == 0.0)
+
+
+@inlined
+def find_tangent(plant: PlantRecords, k: int, c: int) -> tuple[float, float, float, float, float]:
+    """Return the current of L_f at the beginning of an interval, p.u. of the network, what it
+    changes by in a second, and a bound of its second derivative there, of the only switched bridge;
+    in a network of a plain one."""
+    n, s = plant.net[0], plant.st[k]
+    if field(n, "alone")[c]:
+        x = field(plant.now[0], "vector")
+        return x[0, 0], x[0, 1], x[1, 0], x[1, 1], abs(x[2, 0]) + abs(x[2, 1])
+    q, by_v, by_i = field(n, "own_rates")[c, k, 0], s.di_v[0], s.di_i[0]
+    i_a, i_b, v_a, v_b, o_a, o_b, v_dc = (
+        s.ends[0, 0], s.ends[0, 1], s.ends[0, 2], s.ends[0, 3], s.ends[0, 4], s.ends[0, 5],
+        s.ends[0, DC],
+    )  # fmt: skip
+    di_a = by_v * (s.by_dc.real * v_dc - v_a) - by_i * i_a
+    di_b = by_v * (s.by_dc.imag * v_dc - v_b) - by_i * i_b
+    dv_a = q[0] * i_a + q[1] * v_a + q[2] * o_a
+    dv_b = q[0] * i_b + q[1] * v_b + q[2] * o_b
+    return i_a, i_b, di_a, di_b, by_v * (abs(dv_a) + abs(dv_b)) + by_i * (abs(di_a) + abs(di_b))
+
+
+@inlined
 def bend(plant: PlantRecords, k: int, c: int, h: float) -> float:
     """Return by how much the current of L_f may differ from a straight line in the interval, p.u.
     of the network: twice what its second derivative at the beginning gives."""
@@ -264,13 +305,15 @@ def bend(plant: PlantRecords, k: int, c: int, h: float) -> float:
 
 
 @inlined
-def accept(plant: PlantRecords, c: int, step: float, terms: int, tau: float) -> None:
-    """Take the states on to where ``ends`` lead, a part tau of the interval, after ``step`` s."""
+def accept(plant: PlantRecords, c: int, h: float, t: float, terms: int, tau: float) -> None:
+    """Take the states on to where ``ends`` lead, a part tau of an interval of h s from t on."""
     n, now = plant.net[0], plant.now[0]
     if field(n, "alone")[c]:
         x = field(now, "vector")
         for j in range(ORDER):
             x[0, j] = x[POWERS, j]
+    elif now.behind:
+        keep_moments(plant, h, t, terms, tau)
     else:
         x, w = field(now, "terms"), field(now, "w")
         source, speed = field(now, "source"), field(now, "source_speed")
@@ -280,11 +323,118 @@ def accept(plant: PlantRecords, c: int, step: float, terms: int, tau: float) -> 
                 y = complex(x[j, i].real + tau * y.real, x[j, i].imag + tau * y.imag)
             w[i] = y
         for k in range(now.n_s):
-            source[k] = source[k] * turned(speed[k] * step)
+            source[k] = source[k] * turned(speed[k] * tau * h)
     for k in range(n.n_converters):
         s = plant.st[k]
+        if now.behind and k != n.switched:
+            continue
         for j in range(MID + 1):
             s.ends[0, j] = s.ends[1, j]
+
+
+@compiled
+def _find_own(plant: PlantRecords, c: int, h: float, terms: int) -> None:
+    """``find_terms`` of the only switched bridge of a network, see `port`, with where it leads."""
+    n, now = plant.net[0], plant.now[0]
+    k = n.switched
+    r, s, at = plant.par[k], plant.st[k], own(k)
+    x, dc, ends = field(now, "terms"), field(now, "dc_terms"), s.ends
+    g, E = field(now, "port_g"), field(now, "port_E")
+    constants = _constants(plant, c, k)
+    per, R = r.L_f * r.current / (r.omega_b * h), r.R_f * r.current
+    for j in range(MID + 1):
+        ends[1, j] = ends[0, j]
+    i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg, flow, mid = (
+        ends[0, 0], ends[0, 1], ends[0, 2], ends[0, 3], ends[0, 4], ends[0, 5],
+        ends[0, DC], ends[0, REG], ends[0, SOURCE], ends[0, MID],
+    )  # fmt: skip
+    for j in range(terms + 1):
+        if j > 0:
+            E_a, E_b, d = v_a + R * i_a, v_b + R * i_b, h * _PER[j]
+            i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg, flow, mid = _own_term(
+                constants, 1.0 if j == 1 else 0.0, d,
+                i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg, flow, mid,
+            )  # fmt: skip
+            o_a += d * g[0, j - 1]
+            o_b += d * g[1, j - 1]
+            E[0, j - 1], E[1, j - 1] = E_a + j * per * i_a, E_b + j * per * i_b
+            if j < terms - 2:
+                drive_by_itself(plant, h, terms, j - 1)
+            ends[1, 0] += i_a
+            ends[1, 1] += i_b
+            ends[1, 2] += v_a
+            ends[1, 3] += v_b
+            ends[1, 4] += o_a
+            ends[1, 5] += o_b
+            ends[1, DC] += v_dc
+            ends[1, REG] += reg
+            ends[1, SOURCE] += flow
+            ends[1, MID] += mid
+        x[j, at + I_F], x[j, at + V], x[j, at + I_O] = (
+            complex(i_a, i_b), complex(v_a, v_b), complex(o_a, o_b)
+        )  # fmt: skip
+        dc[j, k, 0], dc[j, k, 1], dc[j, k, 2], dc[j, k, 3] = v_dc, reg, flow, mid
+
+
+@inlined
+def _find_plain(plant: PlantRecords, c: int, h: float, terms: int) -> None:
+    """``_find_own`` of a bridge of two levels without drops, all of whose legs have a voltage; it
+    is by_dc v_dc."""
+    n, now = plant.net[0], plant.now[0]
+    k = n.switched
+    r, s, at, q = plant.par[k], plant.st[k], own(k), field(n, "own_rates")[c, n.switched]
+    x, dc, ends = field(now, "terms"), field(now, "dc_terms"), s.ends
+    g, E, e_a, e_b = field(now, "port_g"), field(now, "port_E"), s.by_dc.real, s.by_dc.imag
+    per_C, per_L = r.omega_b / r.C_dc, s.di_v[0]
+    by_i, vi, vv, vo, ov, oo = s.di_i[0], q[0, 0], q[0, 1], q[0, 2], q[0, 3], q[0, 4]
+    free, held, drawn, k_i = 1.0, 0.0, -per_C * r.current, s.winds * r.k_i
+    if s.limit != 0.0:
+        free, held = 0.0, limit_of(s)
+    by_v, by_reg, fixed = -per_C * (free * r.k_p + s.chopper), per_C * free, held + free * r.k_p
+    fixed *= per_C
+    i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg = (
+        ends[0, 0], ends[0, 1], ends[0, 2], ends[0, 3], ends[0, 4], ends[0, 5],
+        ends[0, DC], ends[0, REG],
+    )  # fmt: skip
+    flow, mid, integrates = ends[0, SOURCE], ends[0, MID], k_i
+    ends[1, SOURCE], ends[1, MID] = flow, mid
+    i_a_to, i_b_to, v_a_to, v_b_to, o_a_to, o_b_to, v_dc_to, reg_to = (
+        i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg
+    )  # fmt: skip
+    for j in range(terms + 1):
+        x[j, at + I_F], x[j, at + V], x[j, at + I_O] = (
+            complex(i_a, i_b), complex(v_a, v_b), complex(o_a, o_b)
+        )  # fmt: skip
+        dc[j, k, 0], dc[j, k, 1], dc[j, k, 2], dc[j, k, 3] = v_dc, reg, flow, mid
+        E[0, j], E[1, j] = e_a * v_dc, e_b * v_dc
+        if j == terms:
+            break
+        if j < terms - 3:
+            drive_by_itself(plant, h, terms, j)
+        d = h * _PER[j + 1]
+        i_a, i_b, v_a, v_b, o_a, o_b, v_dc, reg = (
+            d * (per_L * (e_a * v_dc - v_a) - by_i * i_a),
+            d * (per_L * (e_b * v_dc - v_b) - by_i * i_b),
+            d * (vi * i_a + vv * v_a + vo * o_a),
+            d * (vi * i_b + vv * v_b + vo * o_b),
+            d * (ov * v_a + oo * o_a + g[0, j]),
+            d * (ov * v_b + oo * o_b + g[1, j]),
+            d * ((by_v * v_dc + by_reg * reg + fixed) + drawn * (e_a * i_a + e_b * i_b)),
+            d * (integrates - k_i * v_dc),
+        )  # fmt: skip
+        flow = mid = fixed = integrates = 0.0
+        i_a_to += i_a
+        i_b_to += i_b
+        v_a_to += v_a
+        v_b_to += v_b
+        o_a_to += o_a
+        o_b_to += o_b
+        v_dc_to += v_dc
+        reg_to += reg
+    ends[1, 0], ends[1, 1], ends[1, 2], ends[1, 3], ends[1, 4], ends[1, 5] = (
+        i_a_to, i_b_to, v_a_to, v_b_to, o_a_to, o_b_to
+    )  # fmt: skip
+    ends[1, DC], ends[1, REG] = v_dc_to, reg_to
 
 
 @compiled
