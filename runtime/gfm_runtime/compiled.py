@@ -11,11 +11,6 @@ has not changed. But a compiled function contains its callees, which are in othe
 update, a stale one would compute something else without a word. ``_Cache`` compiles again after any
 change of any of our compiled code.
 
-numba names a compiled function by its arguments, and a record among them by a number that counts
-the types of the process. The records of two sizes of plants, compiled by two processes, could so
-have one name: a third process that loads both would call either for both. ``_Named`` adds what the
-arguments hold to the name.
-
 A wheel may carry what numba would compile; ``_Cache`` looks there first (``wheel_code``).
 
 All act on the functions that are decorated here and on no others: a program that imports us keeps
@@ -48,16 +43,6 @@ _PLACES = {
 }
 #: rooms in these folders that generate text; no compiled function of another room calls theirs
 _TEXT_ONLY = ("firmware",)
-
-
-class _Named(Deferring):
-    """The compiler, with the types of the arguments in the name of what it compiles."""
-
-    def define_pipelines(self) -> Any:
-        """As numba asks for it, once a compilation and before it names anything."""
-        function, held = self.state.func_id, repr(self.state.args).encode()
-        function.unique_id = f"{function.unique_id}_{hashlib.sha256(held).hexdigest()[:16]}"
-        return super().define_pipelines()
 
 
 @cache
@@ -156,14 +141,14 @@ def _decorator(**options: Any) -> Any:
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any]) -> DeferredDispatcher:
-    return DeferredDispatcher(function, {}, {**options, "nopython": True}, _Named)
+    return DeferredDispatcher(function, {}, {**options, "nopython": True}, Deferring)
 
 
 def callback(
     function: Callable[..., Any], signature: Any, kept: bool = True, **options: Any
 ) -> CFunc:
     """Compile a function for callers in C, who use its ``address``; ``kept``: in our cache."""
-    made = CFunc(function, normalize_signature(signature), {}, options, _Named)
+    made = CFunc(function, normalize_signature(signature), {}, options, Deferring)
     if kept:
         made._cache = _Cache(function)  # type: ignore[attr-defined]
     made.compile()

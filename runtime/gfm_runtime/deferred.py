@@ -13,6 +13,8 @@ a function.
 
 from __future__ import annotations
 
+import hashlib
+from functools import cached_property
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -21,6 +23,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
+from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering
@@ -118,6 +121,18 @@ class _Library(JITCodeLibrary):
         return library
 
 
+def _mangler(name: str, arguments: tuple[Any, ...], **rest: Any) -> str:
+    """The name of a function for LLVM, with a digest of its arguments' types.
+
+    numba writes out the types. Those of our records have hundreds of fields, and each call would
+    have 20,000 characters. It also names a record by a number that counts the types of the process:
+    two sizes of plants, compiled by two processes, could have one name, and a third process that
+    loads both would call either for both.
+    """
+    digest = hashlib.sha256(repr(arguments).encode()).hexdigest()[:16]
+    return str(default_mangler(f"{name}.{digest}", (), **rest))
+
+
 class UnlinkedCode:
     """What Python will call, once it is made; ``nrt``: the function uses numba's runtime."""
 
@@ -193,7 +208,9 @@ class _Lowering(NativeLowering):
         flags.no_compile = True
         if not called_by_c:
             flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        state.targetctx = context.subtarget(mangler=_mangler)
         super().run_pass(state)
+        state.targetctx = context
         if not called_by_c:
             lowered = state["cr"]
             entry = UnlinkedCode(library, lowered.fndesc, lowered.env, flags.nrt)
@@ -213,12 +230,22 @@ class _Flags(Flags):
         return {**self._defaults, **self._values}
 
 
+class _Arguments(tuple[Any, ...]):
+    """Types of arguments, which numba writes out for each step of a compilation."""
+
+    _written = cached_property(tuple.__repr__)
+
+    def __repr__(self) -> str:
+        return self._written
+
+
 class Deferring(Compiler):
     """numba's compiler, up to the machine code."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.state.flags = _Flags(self.state.flags)
+        self.state.args = _Arguments(self.state.args)
 
     def define_pipelines(self) -> Any:
         """As numba asks for it, once a compilation."""
