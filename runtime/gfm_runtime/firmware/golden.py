@@ -233,86 +233,98 @@ def _drive(laws, instances, fresh, ranges, op, k, tuned, refs, ys, now, io, resu
         else:
             for j in range(n_y):
                 c.y[j] = ys[i, j]
-        if op[i] == INIT:
-            now[0], now[1], now[2], now[3], now[4] = k, 0, OK, k, -1
-            instances[k, 0] = fresh[0]
-            c.bump = 0
-            for j in range(NU_COUNTS):
-                c.held[j] = 0
-        elif op[i] == SWITCH:
-            old = now[0]
-            old_state, new_state = instances[old, now[1]], instances[k, 1 - now[1]]
-            c.bump = change_law(laws[now[3]], old_state, laws[k], new_state, c.ref, c.y, c.u)
-            if inner:
-                take_measurements(new_state, c.y)
-                settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
-            if counts:
-                go_on_with(new_state, old_state)
-            now[0], now[1], now[3], now[4] = k, 1 - now[1], k, -1
-        elif op[i] == RESET:
-            now[2] = OK
-            if now[4] >= 0:
-                now[3], now[4] = now[4], -1
-            old_state = instances[now[0], now[1]]
-            for j in range(NU):
-                c.u[j] = old_state.u[j]
-            if inner:
-                e_d, e_q = old_state.e[0], old_state.e[1]
-                settle_with_inner(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
-            else:
-                settle_into(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero)
-        elif op[i] == CALIBRATE:
-            state = instances[now[0], now[1]]
-            calibrate(laws[now[3]], state, c.adc, 0)
-            if state.suspect >= 0:
-                now[2] = BAD_SENSOR
-        elif op[i] >= TUNE:
-            now[4] = tuned + op[i]
-        law, state = laws[now[3]], instances[now[0], now[1]]
-        if op[i] == SPOIL:
-            state.offset[1] = math.nan
-        elif op[i] == SPOIL_STAGE:
-            state.away[0] = math.nan
-        if counts and now[2] == OK:
-            measure(law, state, c.adc, 0)
-            for j in range(NY_INNER):
-                c.y[j] = state.sensed[j]
-            if state.suspect >= 0:
-                now[2] = BAD_SENSOR
-        if now[2] == OK:
-            now[2] = _refusal(ranges, c.ref, c.y, n_y)
-        if now[2] == OK and now[4] >= 0:
-            new = laws[now[4]]
-            change_law(law, state, new, state, c.ref, c.y, c.u)
-            if inner:
-                take_measurements(state, c.y)
-                settle_inner(new, state, state.e[0], state.e[1])
-            law, now[3], now[4] = new, now[4], -1
-        if now[2] == OK:
-            if inner:
-                look_with_inner(law, state, c.ref, c.y, c.out)
-            else:
-                look(law, state, c.ref, c.y, c.u)
-                for j in range(NU):
-                    c.out[j] = c.u[j]
-            for j in range(n_u):
-                if not math.isfinite(c.out[j]):
-                    now[2] = BAD_U
-        if now[2] == OK:
-            if inner:
-                advance_with_inner(law, state)
-            else:
-                advance(law, state)
-            for j in range(n_u):
-                c.held[j] = c.out[j]
-            if counts:
-                modulate(law, state)
-                for x in range(N_LEGS):
-                    c.held[NU_INNER + x] = int(state.compare[x])
+        _carry_out(laws, instances, fresh, op[i], k, tuned, now, c, inner, counts)
+        _tick(laws, instances[now[0], now[1]], ranges, now, c, n_y, n_u, inner, counts)
         result[i], bump[i] = now[2], c.bump
         for j in range(u.shape[1]):
             u[i, j] = c.held[j]
-        after[i] = state
+        after[i] = instances[now[0], now[1]]
+
+
+@compiled
+def _carry_out(laws, instances, fresh, op, k, tuned, now, c, inner, counts):
+    """What a row asks for before its tick."""
+    if op == INIT:
+        now[0], now[1], now[2], now[3], now[4] = k, 0, OK, k, -1
+        instances[k, 0] = fresh[0]
+        c.bump = 0
+        for j in range(NU_COUNTS):
+            c.held[j] = 0
+    elif op == SWITCH:
+        old = now[0]
+        old_state, new_state = instances[old, now[1]], instances[k, 1 - now[1]]
+        c.bump = change_law(laws[now[3]], old_state, laws[k], new_state, c.ref, c.y, c.u)
+        if inner:
+            take_measurements(new_state, c.y)
+            settle_inner(laws[k], new_state, old_state.e[0], old_state.e[1])
+        if counts:
+            go_on_with(new_state, old_state)
+        now[0], now[1], now[3], now[4] = k, 1 - now[1], k, -1
+    elif op == RESET:
+        now[2] = OK
+        if now[4] >= 0:
+            now[3], now[4] = now[4], -1
+        old_state = instances[now[0], now[1]]
+        for j in range(NU):
+            c.u[j] = old_state.u[j]
+        if inner:
+            e_d, e_q = old_state.e[0], old_state.e[1]
+            settle_with_inner(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero, e_d, e_q)
+        else:
+            settle_into(laws[now[3]], old_state, c.ref, c.y, c.u, c.zero)
+    elif op == CALIBRATE:
+        state = instances[now[0], now[1]]
+        calibrate(laws[now[3]], state, c.adc, 0)
+        if state.suspect >= 0:
+            now[2] = BAD_SENSOR
+    elif op == SPOIL:
+        instances[now[0], now[1]].offset[1] = math.nan
+    elif op == SPOIL_STAGE:
+        instances[now[0], now[1]].away[0] = math.nan
+    elif op >= TUNE:
+        now[4] = tuned + op
+
+
+@compiled
+def _tick(laws, state, ranges, now, c, n_y, n_u, inner, counts):
+    """A tick of the instance in use, which is refused once a result other than OK is latched."""
+    law = laws[now[3]]
+    if counts and now[2] == OK:
+        measure(law, state, c.adc, 0)
+        for j in range(NY_INNER):
+            c.y[j] = state.sensed[j]
+        if state.suspect >= 0:
+            now[2] = BAD_SENSOR
+    if now[2] == OK:
+        now[2] = _refusal(ranges, c.ref, c.y, n_y)
+    if now[2] == OK and now[4] >= 0:
+        new = laws[now[4]]
+        change_law(law, state, new, state, c.ref, c.y, c.u)
+        if inner:
+            take_measurements(state, c.y)
+            settle_inner(new, state, state.e[0], state.e[1])
+        law, now[3], now[4] = new, now[4], -1
+    if now[2] == OK:
+        if inner:
+            look_with_inner(law, state, c.ref, c.y, c.out)
+        else:
+            look(law, state, c.ref, c.y, c.u)
+            for j in range(NU):
+                c.out[j] = c.u[j]
+        for j in range(n_u):
+            if not math.isfinite(c.out[j]):
+                now[2] = BAD_U
+    if now[2] == OK:
+        if inner:
+            advance_with_inner(law, state)
+        else:
+            advance(law, state)
+        for j in range(n_u):
+            c.held[j] = c.out[j]
+        if counts:
+            modulate(law, state)
+            for x in range(N_LEGS):
+                c.held[NU_INNER + x] = int(state.compare[x])
 
 
 @compiled

@@ -255,18 +255,7 @@ def _row(
     for factor in den:
         d, lead = poly_mul(d, [c / factor[-1] for c in factor]), lead * factor[-1]
     m = len(d) - 1
-    B: list[Matrix] = []
-    D: list[list[Any]] = []
-    for measured in (False, True):
-        columns = []
-        for error, feedback in zip(errors, feedbacks, strict=True):
-            on = [*over(error, den), *[0.0] * (m + 1)][: m + 1]
-            if measured:
-                back = [*over(feedback, den), *[0.0] * (m + 1)][: m + 1]
-                on = [-1.0 * x - y for x, y in zip(on, back, strict=True)]
-            columns.append([x / lead for x in on])
-        B.append([[(b[m - 1 - k] - b[m] * d[m - 1 - k]) / T[k] for b in columns] for k in range(m)])
-        D.append([b[m] for b in columns])
+    B, D = _inputs(errors, feedbacks, den, d, lead, T)
     if not m:
         return _Row([], [], [], [], D[0], D[1], [], [], [], [], [])
     A = [[0.0] * m for _ in range(m)]
@@ -290,13 +279,51 @@ def _row(
         )  # fmt: skip
         v = _mode(d, s, T)
         W = [x / _dot(c, v) * min(1.0, T_s / T_t) for x in v]
-    # of a change of law: nearest to the rest state, the output and its change right
+    at_rest = _mode(d, 0.0, T) if INTEGRATOR in den else None
+    E, f, g = _change(A_d, B, c, D, at_rest)
+    return _Row(A_d, B[0], B[1], c, D[0], D[1], W, E[0], E[1], f, g)
+
+
+def _inputs(
+    errors: Sequence[Element],
+    feedbacks: Sequence[Element],
+    den: tuple[Polynomial, ...],
+    d: Polynomial,
+    lead: Any,
+    T: Sequence[float],
+) -> tuple[list[Matrix], list[list[Any]]]:
+    """B and D of the references, and of the measurements, in continuous time."""
+    m = len(d) - 1
+    B: list[Matrix] = []
+    D: list[list[Any]] = []
+    for measured in (False, True):
+        columns = []
+        for error, feedback in zip(errors, feedbacks, strict=True):
+            on = [*over(error, den), *[0.0] * (m + 1)][: m + 1]
+            if measured:
+                back = [*over(feedback, den), *[0.0] * (m + 1)][: m + 1]
+                on = [-1.0 * x - y for x, y in zip(on, back, strict=True)]
+            columns.append([x / lead for x in on])
+        B.append([[(b[m - 1 - k] - b[m] * d[m - 1 - k]) / T[k] for b in columns] for k in range(m)])
+        D.append([b[m] for b in columns])
+    return B, D
+
+
+def _change(
+    A_d: Matrix,
+    B: Sequence[Matrix],
+    c: list[Any],
+    D: Sequence[list[Any]],
+    at_rest: list[Any] | None,
+) -> tuple[list[Matrix], list[Any], list[Any]]:
+    """E, f and g, which take the states at a change of law nearest to the rest state, with the
+    output and its change right; ``at_rest``: the mode of an integrator."""
+    m = len(c)
     move = _sum(A_d, _eye(m), -1.0)
     projector: Matrix = [[0.0] * m for _ in range(m)]
-    if INTEGRATOR in den:
-        v = _mode(d, 0.0, T)
+    if at_rest is not None:
         for k in range(m):
-            projector[k][m - 1] = v[k] / v[m - 1]
+            projector[k][m - 1] = at_rest[k] / at_rest[m - 1]
     drazin = _sum(_inverse(_sum(projector, move, -1.0)), projector, -1.0)
     slope = _product([c], move)[0]
     f, g = [x / _dot(c, c) for x in c], [0.0] * m
@@ -318,7 +345,7 @@ def _row(
                 for k in range(m)
             ]
         )
-    return _Row(A_d, B[0], B[1], c, D[0], D[1], W, E[0], E[1], f, g)
+    return E, f, g
 
 
 def _mode(d: Sequence[Any], s: Any, T: Sequence[float]) -> list[Any]:
