@@ -1,4 +1,4 @@
-"""Nine buses after the loss of a load and of a machine: speeds and rotor angles beside ANDES.
+"""Nine buses after the loss of a load, of a machine, and a fault: speeds and angles beside ANDES.
 
     python examples/ieee9/compare.py      # prints the largest distances
 
@@ -15,12 +15,14 @@ from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario import load_scenario
 from gfm_plant import Network, plant_command, plant_step
 from gfm_plant.components import SynchronousMachine
-from gfm_plant.grid import line_breaker
+from gfm_plant.grid import fault, line_breaker
 
 HERE = Path(__file__).parent
 EVENT_S, POINT_S, END_S = 1.0, 0.05, 6.0
 LOST = {"load": "load6", "machine": "M3"}
 """By event, the part whose breaker opens."""
+FAULT_BUS, FAULT_R, FAULT_S = "bus7", 0.1, 0.1
+"""Where the third event is, its resistance, p.u. of 100 MVA, and how long it lasts."""
 COLUMNS = ("omega_1", "omega_2", "omega_3", "delta_21", "delta_31")
 """Speeds, p.u., and angles of the rotors against the first, rad."""
 
@@ -50,7 +52,10 @@ def run(event: str) -> NDArray[np.float64]:
     each = round(POINT_S / T_s)
     for tick in range(1, round(END_S / T_s) + 1):
         if tick == round(EVENT_S / T_s) + 1:
-            line_breaker(plant, LOST[event], closed=False)
+            if event == "fault":  # p.u. of the converter's 10 MVA
+                fault(plant, None, FAULT_R / 10.0, FAULT_S, node=FAULT_BUS)
+            else:
+                line_breaker(plant, LOST[event], closed=False)
         plant_step(plant.records)
         if tick % each == 0:
             turns = plant.now[0]["unit"][machines["source"]]
@@ -69,6 +74,6 @@ def distances(event: str, theirs_of: str = "") -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    for case in ("machine", "load", "load, T = P / omega"):
+    for case in ("machine", "load", "load, T = P / omega", "fault"):
         each = distances(case.partition(",")[0], case)
         print(f"{case}: {', '.join(f'{name} {far:.2e}' for name, far in each.items())}")
