@@ -23,7 +23,14 @@ from cantools.database.can.c_source import generate
 from zmq.backend.cython import _zmq
 
 from gfm_hil.bench.c_code import compile_c
-from gfm_hil.bench.contenders import FRAME, Contender, free_port, fresh, memory_folder, of_link
+from gfm_hil.bench.contenders import (
+    FRAME,
+    Contender,
+    free_port,
+    fresh_endpoint,
+    memory_folder,
+    of_link,
+)
 from gfm_hil.bench.pair import Policy, pair
 from gfm_hil.bench.pingpong import Messages, Numbers, PingPong, over_link
 from gfm_hil.bench.rounds import in_turn, ratios, spread, spread_text
@@ -120,7 +127,7 @@ def candidates(links: list[str], place: Path) -> list[tuple[Contender, Contender
     for name in links:
         link, over_tcp = name.split()[0], name.endswith("tcp")
         own, other = (
-            f"tcp://127.0.0.1:{free_port()}" if over_tcp else fresh(link, place / part)
+            f"tcp://127.0.0.1:{free_port()}" if over_tcp else fresh_endpoint(link, place / part)
             for part in ("own", "c")
         )
         in_c = Contender(name + IN_C, link, other, _open, "C", longest=FRAME, library=library)

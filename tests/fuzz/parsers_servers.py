@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from gfm_hil.core.roles import ROLES
-from gfm_hil.engine.announcement import announcement
+from gfm_hil.engine.announcement import announcement_file
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -258,7 +258,7 @@ def _loop(place: Path, role: Any) -> Iterator[tuple[str, list[bool]]]:
     try:
         of = [(place, bench)], [timeline]
         with CommandServer(role, *of, bell.set, lambda: stopped.append(True)):
-            found = json.loads(announcement(place, role).read_text())
+            found = json.loads(announcement_file(place, role).read_text())
             yield found["endpoint"], stopped
         assert thread.is_alive()
     finally:

@@ -26,7 +26,7 @@ from gfm_runtime.signals import NU, NY, U_NAMES
 
 Vector = NDArray[np.float64]
 
-_GOLDEN = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 never meet
+_GOLDEN = (5.0**0.5 - 1.0) / 2.0  # irrational: no two of its multiples are equal modulo 1
 _AFFINE = 1e-9  # relative misfit at a point away from the base that still counts as affine
 
 
@@ -40,8 +40,8 @@ class FreeGain:
     high: float
 
     @property
-    def by_ratio(self) -> bool:
-        """Whether its logarithm is searched: for a gain that cannot change its sign."""
+    def logarithmic(self) -> bool:
+        """Whether synthesis searches its logarithm: its bounds keep it positive."""
         return self.low > 0.0
 
 
@@ -59,14 +59,14 @@ def free_gains(
         if name not in declared:
             known = sorted(declared)
             raise LawError(f"gain {name}", f"not free in {file.name}; free are {known}")
-    wanted = [n for n in declared if only is None or n in only]
+    chosen = [n for n in declared if only is None or n in only]
     for name in start or {}:
-        if name not in wanted:
-            raise LawError(f"gain {name}", f"has a start but is not among those to move, {wanted}")
-    if not wanted:
+        if name not in chosen:
+            raise LawError(f"gain {name}", f"has a start but is not among those to move, {chosen}")
+    if not chosen:
         raise LawError(f"law {file.name}", "declares no free gain (parameters.NAME.free)")
     gains = []
-    for name in wanted:
+    for name in chosen:
         p = declared[name]
         assert p.free is not None
         low, high = p.free
@@ -81,12 +81,12 @@ def free_gains(
     return tuple(gains)
 
 
-def _generic(gain: FreeGain, k: int) -> float:
+def _off_start(gain: FreeGain, k: int) -> float:
     """The k-th gain slightly away from its start, by a relative amount that no other gain has."""
     share = 1e-3 * (0.5 + (k + 1) * _GOLDEN % 1.0)
     step = share * (abs(gain.start) or min(1.0, abs(gain.low), abs(gain.high)))
-    moved = gain.start + step if gain.start + step <= gain.high else gain.start - step
-    return min(max(moved, gain.low), gain.high)
+    value = gain.start + step if gain.start + step <= gain.high else gain.start - step
+    return min(max(value, gain.low), gain.high)
 
 
 class GainedLaw:
@@ -108,7 +108,7 @@ class GainedLaw:
     ) -> None:
         self.file, self.gains = file, tuple(gains)
         self._op, self._ref, self._dc_control = op, ref, dc_control
-        self._off_start = np.array([_generic(g, k) for k, g in enumerate(self.gains)])
+        self._off_start = np.array([_off_start(g, k) for k, g in enumerate(self.gains)])
         self._affine = self._try_affine()
 
     @property
@@ -117,17 +117,17 @@ class GainedLaw:
         return self._affine is not None
 
     def named(self, values: Vector) -> dict[str, float]:
-        """The gains by name, tied parameters included."""
+        """The gains of ``values``, shape (n,), by name, and the parameters tied to them."""
         free = {g.name: float(v) for g, v in zip(self.gains, values, strict=True)}
         return tied(self.file, free)
 
     def __call__(self, values: Vector) -> LinearLaw:
         """The law at gains of shape (n,), or the laws at gains of shape (N, n) on a leading axis.
 
-        Gains that give no valid law give matrices of nan.
+        The matrices are NaN where the gains give no valid law.
         """
         if self._affine is None:
-            many = self._many(np.atleast_2d(values))
+            many = self._realise(np.atleast_2d(values))
             return many if np.ndim(values) == 2 else LinearLaw(*(m[0] for m in many.matrices))
         base, slopes = self._affine
         flat, ends = base + values @ slopes, np.cumsum([0, *map(math.prod, self._shapes)])
@@ -145,7 +145,8 @@ class GainedLaw:
         law = build_law(self.file, self.named(values))
         return linearise_law(law, realise(law), self._op, self._ref, self._dc_control)
 
-    def _many(self, values: Vector) -> LinearLaw:
+    def _realise(self, values: Vector) -> LinearLaw:
+        """The laws at gains of shape (N, n), each built from the file."""
         values = np.vstack([self._off_start, values])  # the first row determines the structure
         numbers = {n: np.full(len(values), p.value) for n, p in self.file.parameters.items()}
         numbers |= {g.name: values[:, k] for k, g in enumerate(self.gains)}
@@ -156,85 +157,87 @@ class GainedLaw:
         return LinearLaw(*(m[1:] for m in law.matrices))
 
     def _map(self, numbers: Mapping[str, Vector]) -> tuple[Vector, Vector]:
-        """The error map's slopes; stacked, if it depends on free gains."""
+        """The error map's slopes; with a leading axis of N, if it depends on free gains."""
         kind = self.file.error_map
-        given = [v for v in (kind.R, kind.X) if v is not None]
+        parts = [v for v in (kind.R, kind.X) if v is not None]
         shape = next(iter(numbers.values())).shape
-        impedance = [np.broadcast_to(evaluate("error_map", v, numbers), shape) for v in given]
-        rows = np.array(impedance).reshape(len(given), *shape).T
+        impedance = [np.broadcast_to(evaluate("error_map", v, numbers), shape) for v in parts]
+        rows = np.array(impedance).reshape(len(parts), *shape).T
         distinct, where = np.unique(rows, axis=0, return_inverse=True)
         slopes = [error_map_slopes(kind.type, row, self._op.y, self._ref) for row in distinct]
-        r, y = (np.array(part) for part in zip(*slopes, strict=True))
+        r, y = (np.array(slope) for slope in zip(*slopes, strict=True))
         return (r[0], y[0]) if len(distinct) == 1 else (r[where], y[where])
 
     def _try_affine(self) -> tuple[Vector, Vector] | None:
-        """The elements of all matrices at gains of zero (K,), and their slopes (n, K)."""
-        at = np.array([g.start for g in self.gains])
+        """The elements of all matrices at gains of zero, (K,), and their slopes, (n, K); None if
+        the law is not affine in the gains."""
+        start = np.array([g.start for g in self.gains])
         step = np.array([0.1 * (abs(g.start) or 1.0) for g in self.gains])
-        laws = [self.exact(at), self.exact(at + 0.7 * step)]
-        laws += [self.exact(at + aside) for aside in np.diag(step)]
+        laws = [self.exact(start), self.exact(start + 0.7 * step)]
+        laws += [self.exact(start + one) for one in np.diag(step)]
         self._shapes, *others = (tuple(m.shape for m in law.matrices) for law in laws)
         if any(shapes != self._shapes for shapes in others):
             return None
-        here, far, *sides = (np.concatenate([m.ravel() for m in o.matrices]) for o in laws)
-        slopes = (np.array(sides).reshape(len(at), len(here)) - here) / step[:, None]
-        misfit = np.abs(here + 0.7 * step @ slopes - far).max()
-        if misfit > _AFFINE * max(1.0, np.abs(here).max()):
+        base, check, *at_steps = (np.concatenate([m.ravel() for m in o.matrices]) for o in laws)
+        slopes = (np.array(at_steps).reshape(len(start), len(base)) - base) / step[:, None]
+        misfit = np.abs(base + 0.7 * step @ slopes - check).max()
+        if misfit > _AFFINE * max(1.0, np.abs(base).max()):
             return None
-        return here - at @ slopes, slopes
+        return base - start @ slopes, slopes
 
 
-_LINEAR = 0.01  # fraction of the bound up to which the coordinate is nearly linear
+_LINEAR = 0.01  # fraction of the larger bound up to which asinh is nearly linear
 
 
 class Encoding:
-    """Coordinates of gains, with their bounds.
+    """The coordinates in which a search moves gains: the logarithm of a gain that stays positive,
+    the inverse hyperbolic sine of any other. Equal steps then change large gains by like ratios.
 
     Attributes:
-        start, low, high: coordinates of the start and of the bounds.
+        start, low, high: coordinates of the start and of the bounds, shape (n,).
     """
 
     def __init__(self, gains: Sequence[FreeGain]) -> None:
-        self._by_ratio = np.array([g.by_ratio for g in gains])
+        self._logarithmic = np.array([g.logarithmic for g in gains])
         self._bounds = np.array([[g.low for g in gains], [g.high for g in gains]])
         self._linear = _LINEAR * np.abs(self._bounds).max(axis=0)
         self.start = self.coordinates(np.array([g.start for g in gains]))
         self.low, self.high = (self.coordinates(b) for b in self._bounds)
 
     def values(self, point: Vector) -> Vector:
-        """The gains at one point or at rows of points, clipped to the bounds."""
-        held = np.clip(point, self.low, self.high)
-        ratio = np.exp(np.where(self._by_ratio, held, 0.0))
-        other = self._linear * np.sinh(np.where(self._by_ratio, 0.0, held))
-        return np.clip(np.where(self._by_ratio, ratio, other), *self._bounds)
+        """The gains at coordinates of shape (n,) or (N, n), clipped to the bounds."""
+        inside = np.clip(point, self.low, self.high)
+        ratio = np.exp(np.where(self._logarithmic, inside, 0.0))
+        other = self._linear * np.sinh(np.where(self._logarithmic, 0.0, inside))
+        return np.clip(np.where(self._logarithmic, ratio, other), *self._bounds)
 
     def coordinates(self, values: Vector) -> Vector:
-        """The coordinates of gains."""
-        ratio = np.log(np.where(self._by_ratio, values, 1.0))
-        return np.where(self._by_ratio, ratio, np.arcsinh(values / self._linear))
+        """The coordinates of gains, of the same shape."""
+        ratio = np.log(np.where(self._logarithmic, values, 1.0))
+        return np.where(self._logarithmic, ratio, np.arcsinh(values / self._linear))
 
 
 Columns = Mapping[str, NDArray[np.float64]]  # parameters by name, shape (N,) each
 
 
-@np.errstate(all="ignore")  # such a row is not usable
+@np.errstate(all="ignore")  # rows out of bounds may divide by 0; they become NaN below
 def realise_each(file: LawFile, numbers: Columns) -> LawStateSpace:
     """The law at N sets of parameters: as ``realise``, every matrix with a leading axis of N.
 
     Rows in which an element is out of its bounds are NaN. In row 0 different factors must have
     different values.
     """
-    good = np.ones(max(len(c) for c in numbers.values()), dtype=bool)
+    valid = np.ones(max(len(c) for c in numbers.values()), dtype=bool)
     cells: dict[str, dict[str, Element]] = {"phi": {}, "psi": {}}
     for matrix, of in (("phi", file.phi), ("psi", file.psi)):
         for key, specs in of.items():
-            cells[matrix][key], fine = element_of(f"{matrix}_{key}", specs, numbers)
-            good &= fine
+            cells[matrix][key], within = element_of(f"{matrix}_{key}", specs, numbers)
+            valid &= within
     rows = []
     for i in range(NU):
         phi, psi = ([of.get(f"{i + 1}{j + 1}", ZERO) for j in range(NY)] for of in cells.values())
         rows.append(row_of(phi, psi, smooth=True))
     out = assemble(rows, [getattr(file.u_0, name) for name in U_NAMES])
-    A, D_y = (np.broadcast_to(m, (len(good), *m.shape[-2:])).copy() for m in (out.A, out.D_y))
-    A[~good], D_y[~good] = np.nan, np.nan
+    A, D_y = (np.broadcast_to(m, (len(valid), *m.shape[-2:])).copy() for m in (out.A, out.D_y))
+    A[~valid], D_y[~valid] = np.nan, np.nan
     return replace(out, A=A, D_y=D_y)

@@ -60,7 +60,8 @@ def look_between_ticks(
     Args:
         run: of one converter, whose law computed u.
         start, stop: from when to when, s.
-        step: the longest piece, s; edges and dead times end pieces besides.
+        step: the longest time between two points, s; every edge and every end of a dead time is
+            a point too.
 
     Raises:
         UserError: the bridge is averaged, the window is none, the controller is not ours, or the
@@ -262,7 +263,7 @@ def recover(folder: str | Path) -> Run | NetworkRun:
 
 
 def merge(first: str | Path, second: str | Path, folder: str | Path) -> Run:
-    """One run folder of the two that the sides of a run leave if they were started apart.
+    """One run folder from the two of a controller and a plant that were started separately.
 
     Raises:
         UserError: a folder is not that of one side, they are not of the same run or of the same

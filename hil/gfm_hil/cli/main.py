@@ -23,7 +23,7 @@ COMMANDS = {
     "run": ("run", "run a scenario and leave a run folder"),
     "command": ("command", "command a run that is going on, or print its newest tick"),
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
-    "merge": ("merge", "join the run folders of a controller and a plant started apart"),
+    "merge": ("merge", "join the run folders of a controller and a plant started separately"),
     **{name: ("", entry.text) for name, entry in PORTS.items()},
     "export": (
         "export",

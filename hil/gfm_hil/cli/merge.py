@@ -1,4 +1,4 @@
-"""gfmhil merge: one run folder of the two that sides started apart leave."""
+"""gfmhil merge: one run folder from the two of a controller and a plant started separately."""
 
 import argparse
 from pathlib import Path
@@ -10,8 +10,8 @@ from gfm_hil.results.report import PAGE
 
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
-        "Put the folders that gfmhil controller and gfmhil plant have left of one run together "
-        "into one folder with all signals, metrics, figures and the report. Both stay."
+        "Merge the folders that gfmhil controller and gfmhil plant recorded of one run into one "
+        "run folder with all signals, metrics, figures and the report. The two are kept."
     )
     command.add_argument("first", type=Path, metavar="A", help="folder of one side")
     command.add_argument("second", type=Path, metavar="B", help="folder of the other side")

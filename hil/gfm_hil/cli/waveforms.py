@@ -1,4 +1,4 @@
-"""gfmhil waveforms: what a switched bridge does between the ticks of a run."""
+"""gfmhil waveforms: currents and voltages of a switched bridge between the ticks of a run."""
 
 import argparse
 import json
@@ -22,21 +22,21 @@ _PICTURES, _TABLES = (".png", ".svg", ".pdf"), (".csv", ".npz")
 
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
-        "Repeat a run with a switched bridge in this process, and look at a window of it at every "
-        "edge: ripple, RMS current of the DC capacitor, and of windows of 10 cycles and more "
-        "distortion by IEC 61000-4-7; with a data sheet the losses."
+        "Repeat a run with a switched bridge in this process, and compute a window of it from "
+        "switching edge to switching edge: ripple, RMS current of the DC capacitor, in windows of "
+        "10 cycles and more the distortion by IEC 61000-4-7, and with a data sheet the losses."
     )
     command.add_argument("folder", type=Path, help="the run folder")
     command.add_argument("window", type=common.window, metavar="FROM:TO", help="the window, s")
     command.add_argument(
-        "--step", type=float, default=1e-6, metavar="S", help="longest piece, s (1e-6)"
+        "--step", type=float, default=1e-6, metavar="S", help="most between points, s (1e-6)"
     )
     command.add_argument(
         "--data-sheet", type=Path, metavar="FILE", help="values of the devices, for the losses"
     )
     command.add_argument(
         "-o", "--out", type=Path, action="append", default=[], metavar="FILE",
-        help="write the figure (.png, .svg, .pdf) or all pieces in V and A (.csv, .npz); may be"
+        help="write the figure (.png, .svg, .pdf) or all points in V and A (.csv, .npz); may be"
         " repeated",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="as JSON")
@@ -51,16 +51,16 @@ def call(options: argparse.Namespace) -> int:
     run = load_run(options.folder)
     start, stop = options.window
     between = run.between_ticks(start, stop, options.step)
-    found = _figures(between)
+    results = _results(between)
     if sheet is not None:
-        lost = between.losses(sheet)
-        found["losses_W"] = {**lost.conduction, **lost.switching, "total": lost.total}
+        losses = between.losses(sheet)
+        results["losses_W"] = {**losses.conduction, **losses.switching, "total": losses.total}
     if options.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(results, indent=2))
     else:
         rows = [
             (f"{name}: {part}" if part else name, f"{value:.4g}")
-            for name, values in found.items()
+            for name, values in results.items()
             for part, value in (values.items() if isinstance(values, dict) else [("", values)])
         ]
         terminal().print(Table(("", "value"), rows, text=None))
@@ -69,21 +69,21 @@ def call(options: argparse.Namespace) -> int:
     return 0
 
 
-def _figures(between: BetweenTicks) -> dict[str, Any]:
-    """What one reads off a window, by name."""
+def _results(between: BetweenTicks) -> dict[str, Any]:
+    """Ripple, RMS current and distortion of a window, by a name that ends in the unit."""
     b = between.bases
-    A = np.sqrt(2 / 3) * b.S_n / b.V_n
-    found: dict[str, Any] = {
-        "ripple_i_A": A * max(between.ripple(f"i_{phase}") for phase in "abc"),
+    I_b = np.sqrt(2 / 3) * b.S_n / b.V_n  # A, peak
+    results: dict[str, Any] = {
+        "ripple_i_A": I_b * max(between.ripple(f"i_{phase}") for phase in "abc"),
         "ripple_v_dc_V": b.V_dcref * between.ripple("v_dc"),
         "capacitor_rms_A": b.S_n / b.V_dcref * between.capacitor_rms(),
     }
     try:
         for name in ("i_a", "i_oa", "v_a", "u_a"):
-            found[name] = between.spectrum(name).distortion()
+            results[name] = between.spectrum(name).distortion()
     except UserError:
-        pass  # shorter than the standard's window
-    return found
+        pass  # the window is shorter than the 10 cycles of IEC 61000-4-7
+    return results
 
 
 def _write(file: Path, between: BetweenTicks, title: str) -> None:

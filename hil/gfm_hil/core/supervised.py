@@ -1,4 +1,4 @@
-"""Background work that survives its exceptions: they are reported, and the work restarts."""
+"""Background work that goes on after an exception: it is logged, and the work starts again."""
 
 import asyncio
 import logging
@@ -14,7 +14,7 @@ _LOG = logging.getLogger(__name__)
 
 
 async def supervised(name: str, work: Callable[[], Awaitable[None]]) -> None:
-    """Run the work until it returns; after an exception start it again."""
+    """Run the work until it returns; log an exception, and start it again after ``PAUSE_S``."""
     while True:
         try:
             return await work()
@@ -24,7 +24,7 @@ async def supervised(name: str, work: Callable[[], Awaitable[None]]) -> None:
 
 
 def attempt(name: str, work: Callable[[], None]) -> None:
-    """Run the work once, for loops that are not tasks; report an exception, then pause."""
+    """Run the work once, as a loop of a thread does; log an exception, then pause."""
     try:
         work()
     except Exception as problem:

@@ -1,4 +1,7 @@
-"""Which command servers a run folder announces; a killed process leaves its file behind."""
+"""The file by which a role tells other processes where its command server is.
+
+A process that is killed leaves the file behind, so a reader also checks that the process lives.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ class _Law(BaseModel):
 
 
 class Announcement(BaseModel):
-    """What a role that is running says of itself: where its command server is, and its laws."""
+    """Endpoint of a running role's command server, T_s in s, and the laws that are ready."""
 
     endpoint: str
     T_s: float = 0.0
@@ -32,19 +35,19 @@ class Announcement(BaseModel):
     laws: list[_Law] = []
 
 
-def announcement(folder: Path, role: Role) -> Path:
-    """The file in which a role's command server says how to reach it."""
+def announcement_file(folder: Path, role: Role) -> Path:
+    """The file of a run folder with the announcement of a role."""
     return folder / f"commands_{role}.json"
 
 
-def announced(folder: Path, role: Role) -> dict[str, Any] | None:
-    """What a role's command server announces, or None if no living process has one. Raises
+def read_announcement(folder: Path, role: Role) -> dict[str, Any] | None:
+    """The announcement of a role's command server, or None if it has none that runs. Raises
     UserError: the file or process cannot be examined; the run itself may be fine."""
-    file = announcement(folder, role)
+    file = announcement_file(folder, role)
     try:
-        found = Announcement(**read_json(file, Announcement))
-        place = Path(found.endpoint.removeprefix(SCHEME)).parent
-        return found.model_dump() if scratch.held(place) else None
+        server = Announcement(**read_json(file, Announcement))
+        place = Path(server.endpoint.removeprefix(SCHEME)).parent
+        return server.model_dump() if scratch.held(place) else None
     except FileNotFoundError:
         return None
     except OSError as problem:
@@ -53,15 +56,17 @@ def announced(folder: Path, role: Role) -> dict[str, Any] | None:
         raise UserError(f"{file}: endpoint: {problem}") from None
 
 
-def present(folder: Path) -> list[Role]:
-    """The roles whose command server is alive. Raises UserError: a file or process cannot be
+def running_roles(folder: Path) -> list[Role]:
+    """The roles whose command server runs. Raises UserError: a file or process cannot be
     examined."""
-    return [role for role in ROLES if announced(folder, role) is not None]
+    return [role for role in ROLES if read_announcement(folder, role) is not None]
 
 
 def not_running(folder: Path) -> UserError:
     """The error that no run is going on in a folder."""
-    of = sorted(path.parent.name for path in folder.glob("*/scenario.toml"))
-    if of and (folder / "scenario.toml").is_file():
-        return UserError(f"{folder}: is of a network; name the folder of a converter: one of {of}")
+    converters = sorted(path.parent.name for path in folder.glob("*/scenario.toml"))
+    if converters and (folder / "scenario.toml").is_file():
+        return UserError(
+            f"{folder}: is of a network; name the folder of a converter: one of {converters}"
+        )
     return UserError(f"{folder}: no run is going on there")

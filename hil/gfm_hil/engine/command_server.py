@@ -26,7 +26,7 @@ from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement
+from gfm_hil.engine.announcement import LARGEST, SCHEME, announcement_file
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.scenario.events import AnyEvent
@@ -92,7 +92,7 @@ class CommandServer:
 
     def __exit__(self, *_: object) -> None:
         for folder, _bench in self._places:
-            announcement(folder, self._role).unlink(missing_ok=True)
+            announcement_file(folder, self._role).unlink(missing_ok=True)
         self._over.set()
         self._thread.join()
         self._resources.close()
@@ -106,7 +106,7 @@ class CommandServer:
                 {"label": label, "name": name, "title": c.titles[name], "gains": gains}
                 for label, name, gains in zip(c.labels, c.names, c.changed, strict=True)
             ]
-            place = announcement(folder, self._role)
+            place = announcement_file(folder, self._role)
             new = place.with_suffix(".new")
             new.write_text(json.dumps(content), encoding="utf-8")
             new.replace(place)

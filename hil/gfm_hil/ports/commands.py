@@ -10,7 +10,7 @@ import zmq
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity, local
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.announcement import LARGEST, announced, not_running, present
+from gfm_hil.engine.announcement import LARGEST, not_running, read_announcement, running_roles
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.scenario.events import EVENTS
 from gfm_plant import TRIP_REASONS
@@ -36,7 +36,7 @@ class Operator:
     def __init__(self, folder: Path, through: str = "python") -> None:
         self._folder, self._local = folder, local(through)
         self._context, self.run = zmq.Context(), LiveRun(folder)
-        if not present(folder):
+        if not running_roles(folder):
             raise not_running(folder)
 
     def close(self) -> None:
@@ -69,7 +69,7 @@ class Operator:
     def stop(self, by: Identity | None = None) -> None:
         """Stop the run as Ctrl-C does; with a converter of a network, all of it. Raises UserError:
         the run does not answer."""
-        running = present(self._folder)
+        running = running_roles(self._folder)
         if running:
             self._ask("plant" if "plant" in running else running[0], {"type": "stop"}, by)
 
@@ -94,7 +94,7 @@ class Operator:
             found |= run.row("controller", done - 1)
             found["state"] = self._word("state", dict(enumerate(STATES)), found["state"])
             found["reason"] = self._word("reason", dict(enumerate(REASONS)), run.safe_reason)
-            if (server := announced(self._folder, "controller")) is not None:
+            if (server := read_announcement(self._folder, "controller")) is not None:
                 law = self._word("law", dict(enumerate(server["laws"])), found["law"])
                 found["active"], found["gains"] = law["name"], law["gains"]
                 found["law_title"] = law["title"]
@@ -108,7 +108,7 @@ class Operator:
         return words[int(code)]
 
     def _ask(self, role: Role, event: dict[str, Any], by: Identity | None) -> dict[str, Any]:
-        server = announced(self._folder, role)
+        server = read_announcement(self._folder, role)
         if server is None:
             raise UserError(f"{self._folder}: the {role} is not running")
         try:

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.supervised import PAUSE_S, report
-from gfm_hil.engine.announcement import not_running, present
+from gfm_hil.engine.announcement import not_running, running_roles
 from gfm_hil.links.zeromq.options import beyond_loopback
 from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.commands import Operator
@@ -88,7 +88,7 @@ class BesideRun:
         if not self._gone and now >= self._next_look:
             self._next_look = now + _LOOK_S
             try:
-                self._gone = not any(map(present, self.places.values()))
+                self._gone = not any(map(running_roles, self.places.values()))
             except (OSError, UserError) as problem:
                 report("the look whether the run goes on", problem)
                 self._next_look = now + PAUSE_S
@@ -97,7 +97,7 @@ class BesideRun:
     def wait(self, commands: bool = True) -> None:
         """With ``--wait`` wait until the run records or, if it needs them, takes ``commands``.
         Raises KeyboardInterrupt: the port is to end."""
-        there = present if commands else recorded
+        there = running_roles if commands else recorded
         while self._patient and not all(map(there, self.places.values())):
             if self.interrupted:
                 raise KeyboardInterrupt

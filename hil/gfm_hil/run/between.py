@@ -51,7 +51,7 @@ class BetweenTicks:
         bases: of the converter.
         C_dc: the DC capacitor, p.u.
         T_s: the sampling time, s.
-        step: the longest piece, s.
+        step: the longest time between two points, s.
     """
 
     t: NDArray[np.float64]
@@ -164,7 +164,7 @@ def between_ticks(
         run: of one converter with a switched bridge.
         scenario: what the run repeats, in process.
         start, stop: from when to when, s, whole ticks.
-        step: the longest piece, s.
+        step: the longest time between two points, s.
 
     Raises:
         UserError: the bridge is averaged, the window is none, the controller is not ours, or the

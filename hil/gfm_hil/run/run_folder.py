@@ -1,8 +1,8 @@
 """The folder of a run: whether it may be used, and how its files are made.
 
 ``summary.json`` is written last. While it is missing, the folder still holds all that the other
-files are made of, and ``recover`` can make them again. ``merge_roles`` makes one folder of the two
-that the sides of a run leave if they were started apart.
+files are made of, and ``recover`` can make them again. ``merge_roles`` makes one folder from
+the two of a controller and a plant that were started separately.
 """
 
 import contextlib

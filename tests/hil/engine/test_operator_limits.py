@@ -12,7 +12,7 @@ import zmq
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.rate import Rate
-from gfm_hil.engine.announcement import announced, present
+from gfm_hil.engine.announcement import read_announcement, running_roles
 from gfm_hil.engine.command_server import CommandServer
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
@@ -53,7 +53,7 @@ def ends(make, tmp_path):
 
 def ask(folder: Path, *messages: bytes) -> list[dict[str, Any]]:
     """The command server's answers to raw messages."""
-    server = announced(folder, "controller")
+    server = read_announcement(folder, "controller")
     assert server is not None
     answers = []
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
@@ -113,18 +113,18 @@ def test_an_exception_of_ours_is_answered(ends, tmp_path, monkeypatch, caplog, a
 def test_no_descriptor_left_is_not_the_end_of_a_run(ends, run, tmp_path, monkeypatch, attack_now):
     record = open_recording(run().folder)
     record.folder = tmp_path
-    assert present(tmp_path) == ["controller"] and record.ended() is None
+    assert running_roles(tmp_path) == ["controller"] and record.ended() is None
 
     def full(*_: Any, **__: Any) -> Any:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    checks = (lambda: present(tmp_path), lambda: Operator(tmp_path), record.ended)
+    checks = (lambda: running_roles(tmp_path), lambda: Operator(tmp_path), record.ended)
     with monkeypatch.context() as patch:
         patch.setattr(os, "open", full)
         for check in checks:
             with pytest.raises((UserError, OSError), match="Too many open files"):
                 check()
-    assert present(tmp_path) == ["controller"] and record.ended() is None
+    assert running_roles(tmp_path) == ["controller"] and record.ended() is None
     attack_now("reported as what it is, 3 of 3 times; then the run goes on")
 
 
@@ -133,7 +133,7 @@ def test_only_a_folder_that_is_gone_is_gone(tmp_path):
         assert scratch.held(place)
         (tmp_path / "commands_plant.json").write_text("[1]", encoding="utf-8")
         with pytest.raises(UserError, match=r"commands_plant\.json: must be an object"):
-            present(tmp_path)
+            running_roles(tmp_path)
     assert not scratch.held(place)
 
 

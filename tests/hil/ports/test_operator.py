@@ -10,7 +10,7 @@ import pytest
 
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.announcement import present
+from gfm_hil.engine.announcement import running_roles
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
 
@@ -157,13 +157,13 @@ def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
     with scratch.temporary("gfmhil-commands-") as place:
         endpoint = {"endpoint": f"ipc://{place}/plant"}
         (tmp_path / "commands_plant.json").write_text(json.dumps(endpoint), encoding="utf-8")
-        assert present(tmp_path) == ["plant"]
+        assert running_roles(tmp_path) == ["plant"]
         Operator(tmp_path).close()
     place.mkdir()  # as after SIGKILL
     try:
-        assert present(tmp_path) == []
+        assert running_roles(tmp_path) == []
         with pytest.raises(UserError, match="no run is going on there"):
             Operator(tmp_path)
     finally:
         place.rmdir()
-    assert present(tmp_path) == []
+    assert running_roles(tmp_path) == []

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gfm_hil.engine.announcement import present
+from gfm_hil.engine.announcement import running_roles
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.modbus.device import Device
 from gfm_hil.ports.scope.channels import make_channels
@@ -77,7 +77,7 @@ def bench(link: str, place: Path) -> Iterator[tuple[Clients, dict[str, subproces
                        "--prometheus", "0")  # fmt: skip
         scope = start("scope", "scope", str(folder), "--wait", "--port", "0")
         run = start("run", "run", str(file), "--out", str(folder), "--quiet", "--no-figures")
-        wait_for(lambda: has_run(folder, 100) and len(present(folder)) == 2, run)
+        wait_for(lambda: has_run(folder, 100) and len(running_roles(folder)) == 2, run)
         served = start("modbus", "modbus", str(folder), "--port", "0", "--heartbeat", "0")
         (modbus,) = map(int, re.findall(r":(\d+), unit 1", next(iter(served.stdout or ()))))
         look, control = addresses(iter(scope.stdout or ()))

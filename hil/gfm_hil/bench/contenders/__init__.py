@@ -28,12 +28,12 @@ from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.children import GRACE_S
 from gfm_runtime.signals import NY
 
-FRAME = wire_dtype(NY).itemsize  # bytes of y; the answer is a u
+FRAME = wire_dtype(NY).itemsize  # bytes of the frame with y; the reply is the one with u
 #: files of this folder with links and limits, in the order of the tables. Each has a function
-#: ``contenders(names, place)`` that yields what it adds to the links and peers of these names;
-#: place is a folder in memory with a short path.
+#: ``contenders(names, folder)`` that yields what it adds to the links and peers of these names;
+#: folder is a ``memory_folder``.
 FILES = ("udp", "shm", "zmq", "serial")
-#: files of what one would pick instead, and the packages that each needs
+#: files of other packages' transports, and the packages that each needs
 PEERS = {
     "cyclonedds": ("cyclonedds",),
     "grpc": ("grpc",),
@@ -72,23 +72,23 @@ class Contender:
 
 
 def missing_packages(peer: str) -> list[str]:
-    """What a peer needs and is not installed."""
+    """The packages that a peer needs and that are not installed."""
     return [package for package in PEERS[peer] if find_spec(package) is None]
 
 
 def contenders_of(
-    names: Sequence[str], place: Path, more: Sequence[Contender] = ()
+    names: Sequence[str], folder: Path, more: Sequence[Contender] = ()
 ) -> tuple[list[Contender], list[str]]:
     """The contenders of links and peers, ``more`` of them, and their limits; and remarks: without a
-    C compiler there are no limits. ``place`` is an empty folder in memory with a short path."""
+    C compiler there are no limits. ``folder`` is an empty ``memory_folder``."""
     files = [import_module(f"{__name__}.{name}") for name in (*FILES, *PEERS)]
-    each: list[Contender] = [one for file in files for one in file.contenders(names, place)]
+    each: list[Contender] = [one for file in files for one in file.contenders(names, folder)]
     each += more
-    wanted = {one.limit for one in each if one.source is None}
-    every = [one for one in each if one.source is None or one.name in wanted]
+    limits = {one.limit for one in each if one.source is None}
+    every = [one for one in each if one.source is None or one.name in limits]
     try:
         libraries = {
-            source: compile_c(source, place, f"{source.stem}_pingpong")
+            source: compile_c(source, folder, f"{source.stem}_pingpong")
             for source in dict.fromkeys(c.source for c in every if c.source is not None)
         }
     except NoCompiler as problem:
@@ -116,7 +116,7 @@ def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
 
 
 class PackageEnd:
-    """Base of one end by another package, driven from Python as a link is."""
+    """Base of one end of another package's transport; Python drives it like a link."""
 
     port = None
 
@@ -127,7 +127,7 @@ class PackageEnd:
 def of_package(
     name: str, link: str, endpoint: str, kind: type[PackageEnd], peer: str, limit: str
 ) -> Contender:
-    """What one would pick instead: an end is ``kind``, of the package ``peer``."""
+    """A transport of the package ``peer``, whose ends are of the class ``kind``."""
     return Contender(name, link, endpoint, partial(_open_package, kind), peer, limit=limit)
 
 
@@ -139,16 +139,17 @@ def limit(
     name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong],
     longest: int = 65507,
 ) -> Contender:  # fmt: skip
-    """A limit in C, of the source beside a Python file; ``end`` opens one by ``pingpong.in_c``."""
+    """A limit in C, whose source stands beside a Python file; ``end`` opens an end of it by
+    ``pingpong.in_c``."""
     source = Path(file).with_suffix(".c")
     return Contender(
         name, source.stem, endpoint, end, "C", limit=name, source=source, longest=longest
     )
 
 
-def fresh(link: str, place: Path) -> str:
+def fresh_endpoint(link: str, folder: Path) -> str:
     """A new endpoint of a link."""
-    folder = place / link
+    folder = folder / link
     folder.mkdir(parents=True)
     return link_kind(link).fresh(folder)
 
@@ -161,10 +162,10 @@ def free_port() -> int:
 
 
 def memory_folder(stack: ExitStack) -> Path:
-    """A folder with a short path that goes with the stack, or with this process if it is killed; in
-    memory if /dev/shm exists."""
-    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    folder = tempfile.mkdtemp(prefix="gfmhil-", dir=place)
+    """A folder that is removed with the stack, or with this process if it is killed; in memory if
+    /dev/shm exists. Its path is short, since that of a Unix socket has at most 107 bytes."""
+    memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    folder = tempfile.mkdtemp(prefix="gfmhil-", dir=memory)
     # if this process is killed, plant and controller write in the folder until they have ended
     remove = f'read _ || sleep {5 * GRACE_S}; rm -rf "$0"'
     guard = subprocess.Popen(

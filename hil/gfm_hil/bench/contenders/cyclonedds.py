@@ -17,7 +17,7 @@ _SETTINGS = """<CycloneDDS><Domain><General>
 _DOMAINS = 230  # numbers that a domain may have
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "cyclonedds" in names:
         domain = str(1 + os.getpid() % _DOMAINS)
         yield of_package("cyclonedds", "cyclonedds", domain, Dds, "cyclonedds", udp.LIMIT)

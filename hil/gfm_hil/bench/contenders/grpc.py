@@ -13,9 +13,9 @@ _SERVICE, _METHOD = "gfmhil", "exchange"
 _START_S = 10.0
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "grpc" in names:
-        yield Contender("grpc", "grpc", f"unix:{place}/grpc", _open, "grpcio", limit=udp.LIMIT)
+        yield Contender("grpc", "grpc", f"unix:{folder}/grpc", _open, "grpcio", limit=udp.LIMIT)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

@@ -13,7 +13,7 @@ from gfm_hil.core.roles import Role
 _ROOM = 64  # messages, as in the links
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "iceoryx2" in names:
         name = f"gfmhil-{secrets.token_hex(8)}"
         yield of_package("iceoryx2", "iceoryx2", name, Iceoryx2, "iceoryx2", shm.LIMIT)

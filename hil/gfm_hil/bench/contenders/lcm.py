@@ -9,7 +9,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "lcm" in names:
         port = 10_000 + os.getpid() % 20_000
         group = f"udpm://239.255.76.67:{port}?ttl=0"  # ttl 0: the packets stay on this machine

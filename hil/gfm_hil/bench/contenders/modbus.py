@@ -18,7 +18,7 @@ from gfm_hil.links.port import Port
 _MOST = 121  # registers that function 23 may write
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "modbus" in names:
         port = str(free_port())
         yield Contender("modbus tcp", "modbus", port, _open, "pymodbus", limit=udp.LIMIT)

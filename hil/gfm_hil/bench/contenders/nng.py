@@ -7,9 +7,9 @@ from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_packag
 from gfm_hil.core.roles import Role
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "nng" in names:
-        ipc, tcp = f"ipc://{place}/nng", f"tcp://127.0.0.1:{free_port()}"
+        ipc, tcp = f"ipc://{folder}/nng", f"tcp://127.0.0.1:{free_port()}"
         yield of_package("nng ipc", "nng", ipc, Nng, "pynng", zmq.IPC)
         yield of_package("nng tcp", "nng", tcp, Nng, "pynng", zmq.TCP)
 
@@ -20,7 +20,7 @@ class Nng(PackageEnd):
     def __init__(self, role: Role, endpoint: str) -> None:
         import pynng
 
-        self._socket, self._nothing = pynng.Pair0(), pynng.TryAgain
+        self._socket, self._no_message = pynng.Pair0(), pynng.TryAgain
         if endpoint.startswith("tcp"):
             self._socket.tcp_nodelay = True
         if role == "controller":
@@ -35,7 +35,7 @@ class Nng(PackageEnd):
     def receive(self) -> bytes | None:
         try:
             return bytes(self._socket.recv(block=False))
-        except self._nothing:
+        except self._no_message:
             return None
 
     def close(self) -> None:

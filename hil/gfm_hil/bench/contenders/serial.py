@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
+from gfm_hil.bench.contenders import Contender, fresh_endpoint, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 from gfm_hil.links import open_link
@@ -14,10 +14,10 @@ from gfm_hil.links.serial.link import SerialLink
 LIMIT = "C serial"
 
 
-def contenders(links: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(links: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "serial" in links:
-        yield limit(LIMIT, __file__, fresh("serial", place / "c"), _open, LONGEST)
-        yield of_link("serial", "serial", fresh("serial", place), LIMIT)
+        yield limit(LIMIT, __file__, fresh_endpoint("serial", folder / "c"), _open, LONGEST)
+        yield of_link("serial", "serial", fresh_endpoint("serial", folder), LIMIT)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.bench.contenders import Contender, fresh, limit, of_link
+from gfm_hil.bench.contenders import Contender, fresh_endpoint, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 from gfm_hil.links.base import LONGEST
@@ -15,10 +15,10 @@ _SLOTS = 2 * 1024  # bytes, two slot_t
 LIMIT = "C shm"
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
-    yield limit(LIMIT, __file__, str(place / "slots"), _open, LONGEST)
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
+    yield limit(LIMIT, __file__, str(folder / "slots"), _open, LONGEST)
     if "shm" in names:
-        yield of_link("shm", "shm", fresh("shm", place), LIMIT)
+        yield of_link("shm", "shm", fresh_endpoint("shm", folder), LIMIT)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

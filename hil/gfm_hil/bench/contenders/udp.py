@@ -5,17 +5,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gfm_hil.bench.contenders import FILES, PEERS, Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.contenders import (
+    FILES,
+    PEERS,
+    Contender,
+    free_port,
+    fresh_endpoint,
+    limit,
+    of_link,
+)
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.roles import Role
 
 LIMIT = "C udp"
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     yield limit(LIMIT, __file__, f"{free_port()},{free_port()}", _open)
     for link in [name for name in names if name not in FILES and name not in PEERS]:
-        yield of_link(link, link, fresh(link, place), LIMIT)
+        yield of_link(link, link, fresh_endpoint(link, folder), LIMIT)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

@@ -11,7 +11,7 @@ from gfm_hil.core.roles import Role
 _ROOM = 64  # messages, as in the links
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
     if "zenoh" in names:
         tcp = f"tcp/127.0.0.1:{free_port()}"
         yield of_package("zenoh tcp", "zenoh", tcp, Zenoh, "zenoh", udp.LIMIT)

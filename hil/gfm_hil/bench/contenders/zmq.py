@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from gfm_hil.bench.contenders import Contender, free_port, fresh, limit, of_link
+from gfm_hil.bench.contenders import Contender, free_port, fresh_endpoint, limit, of_link
 from gfm_hil.bench.pingpong import Messages, PingPong, in_c
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
@@ -14,8 +14,8 @@ from gfm_hil.links.base import LONGEST
 IPC, TCP = "C zmq ipc", "C zmq tcp"
 
 
-def contenders(names: Sequence[str], place: Path) -> Iterator[Contender]:
-    ipc, tcp = fresh("zmq", place), "tcp://127.0.0.1"
+def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
+    ipc, tcp = fresh_endpoint("zmq", folder), "tcp://127.0.0.1"
     yield limit(IPC, __file__, f"{ipc}-c", _open, LONGEST)
     yield limit(TCP, __file__, f"{tcp}:{free_port()}", _open, LONGEST)
     if "zmq" in names:

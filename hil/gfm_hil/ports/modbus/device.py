@@ -150,13 +150,13 @@ class Device:
             run = self._look()
             if run is not None and run.tick != self._seen:  # the device of a stalled run is dead
                 self._beats, self._seen = self._beats + 1, run.tick
-        if self._heart.expire(now):
+        if self._heart.lost(now):
             for set_point in self._set_points:
                 set_point.end(now)
-        for set_point in [s for s in self._set_points if s.expire(now)]:
+        for set_point in [s for s in self._set_points if s.expired(now)]:
             async with self._lock:
                 run = self._look()
-                if run is None or not set_point.expire(now):  # a client has just written it
+                if run is None or not set_point.expired(now):  # a client has just written it
                     continue
                 try:
                     await self._carry_out([set_point.revert(run, now)])
@@ -186,19 +186,19 @@ class Device:
         return None
 
     async def _write(self, address: int, registers: list[int]) -> None:
-        cut = self.image.cut(address, registers)
-        if cut is None:
+        points = self.image.split(address, registers)
+        if points is None:
             raise Refusal(ExcCodes.ILLEGAL_ADDRESS, f"{address}: no whole points")
-        for point, _ in cut:
+        for point, _ in points:
             if not self.writable(point):
                 raise Refusal(ExcCodes.ILLEGAL_ADDRESS, f"{point.path}: is not for writing")
-        if self.local and any(point.path != "715.ControllerHb" for point, _ in cut):
+        if self.local and any(point.path != "715.ControllerHb" for point, _ in points):
             raise Refusal(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
         async with self._lock:
             run = self._look()
             if run is None:
                 raise Refusal(ExcCodes.DEVICE_FAILURE, "the run has not begun")
-            plans = self._plans(cut, run)
+            plans = self._plans(points, run)
             _count(plans)
             try:
                 await self._carry_out(plans)
@@ -207,11 +207,11 @@ class Device:
         self.refresh()
 
     def _plans(
-        self, cut: Sequence[tuple[SunSpecPoint, Sequence[int]]], run: RunState
+        self, points: Sequence[tuple[SunSpecPoint, Sequence[int]]], run: RunState
     ) -> list[Effect]:
         by_group: dict[PointGroup, dict[str, Value]] = {}
         try:
-            for point, part in cut:
+            for point, part in points:
                 value = point.decode(part)
                 if value is None:
                     raise ValueError(f"{point.path}: no value")
@@ -233,10 +233,10 @@ class Device:
                         self._forget()
         except UserError:
             for plan in plans:
-                plan.fail()
+                plan.on_refusal()
             raise
         for plan in plans:
-            plan.keep()
+            plan.on_success()
 
     def _forget(self) -> None:
         for group in self._groups:

@@ -105,7 +105,7 @@ class Image:
 
     def __init__(self, models: Mapping[int, Mapping[str, Any]]) -> None:
         self.points: dict[str, SunSpecPoint] = {}
-        self._set: dict[str, object] = {}
+        self._written: dict[str, object] = {}  # newest value of each path
         self.registers: list[int] = [*struct.unpack(">2H", b"SunS")]
         for number, content in models.items():
             model = sunspec.Model(number, model_def=definition(number), data=dict(content))
@@ -124,47 +124,48 @@ class Image:
 
     def set(self, path: str, value: Value) -> None:
         """Write a value to a point's registers."""
-        if self._set.get(path, self) == value:  # most values do not change between refreshes
+        if self._written.get(path, self) == value:  # most values do not change between refreshes
             return
-        self._set[path] = value
+        self._written[path] = value
         point = self.points[path]
-        self.registers[self._place(point)] = point.encode(value)
+        self.registers[self._registers_of(point)] = point.encode(value)
 
     def get(self, path: str) -> Value:
         """The value that a point's registers hold."""
         point = self.points[path]
-        return point.decode(self.registers[self._place(point)])
+        return point.decode(self.registers[self._registers_of(point)])
 
-    def _place(self, point: SunSpecPoint) -> slice:
+    def _registers_of(self, point: SunSpecPoint) -> slice:
         return slice(point.address - BASE, point.address - BASE + point.length)
 
-    def cut(
+    def split(
         self, address: int, registers: Sequence[int]
     ) -> list[tuple[SunSpecPoint, Sequence[int]]] | None:
-        """The points that these registers make up, or None if they contain a point in part."""
-        found, at = [], 0
+        """The points of the registers from an address on, each with its registers; None if the
+        first or last one is within a point, or a register belongs to none."""
+        points, at = [], 0
         while at < len(registers):
             point = self._by_address.get(address + at)
             if point is None or at + point.length > len(registers):
                 return None
-            found.append((point, registers[at : at + point.length]))
+            points.append((point, registers[at : at + point.length]))
             at += point.length
-        return found
+        return points
 
 
 def definition(number: int) -> dict[str, Any]:
     """A model's definition, from this package if it has one, else from pysunspec2."""
     if number not in own_models():
         return dict(sunspec.get_model_def(number))
-    found: dict[str, Any] = json.loads(own_models()[number].read_text(encoding="utf-8"))
-    sunspec.add_mappings(found["group"])
-    return found
+    model: dict[str, Any] = json.loads(own_models()[number].read_text(encoding="utf-8"))
+    sunspec.add_mappings(model["group"])
+    return model
 
 
 def own_models() -> dict[int, Traversable]:
-    """The files of the models that pysunspec2 does not ship, by number, for clients."""
-    found = files("gfm_hil.ports.modbus").joinpath("models").iterdir()
-    return {int(f.name[len("model_") : -len(".json")]): f for f in found}
+    """The files of the models that pysunspec2 does not ship, by number; clients need them too."""
+    folder = files("gfm_hil.ports.modbus").joinpath("models").iterdir()
+    return {int(f.name[len("model_") : -len(".json")]): f for f in folder}
 
 
 def _walk(group: Any, path: str) -> Iterator[tuple[str, Any]]:

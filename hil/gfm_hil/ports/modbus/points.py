@@ -1,4 +1,4 @@
-"""The points that clients write, in groups with a common meaning, and what a write causes.
+"""The points that clients write, in groups that act together, and the effect of a write.
 
 - Set-points of model 704: a value, its mode, its enable, and the timer that reverts them. One that
   has not been written since it was last disabled reads as the reference in force, so that enabling
@@ -22,6 +22,7 @@ omega_u too; it has D_q if its file names it and phi_34(0)/phi_35(0), or its lim
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,20 +60,23 @@ def droops(file: LawFile, changed: Mapping[str, float]) -> Droops:
     changed law is invalid."""
     law = build_law(file, tied(file, dict(changed)))
 
-    def own(name: str, seen: complex) -> float | None:
+    def if_gain_is(gain: complex, name: str) -> float | None:
+        """The parameter of that name if the law's gain at rest equals it."""
         value = law.parameters[name].value if name in law.parameters else None
-        return None if value is None or abs(seen - value) > _RTOL * abs(value) else value
+        return None if value is None or abs(gain - value) > _RTOL * abs(value) else value
 
-    swing, D_p = law.element("phi", (1, 1)), own("D_p", law.element("phi", (1, 1))(_NEARLY_DC))
-    # 1/phi_22 = 1/D_p + 2 H s + ...; what else acts on omega_u would change it
-    alone = D_p is not None and {c for c in (*law.phi, *law.psi) if c[0] == 1} == {(1, 1)}
-    H = max(0.0, (1.0 / swing(_SLOW)).imag / (2 * _SLOW.imag)) if alone else None
-    return Droops(D_p, own("D_q", _reactive_droop(law)), H)
+    phi_22 = law.element("phi", (1, 1))
+    D_p = if_gain_is(phi_22(_NEARLY_DC), "D_p")
+    # 1/phi_22 = 1/D_p + 2 H s + ..., unless another element acts on omega_u
+    only_p = D_p is not None and {c for c in (*law.phi, *law.psi) if c[0] == 1} == {(1, 1)}
+    H = max(0.0, (1.0 / phi_22(_SLOW)).imag / (2 * _SLOW.imag)) if only_p else None
+    return Droops(D_p, if_gain_is(_reactive_droop(law), "D_q"), H)
 
 
 def _reactive_droop(law: BuiltLaw) -> complex:
-    below = law.element("phi", (2, 4))(_NEARLY_DC)
-    return law.element("phi", (2, 3))(_NEARLY_DC) / below if below else 0.0
+    """phi_34/phi_35 at rest, p.u.; 0 without phi_35."""
+    phi_35 = law.element("phi", (2, 4))(_NEARLY_DC)
+    return law.element("phi", (2, 3))(_NEARLY_DC) / phi_35 if phi_35 else 0.0
 
 
 class LawDroops:
@@ -85,9 +89,9 @@ class LawDroops:
         )
 
     def droops(self, law: str, changed: Mapping[str, float]) -> Droops:
-        """D_p and D_q of a law; ``changed`` holds the parameters that differ from its file."""
-        found: Droops = self._droops(law, tuple(changed.items()))
-        return found
+        """The droops of a law; ``changed`` holds the parameters that differ from its file."""
+        values: Droops = self._droops(law, tuple(changed.items()))
+        return values
 
     def event(self, law: str, changed: Mapping[str, float], wanted: Mapping[str, float]) -> Event:
         """The command that changes a law's droops. Raises ValueError: the law has no droop of that
@@ -107,19 +111,21 @@ class LawDroops:
 
 @dataclass(frozen=True)
 class Effect:
-    """Commands for the run, in order. The device calls ``keep`` once all of them were carried out,
-    or ``fail`` if one was refused."""
+    """Commands for the run, in order. The device calls ``on_success`` once the run has carried out
+    all of them, or ``on_refusal`` if it refused one."""
 
     events: tuple[Event, ...] = ()
-    keep: Callable[[], None] = lambda: None
-    fail: Callable[[], None] = lambda: None
+    on_success: Callable[[], None] = lambda: None
+    on_refusal: Callable[[], None] = lambda: None
 
 
 class PointGroup(ABC):
-    """A group of points that clients write together and that have a common meaning."""
+    """Points that clients write together, because only together they say what is wanted."""
 
     writable: tuple[str, ...]  # paths of the points that clients may write
-    layout: Mapping[int, Mapping[str, Any]] = {}  # its own models, as of ``Measures.models``
+    layout: Mapping[
+        int, Mapping[str, Any]
+    ] = {}  # its own models, by number, as ``Measures.models``
 
     @abstractmethod
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
@@ -128,7 +134,7 @@ class PointGroup(ABC):
 
     @abstractmethod
     def show(self, run: RunState, now: float) -> dict[str, Value]:
-        """The values of its points."""
+        """The values of its points by path, in the points' units."""
 
     def forget(self) -> None:  # noqa: B027
         """Clear the state, if any: the run was reset, or another operator commands it."""
@@ -151,7 +157,7 @@ class Settings:
     until: float | None = None  # the device's time at which the timer expires, s; None: not running
     before: float = 0.0  # the reference in force when it was enabled, p.u.
 
-    def setting(self, name: str, value: float | None) -> Settings:
+    def with_value(self, name: str, value: float | None) -> Settings:
         """The same with another value of one field."""
         changes: dict[str, Any] = {name: value}
         return replace(self, **changes)
@@ -197,12 +203,12 @@ class SetPoint(PointGroup):
         return self._plan(new, run, now, changed=True)
 
     def end(self, now: float) -> None:
-        """If enabled, let the timer expire now, even if none is running."""
+        """If enabled, make the timer expire at ``now``, even if none runs."""
         if self.settings.enabled:
             self.settings = replace(self.settings, until=now)
 
-    def expire(self, now: float) -> bool:
-        """Whether the timer has expired."""
+    def expired(self, now: float) -> bool:
+        """Whether the timer has expired at ``now``, s."""
         return self.settings.until is not None and now >= self.settings.until
 
     def revert(self, run: RunState, now: float) -> Effect:
@@ -210,24 +216,24 @@ class SetPoint(PointGroup):
         s = self.settings
         name = self._in_force(s)
         back = getattr(s, f"{name}_back")
-        new = s.setting(name, s.before * self._unit(name) if back is None else back)
+        new = s.with_value(name, s.before * self._unit(name) if back is None else back)
         return self._plan(replace(new, enabled=s.enabled_back), run, now, changed=False)
 
     def forget(self) -> None:
         self.settings = Settings(mode=self._absolute)
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
-        s, there = self.settings, run.references[self.reference]
-        back = s.before if s.enabled else there
-        found: dict[str, Value] = {}
+        s, in_force = self.settings, run.references[self.reference]
+        back = s.before if s.enabled else in_force
+        values: dict[str, Value] = {}
         for path, key in self._keys.items():
             value = getattr(s, key)
             if value is None:
-                value = (back if key.endswith("_back") else there) * self._unit(key)
-            found[path] = float(value)
+                value = (back if key.endswith("_back") else in_force) * self._unit(key)
+            values[path] = float(value)
         left = 0.0 if s.until is None else max(s.until - now, 0.0)
-        found[f"{self._prefix}RvrtRem"] = -(-left // 1)
-        return found
+        values[f"{self._prefix}RvrtRem"] = float(math.ceil(left))
+        return values
 
     def _plan(self, new: Settings, run: RunState, now: float, changed: bool) -> Effect:
         old = self.settings
@@ -238,7 +244,7 @@ class SetPoint(PointGroup):
             if new.mode != old.mode:  # do not keep the old mode's value
                 left = self._in_force(old)
                 if getattr(new, left) == getattr(old, left):
-                    new = new.setting(left, None)
+                    new = new.with_value(left, None)
             name = self._in_force(new)
             number = getattr(new, name)
             target = None if number is None else number / self._unit(name)
@@ -248,10 +254,10 @@ class SetPoint(PointGroup):
         running = changed and new.enabled and new.timeout > 0
         new = replace(new, until=now + new.timeout if running else None)
 
-        def keep() -> None:
+        def store() -> None:
             self.settings = new
 
-        return Effect(() if target is None else (_reference(self.reference, target),), keep)
+        return Effect(() if target is None else (_reference(self.reference, target),), store)
 
     def _in_force(self, s: Settings) -> str:
         return "value" if s.mode == self._absolute else "percent"
@@ -268,10 +274,10 @@ def _reference(name: str, value: float) -> Event:
 COMPLETED, FAILED = 1, 2
 _SPAN = 100.0  # %: the two points that show the droop in force have Var = ± this
 _RESOLUTION = 0.015  # %: largest deviation of the line from the reference
-_MINE = 2  # the curve that a client may write
+_WRITABLE = 2  # number of the curve that a client may write
 
-#: meaning of a curve: "V_ref" [p.u.], "D_p", "D_q"
-Meaning = dict[str, float]
+#: what a curve stands for: "V_ref", "D_p", "D_q", p.u.
+DroopValues = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -281,13 +287,13 @@ class Adopted:
     enabled: bool = False
     request: int = 1
     result: int = COMPLETED
-    meaning: Meaning | None = None  # adopted; disabling clears it
-    before: Meaning | None = None  # in force when it was enabled, under the law below
+    values: DroopValues | None = None  # those adopted; disabling clears it
+    before: DroopValues | None = None  # in force when it was enabled, under the law below
     law: str = ""
 
 
 class Curves(PointGroup):
-    """What models 705 and 711 share."""
+    """A function with stored curves: what models 705 and 711 have in common."""
 
     # model, curve: the model's number and its name of a curve
     model: int
@@ -298,23 +304,23 @@ class Curves(PointGroup):
         self._gains = gains
         self._enable, adopt = f"{self.model}.Ena", f"{self.model}.Adpt{self.curve}"
         self._request, self._result = f"{adopt}Req", f"{adopt}Rslt"
-        self._fixed, self._own = (f"{self.model}.{self.curve}{k}." for k in (1, _MINE))
+        self._fixed, self._own = (f"{self.model}.{self.curve}{k}." for k in (1, _WRITABLE))
         own = (self._own + name for name in self.stored)
         self.writable = (self._enable, self._request, *own)
         self.state = Adopted()
         self._stored: dict[str, Value] = {}
 
     @abstractmethod
-    def read(self, stored: Written) -> Meaning:
-        """The meaning of stored values; raises ValueError if they are invalid."""
+    def read(self, stored: Written) -> DroopValues:
+        """V_ref and droops, by name, of stored points; raises ValueError if these are invalid."""
 
     @abstractmethod
-    def write(self, meaning: Meaning) -> dict[str, Value]:
-        """The stored values of a meaning."""
+    def write(self, values: DroopValues) -> dict[str, Value]:
+        """The stored points that show V_ref and droops."""
 
     @abstractmethod
-    def in_force(self, run: RunState) -> Meaning:
-        """The meaning now in force."""
+    def in_force(self, run: RunState) -> DroopValues:
+        """V_ref and droops now in force."""
 
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
         own = {p.removeprefix(self._own): v for p, v in written.items() if p.startswith(self._own)}
@@ -328,54 +334,56 @@ class Curves(PointGroup):
                 self.state = replace(old, result=FAILED)
 
         if adopts:
-            if written[self._request] != _MINE:
-                raise ValueError(f"{self._request}: must be {_MINE}, the one that can be written")
+            if written[self._request] != _WRITABLE:
+                raise ValueError(
+                    f"{self._request}: must be {_WRITABLE}, the one that can be written"
+                )
             try:
-                meaning = self.read(self.write(self.in_force(run)) | stored)
-                self._events(meaning, run)
+                values = self.read(self.write(self.in_force(run)) | stored)
+                self._events(values, run)
             except ValueError:
                 fail()
                 raise
-            new = replace(new, request=_MINE, result=COMPLETED, meaning=meaning)
+            new = replace(new, request=_WRITABLE, result=COMPLETED, values=values)
         if self._enable in written:
             new = replace(new, enabled=bool(written[self._enable]))
         if new.enabled and not old.enabled:
             new = replace(new, before=self.in_force(run), law=run.law)
-        if new.enabled and new.meaning and (adopts or not old.enabled):
-            events = self._events(new.meaning, run)
+        if new.enabled and new.values and (adopts or not old.enabled):
+            events = self._events(new.values, run)
         elif old.enabled and not new.enabled:
             before = old.before or {}
-            if run.law != old.law:  # which keeps its own droops
+            if run.law != old.law:  # the droops were those of another law
                 before = {name: value for name, value in before.items() if name == "V_ref"}
-            events = self._events(before, run) if old.meaning else ()
-            new = replace(new, meaning=None, before=None)
+            events = self._events(before, run) if old.values else ()
+            new = replace(new, values=None, before=None)
 
-        def keep() -> None:
+        def store() -> None:
             self.state, self._stored = new, stored
 
-        return Effect(events, keep, fail)
+        return Effect(events, store, fail)
 
     def forget(self) -> None:
         self.state, self._stored = Adopted(), {}
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
-        s, there = self.state, self.write(self.in_force(run))
+        s, now_in_force = self.state, self.write(self.in_force(run))
         return {
             self._enable: float(s.enabled),
             self._request: float(s.request),
             self._result: float(s.result),
-            **{self._fixed + n: v for n, v in there.items()},
-            **{self._own + n: v for n, v in (there | self._stored).items()},
+            **{self._fixed + n: v for n, v in now_in_force.items()},
+            **{self._own + n: v for n, v in (now_in_force | self._stored).items()},
         }
 
-    def _events(self, meaning: Meaning, run: RunState) -> tuple[Event, ...]:
-        """The commands for a meaning; gains first, since the run may refuse them."""
+    def _events(self, values: DroopValues, run: RunState) -> tuple[Event, ...]:
+        """The commands for V_ref and droops; droops first, since the run may refuse them."""
         events = []
-        droops = {name: value for name, value in meaning.items() if name != "V_ref"}
+        droops = {name: value for name, value in values.items() if name != "V_ref"}
         if droops:
             events.append(self._gains.event(run.law, run.gains, droops))
-        if "V_ref" in meaning:
-            events.append(_reference("V_ref", meaning["V_ref"]))
+        if "V_ref" in values:
+            events.append(_reference("V_ref", values["V_ref"]))
         return tuple(events)
 
 
@@ -390,11 +398,11 @@ class VoltVar(Curves):
     model, curve = 705, "Crv"
     stored = ("ActPt", "VRef", "Pt1.V", "Pt1.Var", "Pt2.V", "Pt2.Var")
 
-    def in_force(self, run: RunState) -> Meaning:
+    def in_force(self, run: RunState) -> DroopValues:
         D_q = self._gains.droops(run.law, run.gains).D_q
         return {"V_ref": run.references["V_ref"], **({} if D_q is None else {"D_q": D_q})}
 
-    def read(self, stored: Written) -> Meaning:
+    def read(self, stored: Written) -> DroopValues:
         v_ref = _number(stored, "VRef") / 100.0
         check_reference("V_ref", v_ref)
         count = _number(stored, "ActPt")
@@ -412,14 +420,14 @@ class VoltVar(Curves):
             raise ValueError("705: the line must pass through V = 100 %, Var = 0")
         return {"V_ref": v_ref, "D_q": D_q}
 
-    def write(self, meaning: Meaning) -> dict[str, Value]:
-        D_q = meaning.get("D_q")
+    def write(self, values: DroopValues) -> dict[str, Value]:
+        D_q = values.get("D_q")
         points: dict[str, Value] = {}
         for k, var in ((1, _SPAN), (2, -_SPAN)):
             points[f"Pt{k}.V"] = None if D_q is None else 100.0 - D_q * var
             points[f"Pt{k}.Var"] = None if D_q is None else var
         active = 0.0 if D_q is None else 2.0
-        return {"ActPt": active, "VRef": 100.0 * meaning["V_ref"], **points}
+        return {"ActPt": active, "VRef": 100.0 * values["V_ref"], **points}
 
 
 class Droop(Curves):
@@ -428,11 +436,11 @@ class Droop(Curves):
     model, curve = 711, "Ctl"
     stored = ("DbOf", "DbUf", "KOf", "KUf", "RspTms")
 
-    def in_force(self, run: RunState) -> Meaning:
+    def in_force(self, run: RunState) -> DroopValues:
         D_p = self._gains.droops(run.law, run.gains).D_p
         return {} if D_p is None else {"D_p": D_p}
 
-    def read(self, stored: Written) -> Meaning:
+    def read(self, stored: Written) -> DroopValues:
         over, under = _number(stored, "KOf"), _number(stored, "KUf")
         if over != under:
             raise ValueError(f"711: KOf = {over:g}, KUf = {under:g}: must be equal")
@@ -441,15 +449,15 @@ class Droop(Curves):
                 raise ValueError(f"711: {name} = {_number(stored, name):g}: must be 0")
         return {"D_p": over}
 
-    def write(self, meaning: Meaning) -> dict[str, Value]:
-        D_p = meaning.get("D_p")
+    def write(self, values: DroopValues) -> dict[str, Value]:
+        D_p = values.get("D_p")
         return {"DbOf": 0.0, "DbUf": 0.0, "KOf": D_p, "KUf": D_p, "RspTms": 0.0}
 
 
 def _number(stored: Written, name: str) -> float:
     value = stored[name]
     if not isinstance(value, (int, float)):
-        raise ValueError(f"{name}: not given")
+        raise ValueError(f"{name}: has no value")
     return float(value)
 
 
@@ -481,16 +489,16 @@ class Heartbeat(PointGroup):
                 f"HbTms = {timeout}: must lie in [{_SHORTEST_MS}, {_LONGEST_MS}] ms, or be 0"
             )
 
-        def keep() -> None:
+        def store() -> None:
             if isinstance(timeout, (int, float)):
                 self._timeout_ms = int(timeout)
             if isinstance(value, (int, float)) and value != self._value:
                 self._value, self._last, self.missing = value, now, False
 
-        return Effect(keep=keep)
+        return Effect(on_success=store)
 
-    def expire(self, now: float) -> bool:
-        """Whether it has just been lost; true once per loss."""
+    def lost(self, now: float) -> bool:
+        """Whether it is lost since the last call, at ``now``, s; true once per loss."""
         if self._last is None or not self._timeout_ms:
             return False
         waited_ms = (now - self._last) * 1e3
@@ -562,11 +570,11 @@ class Direct(PointGroup):
         return Effect(tuple(events))
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
-        there = run.references | vars(self._gains.droops(run.law, run.gains))
-        found: dict[str, Value] = {}
-        for path, (name, unit) in self._points.items():
-            found[path] = None if there[name] is None else there[name] * unit
-        return found
+        in_force = run.references | vars(self._gains.droops(run.law, run.gains))
+        return {
+            path: None if in_force[name] is None else in_force[name] * unit
+            for path, (name, unit) in self._points.items()
+        }
 
 
 class ActiveLaw(PointGroup):

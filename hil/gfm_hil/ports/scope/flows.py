@@ -17,7 +17,7 @@ from gfm_hil.results.single_line import (
 from gfm_hil.scenario.events.breaker import GRID, switched
 from gfm_runtime.states import STATES
 
-_SHOWN = ("p", "q", "V", "omega_u")  # channels; the last as a frequency, Hz
+_SHOWN = ("p", "q", "V", "omega_u")  # p.u.; the pyramid has omega_u as a frequency, Hz
 
 
 class Flows:
@@ -27,7 +27,7 @@ class Flows:
         runs: of its converters, by name.
 
     Raises:
-        LawError: a law cannot be read, by whose title the diagram calls it.
+        LawError: a law cannot be read; the diagram has the titles of all.
     """
 
     def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
@@ -38,19 +38,19 @@ class Flows:
         self._closed = {name: True for name in nodes} | {n: line[-1] for n, line in lines.items()}
         network = self._scenario.network
         feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
-        found: list[dict[str, Any]] = []
+        nodes_shown: list[dict[str, Any]] = []
         for name, bar in bars.items():
-            hanging = []
+            shunts = []
             for symbol, text, closed in bar.right:
                 part = text.partition("\n")[0] if symbol != "~" else GRID
                 self._closed[part] = closed
-                hanging.append({"name": part, "symbol": symbol, "feeds": part in feeds})
-            found.append({
+                shunts.append({"name": part, "symbol": symbol, "feeds": part in feeds})
+            nodes_shown.append({
                 "name": name, "column": bar.column, "rows": bar.rows,
-                "converters": bar.converters, "right": hanging,
+                "converters": bar.converters, "right": shunts,
             })  # fmt: skip
         self.diagram = {
-            "rows": rows, "bars": found, "laws": laws,
+            "rows": rows, "bars": nodes_shown, "laws": laws,
             "lines": [
                 {"name": name, "row": row, "start": start, "end": end, "symbol": symbol}
                 for name, (row, start, end, symbol, *_) in lines.items()
@@ -63,12 +63,12 @@ class Flows:
         return next(iter(self._runs.values())).record.scenario
 
     def now(self) -> dict[str, Any]:
-        """The newest tick of each converter, P and Q of each part that the run records, p.u., a
-        line's at its start, and whether the breaker of each part is closed."""
+        """The newest tick of each converter; P and Q, p.u., of each part that the run records, of a
+        line at its start; and whether the breaker of each part is closed."""
         converters = {name: _newest(run) for name, run in self._runs.items()}
         closed = dict(self._closed)
-        for line in next(iter(self._runs.values())).happened()["events"]:
-            if (change := switched(line)) is not None:
+        for entry in next(iter(self._runs.values())).happened()["events"]:
+            if (change := switched(entry)) is not None:
                 closed[change[0]] = change[1]
         return {"converters": converters, "flows": self._recorded(), "closed": closed}
 
@@ -86,7 +86,7 @@ class Flows:
 
 
 def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
-    """Of a narrow page: the rows of each node, and the row and the lane of each line."""
+    """For a narrow page: the rows of each node, and the row and the lane of each line."""
     rows = give_rows(bars, lines, stacked=True)
     lanes = give_lanes(bars, lines)
     return {
@@ -96,14 +96,14 @@ def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
 
 
 def _newest(run: WatchedRun) -> dict[str, Any]:
-    """What a converter does now: p, q, V in p.u. and f in Hz, the state and the misses so far; what
-    is not recorded is left out."""
+    """The newest tick of a converter: p, q, V in p.u., f in Hz, its state and the misses so far; a
+    signal that is not recorded is left out."""
     pyramid, done = run.pyramid, run.pyramid.done
     if not done:
         return {}
     values = {name: float(pyramid.values(name, done - 1, done)[0]) for name in _SHOWN}
-    found: dict[str, Any] = {name: round(x, 5) for name, x in values.items() if x == x}
+    newest: dict[str, Any] = {name: round(x, 5) for name, x in values.items() if x == x}
     state = run.record.columns.get("state")
     if state is not None and 0 <= (code := float(state[done - 1 : done][0])) < len(STATES):
-        found["state"] = STATES[int(code)]
-    return found | {"misses": pyramid.misses(done)}
+        newest["state"] = STATES[int(code)]
+    return newest | {"misses": pyramid.misses(done)}

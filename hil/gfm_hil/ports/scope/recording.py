@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.announcement import announced, present
+from gfm_hil.engine.announcement import read_announcement, running_roles
 from gfm_hil.ports.port import recorded
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.live import LiveRun
@@ -60,7 +60,7 @@ class Recording:
 
     def look_up_laws(self) -> None:
         """Read the laws behind the indices in column ``law`` again: gains may have changed."""
-        server = announced(self.folder, "controller")
+        server = read_announcement(self.folder, "controller")
         if server is None:  # a foreign controller, or it has ended
             return
         self.laws = [_law(law["label"], law["title"], law["gains"]) for law in server["laws"]]
@@ -76,7 +76,7 @@ class Recording:
         try:
             content = read_summary(self.folder, self.capacity)
         except FileNotFoundError:  # without one it is over once its command servers have gone
-            there = bool(present(self.folder))
+            there = bool(running_roles(self.folder))
             self._met |= there
             return {"status": "over", "reason": ""} if self._met and not there else None
         return {key: str(content[key]) for key in ("status", "reason")}
