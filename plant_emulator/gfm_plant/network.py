@@ -309,7 +309,7 @@ def _pack_rates(
             B[:, places[name]] = column
             if name == GRID_SOURCE:  # its negative sequence
                 B[:, places[name] + 1] = column
-        pack_port(net, circuit, net["switched"], by_w[0], B, free[0][0], axes[0].fastest)
+        pack_port(net, circuit, net["switched"], by_w[0], B, *free[0], axes[0].fastest)
     for k in range(N):
         i_f, v, i_o = range(N_OWN * k, N_OWN * (k + 1))
         for axis, A in enumerate(by_w):

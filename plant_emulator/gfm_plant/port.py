@@ -61,7 +61,7 @@ _SHARES = np.array(
 
 def pack_port(
     net: Any, place: int, k: int, A: NDArray[np.float64], B: NDArray[np.float64],
-    free: NDArray[np.bool_], size: float,
+    free: NDArray[np.bool_], by_free: NDArray[np.float64], size: float,
 ) -> None:  # fmt: skip
     """Set the tables of a balanced circuit, or none if its norm asks for too many powers.
 
@@ -71,6 +71,7 @@ def pack_port(
         k: the switched converter.
         A, B: w' = A w + B s, 1/s, of which only the columns of ``free`` states are not zero.
         free: which states give all others.
+        by_free: all states by these, in their columns.
         size: the norm of A in energy coordinates, 1/s.
     """
     half, N = 0.5 * float(net["unit_s"]), int(net["n_converters"])
@@ -86,7 +87,7 @@ def pack_port(
     sources = [j for j in range(B.shape[1]) if j != k and B[:, j].any()]
     drives = np.zeros(len(A))
     drives[others] = A[i_o, others] / half
-    from_start = _by_start(A, B[:, sources], free)
+    from_start = _by_start(A, B[:, sources], by_free[:, free])
     by_E = np.zeros((powers + TERMS, len(A)))  # A^m b
     by_E[0] = B[:, k]
     for m in range(1, len(by_E)):
@@ -121,7 +122,7 @@ def pack_port(
 
 
 def _by_start(
-    A: NDArray[np.float64], B: NDArray[np.float64], free: NDArray[np.bool_]
+    A: NDArray[np.float64], B: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """What w is without E: for each power of time a matrix, by the free states at the beginning and
     by the powers of each source about the middle."""
@@ -137,7 +138,7 @@ def _by_start(
         driven[j] /= j
     to_middle = by_middle.sum(0)
     first = to_middle @ ((-1.0) ** np.arange(length) @ driven.swapaxes(0, 1))
-    return np.concatenate([by_middle @ to_middle[:, free], driven - by_middle @ first], axis=2)
+    return np.concatenate([by_middle @ (to_middle @ start), driven - by_middle @ first], axis=2)
 
 
 @cache

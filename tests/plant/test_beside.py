@@ -28,6 +28,7 @@ pytestmark = pytest.mark.full  # compiles the plant for several converters
 T_S = 1e-4
 Z_B = 380**2 / 4000
 DROPS = {"V_switch": 1.5, "V_diode": 1.2, "R_switch": 0.03, "R_diode": 0.02}
+KINDS = "average", "two-level"
 SOURCE = {"dc_source": {"mode": "regulated"}}
 OTHERS = ({}, {"factors": {"L_f": 1.3, "C_f": 0.8, "C_dc": 0.7}}, {"factors": {"L_g": 2.0}})
 CASES = {
@@ -233,6 +234,21 @@ def go_on(network, alone, ticks):
 def test_a_network_of_one_switched_converter_is_that_converter():
     network, alone = on_a_stiff_grid({"bridge": {"kind": "two-level", "dead_time_s": 2e-6}})
     assert go_on(network, alone, 100) < 1e-12
+
+
+def test_currents_that_others_give_add_up():
+    """Without a capacitor at the bus, a load has the currents of both converters."""
+    plants = [Plant.model_validate({**SOURCE, "bridge": {"kind": k}}) for k in KINDS]
+    parts = NetworkParts.model_validate({"loads": {"r": {"node": "bus", "P": 0.8, "Q": 0.2}}})
+    names = {f"c{k}": (one, "bus") for k, one in enumerate(plants)}
+    plant = make_network(names, T_S, Grid(), parts)
+    starts = [plant_equilibrium(make_plant(one, T_S).par, 0.4, 1.0) for one in plants]
+    plant.start(*(np.array(column) for column in zip(*starts, strict=True)))
+    for _ in range(20):
+        plant_step(plant.records)
+    a, b, load = (plant.now["w"][0][plant.wiring.order.index(x)] for x in ("c0.i_o", "c1.i_o", "r"))
+    assert plant.net["port_powers"][0, 0] > 0
+    assert abs(a + b - load) < 1e-12 and abs(load) > 0.5
 
 
 @pytest.mark.parametrize("kind", ["two-level", "t-type"])
