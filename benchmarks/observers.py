@@ -1,8 +1,8 @@
-"""Misses of a run in real time without Modbus clients, and with many that poll all they can.
+"""Misses of a run in real time without Modbus clients, and with many that poll without pause.
 
-One run over shared memory with its server beside it; rounds without a client and with many follow
-each other in that one run, so that what else the machine does meets both. Before and after the run
-both processors only pace, with nothing else to do: those ticks the host loses by itself.
+One run over shared memory with its server beside it. Rounds without a client and with many
+alternate in that run, so that other load of the machine disturbs both alike. Before and after the
+run both processors only wait for each tick: the ticks that they miss then are the host's.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ Timing = dict[str, NDArray[np.int64]]
 
 
 @dataclass
-class Turn:
-    """One stretch of the run, ns of CLOCK_MONOTONIC, and the answers that clients got in it."""
+class Round:
+    """One round: begin and end, ns of CLOCK_MONOTONIC, and the replies that clients received."""
 
     kind: str
     begin: int
@@ -70,7 +70,7 @@ class Turn:
 
 
 @dataclass
-class Found:
+class Totals:
     """All rounds of one kind together."""
 
     ticks: int = 0
@@ -82,7 +82,7 @@ class Found:
 
 
 def poll(pipe: Connection, port: int, clients: int) -> None:
-    """In a process of its own: at each message of the pipe begin or stop polling, and say so."""
+    """In a process of its own: begin or stop polling at each message of the pipe, and answer it."""
     host, request = ("127.0.0.1", port), struct.pack(">HHHBBHH", 0, 0, 6, 1, 3, *_READ)
     whole = 9 + 2 * _READ[1]  # bytes of an answer
     pipe.send("ready")
@@ -108,22 +108,20 @@ def poll(pipe: Connection, port: int, clients: int) -> None:
 
 
 def measure(clients: int, seconds: float, rounds: int) -> dict[str, Any]:
-    """Everything; plain data."""
+    """The rows of the table, as plain data for JSON."""
     policy = "fifo" if may_sched_fifo() else "other"
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
         late = [_pace(policy, seconds, rounds)]
-        timing, stretches = _run(Path(place), clients, seconds, rounds)
+        timing, done = _run(Path(place), clients, seconds, rounds)
         late.append(_pace(policy, seconds, rounds))
-    found = {
-        kind: _count(timing, [s for s in stretches if s.kind == kind]) for kind in (_NONE, _MANY)
-    }
-    trip = float(np.median(np.concatenate(found[_NONE].trips)))
+    totals = {kind: _count(timing, [s for s in done if s.kind == kind]) for kind in (_NONE, _MANY)}
+    trip = float(np.median(np.concatenate(totals[_NONE].trips)))
     pieces = [piece for each in late for piece in np.array_split(each, (rounds + 1) // 2, axis=1)]
-    gone = [len(lost(piece, T_S * 1e9 - trip)) for piece in pieces]
+    missed = [len(lost(piece, T_S * 1e9 - trip)) for piece in pieces]
     ticks = sum(piece.shape[1] for piece in pieces)
-    rows = [{"what": "bare pacing", "ticks": ticks, "missed": sum(gone),
-             "missed_pct": 100 * sum(gone) / ticks, "by_turn": gone}]  # fmt: skip
-    for kind, one in found.items():
+    rows = [{"what": "bare pacing", "ticks": ticks, "missed": sum(missed),
+             "missed_pct": 100 * sum(missed) / ticks, "by_turn": missed}]  # fmt: skip
+    for kind, one in totals.items():
         slack = T_S * 1e6 - np.percentile(np.concatenate(one.trips), (50, 99, 99.9)) * 1e-3
         rows.append({
             "what": kind, "ticks": one.ticks, "missed": sum(one.missed),
@@ -132,7 +130,7 @@ def measure(clients: int, seconds: float, rounds: int) -> dict[str, Any]:
             "causes": dict(zip(CAUSES, one.causes.tolist(), strict=True)),
             "answers_per_s": one.answers / one.seconds,
         })  # fmt: skip
-    more = np.subtract(found[_MANY].missed, found[_NONE].missed)
+    more = np.subtract(totals[_MANY].missed, totals[_NONE].missed)
     return {
         "clients": clients, "seconds": seconds * rounds, "policy": policy, "rows": rows,
         "more_by_turn": more.tolist(), "environment": environment(),
@@ -140,14 +138,14 @@ def measure(clients: int, seconds: float, rounds: int) -> dict[str, Any]:
 
 
 def _pace(policy: Any, seconds: float, rounds: int) -> NDArray[np.int64]:
-    """Lateness of a loop that only paces, half as long as the rounds, (2, ticks), ns."""
+    """Lateness of a loop that only paces, ns, shape (2, ticks), for half the time of the rounds."""
     with ExitStack() as stack:
         two = stack.enter_context(pair(policy, memory_folder(stack)))
         two.both(pace_here, 0, 1, HYBRID, 1)
         return pace_both(two, round(T_S * 1e9), HYBRID, seconds * rounds / 2)
 
 
-def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing, list[Turn]]:
+def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing, list[Round]]:
     duration = 2 * rounds * (seconds + 2 * _SETTLE_S) + 20.0
     file, folder = place / "observers.toml", place / "run"
     file.write_text(SCENARIO.format(duration=duration), encoding="utf-8")
@@ -168,17 +166,17 @@ def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing
                 raise SystemExit("the run did not start")
         pollers.start()
         ours.recv()
-        stretches = []
+        done = []
         for round_ in range(rounds):
             for kind in (_NONE, _MANY)[:: -1 if round_ % 2 else 1]:
-                stretches.append(_turn(kind, seconds, ours))
+                done.append(_round(kind, seconds, ours))
         timing = _times(folder)
     finally:
         run.terminate()
         run.communicate()
         if pollers.is_alive():
             pollers.kill()
-    return timing, stretches
+    return timing, done
 
 
 def _times(folder: Path) -> Timing:
@@ -192,14 +190,14 @@ def _times(folder: Path) -> Timing:
     }
 
 
-def _turn(kind: str, seconds: float, pipe: Any) -> Turn:
+def _round(kind: str, seconds: float, pipe: Any) -> Round:
     if kind == _MANY:
         pipe.send("go")
         pipe.recv()
     time.sleep(_SETTLE_S)
     begin = time.monotonic_ns()
     time.sleep(seconds)
-    round_ = Turn(kind, begin, time.monotonic_ns())
+    round_ = Round(kind, begin, time.monotonic_ns())
     if kind == _MANY:
         pipe.send("stop")
         round_.answers = pipe.recv()
@@ -207,26 +205,26 @@ def _turn(kind: str, seconds: float, pipe: Any) -> Turn:
     return round_
 
 
-def _count(timing: Timing, stretches: list[Turn]) -> Found:
-    found = Found()
-    for round_ in stretches:
+def _count(timing: Timing, done: list[Round]) -> Totals:
+    totals = Totals()
+    for round_ in done:
         scheduled = timing["plant_scheduled"]
         here = (scheduled >= round_.begin) & (scheduled < round_.end)
         part = {name: column[here] for name, column in timing.items()}
-        there = part["plant_received"] >= 0
-        found.ticks += len(there)
-        found.missed.append(int((~there).sum()))
-        found.trips.append((part["plant_received"] - part["plant_scheduled"])[there])
+        received = part["plant_received"] >= 0
+        totals.ticks += len(received)
+        totals.missed.append(int((~received).sum()))
+        totals.trips.append((part["plant_received"] - part["plant_scheduled"])[received])
         causes = attribute(part, round(T_S * 1e9)).causes
-        found.causes += np.bincount(causes, minlength=len(CAUSES))
-        found.answers += round_.answers
-        found.seconds += (round_.end - round_.begin) * 1e-9
-    return found
+        totals.causes += np.bincount(causes, minlength=len(CAUSES))
+        totals.answers += round_.answers
+        totals.seconds += (round_.end - round_.begin) * 1e-9
+    return totals
 
 
-def _table(found: dict[str, Any]) -> str:
-    """Side by side, as lines of Markdown."""
-    kinds = found["rows"]
+def _table(result: dict[str, Any]) -> str:
+    """The rows side by side, as a table of Markdown."""
+    kinds = result["rows"]
     lines: list[list[str]] = []
 
     def line(name: str, cells: list[str]) -> None:
@@ -245,12 +243,12 @@ def _table(found: dict[str, Any]) -> str:
         line(f"missed for {cause}", cells)
     cells = [f"{row['answers_per_s']:.0f}" if row.get("answers_per_s") else "–" for row in kinds]
     line("answers a second", cells)
-    by_turn = found["more_by_turn"]
+    by_turn = result["more_by_turn"]
     more = ", ".join(f"{each:+d}" for each in by_turn)
     error = np.std(by_turn, ddof=1) / len(by_turn) ** 0.5 if len(by_turn) > 1 else math.nan
     return "\n".join([
         markdown(["", *(row["what"] for row in kinds)], lines), "",
-        f"{found['clients']} clients for {found['seconds']:g} s, {found['policy']}: "
+        f"{result['clients']} clients for {result['seconds']:g} s, {result['policy']}: "
         f"{np.mean(by_turn):+.0f} ± {error:.0f} misses in a round (mean and its standard error); "
         f"round by round {more}",
     ])  # fmt: skip
@@ -266,8 +264,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.clients < 1 or options.rounds < 1 or not 0.1 <= options.seconds <= 3600:
         parser.error("--clients and --rounds must be at least 1, --seconds in [0.1, 3600]")
-    found = measure(options.clients, options.seconds, options.rounds)
-    print(json.dumps(found, indent=1) if options.json else _table(found))
+    result = measure(options.clients, options.seconds, options.rounds)
+    print(json.dumps(result, indent=1) if options.json else _table(result))
 
 
 if __name__ == "__main__":

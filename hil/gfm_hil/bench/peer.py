@@ -26,7 +26,7 @@ from gfm_hil.controllers import FORMS
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
-from gfm_hil.engine.drive import part_from, send_last
+from gfm_hil.engine.drive import end_exchange, send_last
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import Link, link_kind, link_names
@@ -246,7 +246,7 @@ class _Caller:
         writer = FrameWriter("y", len(self._values) > NY)
         writer.sequence[:] = self._y.sequence
         reader = FrameReader("u", len(self._values) > NY)
-        part_from(self._good, writer, reader, self._tick, STOPPED, 0, self._values)
+        end_exchange(self._good, writer, reader, self._tick, STOPPED, 0, self._values)
         self._good.close()
 
 

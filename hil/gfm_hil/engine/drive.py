@@ -1,6 +1,6 @@
-"""Driving the compiled loops: call them, and do in Python what they came back for.
+"""Driving the compiled loops: call them, and do in Python what they return for.
 
-The loop has a thread of its own, which the main thread watches; that one receives Ctrl-C.
+The loop has a thread of its own; the main thread, which receives Ctrl-C, watches it.
 """
 
 import contextlib
@@ -45,25 +45,25 @@ from gfm_runtime.states import LOST_PEER, PLANT_TRIP, REASONS, SAFE, STOPPED
 
 _FAR = 2**62  # the next tick of a timeline without events
 _NAP_NS = 100_000
-_SOON = 200  # looks
-_LAST_NS = 500_000_000  # how long to go on sending, or waiting for, last frames
-_LOOK_S = 0.05
+_SOON = 200  # receptions without a message before lockstep sleeps
+_LAST_NS = 500_000_000  # for sending, and for receiving, last frames
+_WATCH_S = 0.05  # how often the main thread watches the loop
 
 
 class Share(NamedTuple):
-    """What a role's loop has of one converter."""
+    """What a role's loop needs of one converter."""
 
     bench: Bench
     link: Link
     part: RolePart
     timeline: Timeline
-    # there are more loops than processors: this one yields its processor at every look, and in
-    # lockstep it sleeps soon
+    # there are more loops than processors: this one yields its processor whenever no message is
+    # there, and in lockstep it sleeps soon
     crowded: bool = False
 
 
 class _End:
-    """One end of a link for a compiled loop, and what the loop writes there."""
+    """One end of a link for a compiled loop, with the frames and records that the loop writes."""
 
     def __init__(self, role: Role, share: Share, t0_ns: int, flags: NDArray[np.int64]) -> None:
         bench, link, part, *_ = share
@@ -110,15 +110,15 @@ class _End:
             raise PeerLost("the link is gone")
         return why
 
-    def keep_u(self, u: NDArray[np.float64]) -> None:
-        """Take u as the two newest that came."""
+    def set_last_u(self, u: NDArray[np.float64]) -> None:
+        """Set the two newest u that were received, p.u., to one value, so that u has no trend."""
         for name in ("u_last", "u_before"):
             self.loop[name][0, : len(u)] = u
 
-    def last_words(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
-        """Tell the other side how this side ends."""
+    def send_last_frames(self, state: int, reason: int, values: NDArray[np.float64]) -> None:
+        """Send the frames that end the run, with the state and reason of this side."""
         tick = max(self.tick, 0)
-        part_from(self.link, self.writer, self.reader, tick, state, reason, values)
+        end_exchange(self.link, self.writer, self.reader, tick, state, reason, values)
 
 
 def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -> list[FrameReader]:
@@ -130,7 +130,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
     bench = shares[0].bench
     ticks = bench.scenario.ticks
     for end in ends:
-        end.keep_u(end.bench.u)
+        end.set_last_u(end.bench.u)
     while any(timeline.running for timeline in timelines):
         for timeline in timelines:
             timeline.carry_out(first.tick)
@@ -139,9 +139,9 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         tick = first.tick
         if why == ReturnReason.RESTORE:
             bench.restore_plant(tick)
-            first.keep_u(bench.u)
+            first.set_last_u(bench.u)
         for started in follow_trips(bench.plant):
-            ends[started].keep_u(bench.plant.st["u"][started, 0, : len(bench.u)])
+            ends[started].set_last_u(bench.plant.st["u"][started, 0, : len(bench.u)])
         report_check(bench.plant, timelines, tick)
         for timeline in timelines:
             timeline.look(max(tick - 1, 0))
@@ -167,7 +167,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         state = SAFE if status == "tripped" and not survives_trip else STOPPED
         early = status != "completed" and end.tick < ticks
         if not end.loop["lost"][0]:
-            end.last_words(state, int(early), end.bench.y)
+            end.send_last_frames(state, int(early), end.bench.y)
     return [end.reader for end in ends]
 
 
@@ -180,9 +180,9 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
     bench, timeline = share.bench, share.timeline
     end, ctl = _End("controller", share, t0_ns, flags), bench.controller.ctl
     loop, own, in_network = end.loop[0], _records(bench), bench.scenario.network is not None
-    why, ticks = ReturnReason.EVENT, _ticks(bench)
+    why, ticks = ReturnReason.EVENT, _ticks_of(bench)
     if bench.external is not None:
-        bench.external.last_words = lambda: end.last_words(STOPPED, 0, bench.u)
+        bench.external.last_words = lambda: end.send_last_frames(STOPPED, 0, bench.u)
     loop["heard"] = max(time.monotonic_ns(), t0_ns)
     while timeline.running or in_network:
         event = timeline.next_tick()
@@ -196,32 +196,32 @@ def drive_controller(share: Share, t0_ns: int, flags: NDArray[np.int64]) -> Fram
             why = end.checked(ticks(*end.side, own, event))
         except ControllerError as problem:
             timeline.end("safe", str(problem), end.tick)
-            end.last_words(STOPPED, 0, bench.u)
+            end.send_last_frames(STOPPED, 0, bench.u)
             break
         tick = end.tick
         if why in (ReturnReason.CHANGED, ReturnReason.EVENT) and not loop["pending"]:
             timeline.look(max(tick, 0))
         if why == ReturnReason.STOPPED_HERE:
             timeline.end("interrupted", "stopped by the operator", tick)
-            end.last_words(STOPPED, 0, bench.u)
+            end.send_last_frames(STOPPED, 0, bench.u)
             break
         if why == ReturnReason.PEER_SAFE:
             timeline.end("tripped", REASONS[PLANT_TRIP], max(tick, end.reader.tick))
-            end.last_words(SAFE, PLANT_TRIP, bench.u)
+            end.send_last_frames(SAFE, PLANT_TRIP, bench.u)
             break
         if why == ReturnReason.PEER_STOPPED:
             if end.reader.reason:
                 timeline.end("interrupted", PLANT_LEFT, tick)
             else:
                 timeline.finish(tick)
-            end.last_words(STOPPED, 0, bench.u)
+            end.send_last_frames(STOPPED, 0, bench.u)
             break
         if why == ReturnReason.SILENT:
             timeline.end("safe", REASONS[LOST_PEER], tick)
-            end.last_words(SAFE, LOST_PEER, bench.u)
+            end.send_last_frames(SAFE, LOST_PEER, bench.u)
             break
         if not timeline.running and not in_network:  # ``timeline.look`` found a safe state
-            end.last_words(SAFE, int(ctl["reason"][0]), bench.u)
+            end.send_last_frames(SAFE, int(ctl["reason"][0]), bench.u)
     return end.reader
 
 
@@ -239,7 +239,7 @@ def send_last(
             time.sleep(0.001)
 
 
-def part_from(
+def end_exchange(
     link: Link,
     writer: FrameWriter,
     reader: FrameReader,
@@ -276,17 +276,17 @@ def run_loop(
 ) -> list[FrameReader]:
     """Run one side of a scenario after the handshakes, in a thread; returns its frame counters.
 
-    The thread inherits processor and priority from the caller. The caller then steps back to
-    ordinary priority and only looks, a few times a second, whether to stop and what to write down.
+    The thread inherits processor and priority from the caller. The caller then returns to ordinary
+    priority, and every 50 ms checks whether to stop and writes the log.
     A link without a port gets a thread that pumps its messages.
-
-    Raises:
-        PeerLost: an external controller does not answer; its thread is left behind.
 
     Args:
         shares: of the controller one, of the plant one for each converter.
-        flags: shape (FLAGS,), what other threads tell the loop, see
+        flags: shape (FLAGS,), by which other threads stop or wake the loop, see
             ``gfm_hil.engine.loop_records``.
+
+    Raises:
+        PeerLost: an external controller does not answer; its thread goes on.
     """
     if flags is None:
         flags = np.zeros(FLAGS, np.int64)
@@ -294,18 +294,18 @@ def run_loop(
     timelines = [share.timeline for share in shares]
     external = shares[0].bench.external if role == "controller" else None
     for share in shares:
-        getattr(share.link, "start", _not_there)()
-    found: list[FrameReader] = []
-    failed: list[BaseException] = []
+        getattr(share.link, "start", _do_nothing)()
+    readers: list[FrameReader] = []
+    problems: list[BaseException] = []
 
     def work() -> None:
         try:
             if role == "plant":
-                found.extend(drive_plant(shares, t0_ns, flags))
+                readers.extend(drive_plant(shares, t0_ns, flags))
             else:
-                found.append(drive_controller(shares[0], t0_ns, flags))
+                readers.append(drive_controller(shares[0], t0_ns, flags))
         except BaseException as problem:  # the caller's thread raises it
-            failed.append(problem)
+            problems.append(problem)
 
     for timeline in timelines:
         timeline.put_off = True
@@ -316,7 +316,7 @@ def run_loop(
     restore_priority()
     try:
         while thread.is_alive():
-            thread.join(_LOOK_S)
+            thread.join(_WATCH_S)
             for timeline in timelines:
                 timeline.flush()
             flags[STOP] = stopped() or any(timeline.failed for timeline in timelines)
@@ -330,17 +330,17 @@ def run_loop(
         for timeline in timelines:
             timeline.put_off = False
         for share in shares:
-            getattr(share.link, "stop", _not_there)()
-    if failed:
-        raise failed[0]
-    return found
+            getattr(share.link, "stop", _do_nothing)()
+    if problems:
+        raise problems[0]
+    return readers
 
 
-def _not_there() -> None:
+def _do_nothing() -> None:
     """The start and the stop of a link that has neither method."""
 
 
-def _ticks(bench: Bench) -> Callable[..., ReturnReason]:
+def _ticks_of(bench: Bench) -> Callable[..., ReturnReason]:
     return bench.external or controller_ticks
 
 
@@ -361,7 +361,7 @@ def compile_loops(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart
     if role == "plant":
         plant_ticks(tuple(end.side for end in ends), benches[0].plant.records, 0)
     else:
-        _ticks(benches[0])(*ends[0].side, _records(benches[0]), _FAR)
+        _ticks_of(benches[0])(*ends[0].side, _records(benches[0]), _FAR)
 
 
 @port_function

@@ -16,17 +16,26 @@ from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
 from gfm_hil.results.figures import as_svg, in_a_page
-from gfm_hil.results.single_line import Bar, bars_of, collide, converters_of, give_lanes, give_rows
+from gfm_hil.results.single_line import (
+    Bar,
+    assign_lanes,
+    assign_rows,
+    bars_of,
+    collide,
+    converters_of,
+)
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
 
 _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
-_TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4  # where these begin, and one bar to the next
+#: x of the terminal, of a converter's line and of the first busbar; from one busbar to the next
+_TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4
 _ROW = 1.75
-#: of a narrow page: its rows, the lines beside each other, its width
+#: of a narrow page: from one row to the next, from one vertical line to the next, its width
 _STACKED_ROW, _LANE, _NARROW = 1.0, 0.4, 5.1
-#: places of a report: the curves of one converter, and those of some beside each other
+#: fragments of a report's address, before names: the chapter of one converter, and the curves of
+#: only these converters
 OF, ONLY = "of-", "only="
 
 
@@ -50,9 +59,9 @@ def draw_diagram(
         root = in_a_page(drawn)
         root.set("class", width)
         for link in root.iter("a"):
-            _, hash, place = link.attrib["href"].partition("#")
-            link.attrib = {"href": hash + place}  # in the same tab
-            link.set("aria-label", f"curves of {place.removeprefix(OF).removeprefix(ONLY)}")
+            fragment = link.attrib["href"].partition("#")[2]
+            link.attrib = {"href": f"#{fragment}"}  # without the target of a new tab
+            link.set("aria-label", f"curves of {fragment.removeprefix(OF).removeprefix(ONLY)}")
         elements.append(ElementTree.tostring(root, encoding="unicode"))
     return "".join(elements)
 
@@ -60,18 +69,18 @@ def draw_diagram(
 def fill_diagram(
     figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
 ) -> Axes:
-    """Fill a figure, whose size it sets, with the diagram; events that make faults are marked.
-    Where columns do not hold a mesh it is as ``fill_narrow`` has it.
+    """Draw the diagram into a figure and set its size; faults of the events are marked. A mesh
+    whose nodes would overlap in columns is drawn as by ``fill_narrow``.
 
     Args:
-        report: address of the page on whose curves converters and lines are links, a line on those
-            of the converters at its ends; None for no links.
-        leads_to: what the link of a converter has before its name: its chapter, or ``ONLY`` its
+        report: address of the page with the curves, to which converters and lines are links, a line
+            to the curves of the converters at its ends; None: no links.
+        leads_to: fragment before the name of a converter: ``OF``, its chapter, or ``ONLY``, its
             curves among those of all.
     """
     plants, laws, nodes = converters_of(scenario)
     bars, lines = bars_of(scenario, nodes)
-    top = give_rows(bars, lines)
+    top = assign_rows(bars, lines)
     if collide(bars, lines):
         return fill_narrow(figure, scenario, report, leads_to)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
@@ -80,10 +89,10 @@ def fill_diagram(
     axes.set(xlim=(-0.2, width), ylim=(-_ROW * top + 0.55, 0.95), aspect="equal")
     axes.axis("off")
     passing = [(r, 0.0) for bar in bars.values() for r in bar.rows[: len(bar.converters)]]
-    passing += [(r, min(_at(bars[a]), _at(bars[b]))) for r, a, b, *_ in lines.values()]
+    passing += [(r, min(_x_of(bars[a]), _x_of(bars[b]))) for r, a, b, *_ in lines.values()]
     spots: _Spots = {}
     for name, bar in bars.items():
-        x = _at(bar)
+        x = _x_of(bar)
         for row, converter in zip(bar.rows, bar.converters, strict=False):
             _converter(axes, row, converter, plants[converter], laws[converter])
             _wire(axes, (_LINE, -_ROW * row), (x, -_ROW * row))
@@ -91,9 +100,9 @@ def fill_diagram(
             behind = not converter and plants[converter].lcl is not None
             spots[converter] = (_LINE + 1.1 if behind else _TERMINAL, -_ROW * row), (x, -_ROW * row)
             if report is not None:
-                _area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{leads_to}{converter}")
+                _link_area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{leads_to}{converter}")
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
-            _hang(axes, x, -_ROW * row, symbol, text, closed)
+            _shunt(axes, x, -_ROW * row, symbol, text, closed)
         ys = [-_ROW * row for row in bar.rows]
         ys += [-_ROW * row for row, start, end, *_ in lines.values() if name in (start, end)]
         ends = min(ys) - 0.35, max(ys) + 0.35
@@ -103,17 +112,17 @@ def fill_diagram(
                 axes.plot([x - 0.15, x + 0.15], [-_ROW * row] * 2, color="white", lw=4, zorder=2.2)
         axes.text(x, max(ys) + 0.45, name, ha="center", fontsize=8.5, color=_INK)
     for name, (row, start, end, symbol, text, closed) in lines.items():
-        (left, right), y = sorted((_at(bars[start]), _at(bars[end]))), -_ROW * row
+        (left, right), y = sorted((_x_of(bars[start]), _x_of(bars[end]))), -_ROW * row
         _wire(axes, (left, y), (right, y))
         _IN_LINE.get(symbol, _box)(axes, (left + right) / 2, y)
         _breaker(axes, left + 0.5, y, closed)
         axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
         at_ends = [c for c, node in nodes.items() if node in (start, end)]
         if report is not None and at_ends:
-            _area(axes, (left + 0.1, right - 0.1), y, f"{report}#{ONLY}{','.join(at_ends)}")
-        spots[name] = (_at(bars[start]), y), (_at(bars[end]), y)
+            _link_area(axes, (left + 0.1, right - 0.1), y, f"{report}#{ONLY}{','.join(at_ends)}")
+        spots[name] = (_x_of(bars[start]), y), (_x_of(bars[end]), y)
     for name, bar in bars.items():
-        spots[f"node {name}"] = ((_at(bar), -_ROW * bar.rows[0]),) * 2
+        spots[f"node {name}"] = ((_x_of(bar), -_ROW * bar.rows[0]),) * 2
     for event in scenario.events:
         if not isinstance(event, Fault):
             continue
@@ -125,11 +134,11 @@ def fill_diagram(
 def fill_narrow(
     figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
 ) -> Axes:
-    """As ``fill_diagram`` for a narrow page: nodes below each other, lines at their left, and of a
-    converter its elements in words."""
+    """As ``fill_diagram`` for a narrow page: nodes below each other, lines on their left, and a
+    converter's filter as text."""
     plants, laws, nodes = converters_of(scenario)
     bars, lines = bars_of(scenario, nodes)
-    top, lanes = give_rows(bars, lines, stacked=True), give_lanes(bars, lines)
+    top, lanes = assign_rows(bars, lines, stacked=True), assign_lanes(bars, lines)
     height = _STACKED_ROW * (top + 0.3)
     figure.set_size_inches(0.72 * _NARROW, 0.72 * height)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -137,7 +146,7 @@ def fill_narrow(
     axes.axis("off")
     x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
     spots: _Spots = {}
-    labels: dict[str, tuple[float, float]] = {}  # where the text of a fault there stands
+    labels: dict[str, tuple[float, float]] = {}  # (x, y) of the text of a fault, by the same names
     for name, bar in bars.items():
         ys = [-_STACKED_ROW * row for row in bar.rows]
         axes.plot([x, x], [ys[0] + 0.35, ys[-1] - 0.35], color=_INK, lw=3.5, solid_capstyle="butt")
@@ -148,9 +157,9 @@ def fill_narrow(
             _in_words(axes, x, y, converter, plants[converter], laws[converter])
             spots[converter], labels[converter] = ((x + 0.35, y), (x, y)), (x + 0.3, y - 0.5)
             if report is not None:
-                _area(axes, (x, _NARROW), y, f"{report}#{leads_to}{converter}", 0.45)
+                _link_area(axes, (x, _NARROW), y, f"{report}#{leads_to}{converter}", 0.45)
         for y, (symbol, text, closed) in zip(ys[len(bar.converters) :], bar.right, strict=False):
-            _hang(axes, x, y, symbol, _folded(text, x + 1.5), closed, 0.75)
+            _shunt(axes, x, y, symbol, _wrap_lines(text, x + 1.5), closed, 0.75)
     for name, (row, start, end, symbol, text, closed) in lines.items():
         upper, lower = sorted((bars[start].rows, bars[end].rows))
         y, at = -_STACKED_ROW * row, x - _LANE * (1 + lanes[name])
@@ -162,30 +171,30 @@ def fill_narrow(
         axes.plot([at, at], ends, color=_INK, lw=1.1, solid_capstyle="round", zorder=2.2)
         _IN_LINE.get(symbol, _box)(axes, at, y, True)
         _breaker(axes, at, y + 0.57, closed)
-        label = f"{name}\n{_folded(text, x + 0.25)}"
+        label = f"{name}\n{_wrap_lines(text, x + 0.25)}"
         axes.text(x + 0.25, y, label, va="center", **_SMALL)
         begin, finish = ends if bars[start].rows == upper else ends[::-1]
         spots[name] = (at, begin), (at, finish)
         labels[name] = x + 0.3, y - 0.45
         at_ends = [c for c, node in nodes.items() if node in (start, end)]
         if report is not None and at_ends:
-            _area(axes, (at - 0.3, _NARROW), y, f"{report}#{ONLY}{','.join(at_ends)}", 0.45)
+            _link_area(axes, (at - 0.3, _NARROW), y, f"{report}#{ONLY}{','.join(at_ends)}", 0.45)
     for event in scenario.events:
         if isinstance(event, Fault):
             *_, text = _fault(axes, scenario, event, spots)
-            axes.text(*labels[_where(event, spots)], text, **_MARKED)
+            axes.text(*labels[_spot_of(event, spots)], text, **_MARKED)
     return axes
 
 
-#: from where to where a fault of a line may be, by its name, or by "node" and that of a node
+#: both ends (x, y) of the places where a fault may be, by the name of a line or "node NAME"
 _Spots = dict[str, tuple[tuple[float, float], tuple[float, float]]]
 
 
-def _folded(text: str, x: float) -> str:
-    """Lines of text that fit a narrow page from x on."""
+def _wrap_lines(text: str, x: float) -> str:
+    """The text in lines that fit between x and the right edge of a narrow page."""
     letters = int((_NARROW - x) * 0.72 * 72 / 4.3)  # mean width of a small letter, points
-    kept = [line.replace(" ", "\xa0").replace(",\xa0", ", ") for line in text.splitlines()]
-    return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in kept)
+    unbroken = [line.replace(" ", "\xa0").replace(",\xa0", ", ") for line in text.splitlines()]
+    return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in unbroken)
 
 
 def _in_words(axes: Axes, x: float, y: float, name: str, plant: Plant, law: str) -> None:
@@ -194,21 +203,21 @@ def _in_words(axes: Axes, x: float, y: float, name: str, plant: Plant, law: str)
     pu = parameters.pu(plant.real_factors())
     _wire(axes, (x, y), (x + 0.35, y))
     _bridge(axes, x + 0.35, y)
-    said = [f"{parameters.S_n / 1e3:g} kVA"]
-    said += [f"$L_f$ {pu['L_f']:.3g}", f"$C_f$ {pu['C_f']:.3g}"]
+    elements = [f"{parameters.S_n / 1e3:g} kVA"]
+    elements += [f"$L_f$ {pu['L_f']:.3g}", f"$C_f$ {pu['C_f']:.3g}"]
     if plant.lcl is not None:
-        said.append(f"$L_2$ {plant.lcl.L:.3g}")
+        elements.append(f"$L_2$ {plant.lcl.L:.3g}")
     if plant.lcl is None or not name:
-        said.append(f"$L_g$ {pu['L_g']:.3g}")
+        elements.append(f"$L_g$ {pu['L_g']:.3g}")
     if not name:
-        said.append(f"SCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}")
+        elements.append(f"SCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}")
     text = f"{name}: {law}" if name else law
-    text = "\n".join(_folded(one, x + 1.2) for one in (text, ", ".join(said)))
+    text = "\n".join(_wrap_lines(one, x + 1.2) for one in (text, ", ".join(elements)))
     axes.text(x + 1.2, y, text, va="center", **_SMALL | {"color": _INK})
 
 
-def _area(axes: Axes, x: tuple[float, float], y: float, url: str, half: float = 0.8) -> None:
-    """A link as large as what is drawn along a row."""
+def _link_area(axes: Axes, x: tuple[float, float], y: float, url: str, half: float = 0.8) -> None:
+    """A link over the symbols of a row, from x[0] to x[1], ``half`` high on both sides."""
     low = y - half if half < 0.8 else y - 1.0
     axes.add_patch(
         Rectangle((x[0], low), x[1] - x[0], 2 * half, fc="none", ec="none", url=url, zorder=5)
@@ -219,7 +228,7 @@ _MARKED: dict[str, Any] = {"fontsize": 7.5, "color": _RED}
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 
 
-def _at(bar: Bar) -> float:
+def _x_of(bar: Bar) -> float:
     return _BARS + _COLUMN * bar.column
 
 
@@ -331,10 +340,10 @@ _AT_END: dict[str, Callable[[Axes, float, float], None]] = {
 }  # fmt: skip
 
 
-def _hang(
+def _shunt(
     axes: Axes, x: float, y: float, symbol: str, text: str, closed: bool, reach: float = 1.2
 ) -> None:
-    """What hangs on the right of a bar, with its breaker; a bank of capacitors has none."""
+    """A shunt element on the right of a busbar, with its breaker; a bank of capacitors has none."""
     end = x + reach
     _wire(axes, (x, y), (end, y))
     if symbol != "capacitor":
@@ -349,7 +358,7 @@ def _hang(
     axes.text(end + place, y, text, va="center", **_SMALL)
 
 
-def _where(event: Fault, spots: _Spots) -> str:
+def _spot_of(event: Fault, spots: _Spots) -> str:
     """The name of the spot of a fault."""
     if event.node is not None:
         return f"node {event.node}"
@@ -358,7 +367,7 @@ def _where(event: Fault, spots: _Spots) -> str:
 
 def _fault(axes: Axes, scenario: Scenario, event: Fault, spots: _Spots) -> tuple[float, float, str]:
     """A flash where the event puts its fault; returns the place and what to write there."""
-    (x, y), (x_end, y_end) = spots[_where(event, spots)]
+    (x, y), (x_end, y_end) = spots[_spot_of(event, spots)]
     x += (event.position or 0.0) * (x_end - x)
     y += (event.position or 0.0) * (y_end - y)
     flash: Sequence[tuple[float, float]] = [(0.0, 0.0), (0.16, 0.3), (0.02, 0.3), (0.2, 0.62)]

@@ -12,7 +12,7 @@ from gfm_runtime import law_titles
 
 @dataclass
 class Bar:
-    """A node: which converters come from the left, and what hangs on its right."""
+    """The busbar of a node: converters on its left, and on its right what is connected in shunt."""
 
     column: int = 0
     converters: list[str] = field(default_factory=list)
@@ -57,18 +57,18 @@ def bars_of(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, Bar
                 bars.setdefault(node, Bar())
         for name, one, closed in sorted(each, key=lambda item: item[1].symbol == "capacitor"):
             if hasattr(one, "node"):  # banks below the others
-                hanging = one.symbol, f"{name}\n{one.label()}", closed
-                bars.setdefault(one.node, Bar()).right.append(hanging)
+                shunt = one.symbol, f"{name}\n{one.label()}", closed
+                bars.setdefault(one.node, Bar()).right.append(shunt)
     if at_grid is not None:
         kind = "ideal" if grid.finite is None else f"S {grid.finite.S:g}, H {grid.finite.H:g} s"
         f_g = grid.omega_g * nominal_frequency(scenario)
         text = f"grid, {kind}\n$V_g$ {grid.V_g:g} p.u., {f_g:g} Hz"
         bars.setdefault(at_grid, Bar()).right.insert(0, ("~", text, True))
-    _give_columns(bars, lines, at_grid)
+    _assign_columns(bars, lines, at_grid)
     return bars, lines
 
 
-def _give_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> None:
+def _assign_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> None:
     """Put every node left of its neighbours on the way to the grid, which is last; those that a
     line connects are in different columns."""
     first = last or next(iter(bars))
@@ -85,11 +85,11 @@ def _give_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> No
         bar.column = max(away.values()) - away.get(name, 0)
 
 
-def give_rows(bars: Mapping[str, Bar], lines: Lines, stacked: bool = False) -> int:
-    """Give every node, and every line, rows of its own; returns how many there are.
+def assign_rows(bars: Mapping[str, Bar], lines: Lines, stacked: bool = False) -> int:
+    """Assign rows of their own to every node and line; returns how many there are.
 
     Nodes at the right come first, so that wires to them pass above the others. ``stacked``: all
-    nodes are in one column for a narrow page, and converters hang on their right, above the rest.
+    nodes are in one column for a narrow page, with its converters on the right, above the rest.
     """
     row, done = 0, set[str]()
     for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
@@ -119,7 +119,7 @@ def collide(bars: Mapping[str, Bar], lines: Lines) -> bool:
     )
 
 
-def give_lanes(bars: Mapping[str, Bar], lines: Lines) -> dict[str, int]:
+def assign_lanes(bars: Mapping[str, Bar], lines: Lines) -> dict[str, int]:
     """How far left of nodes that are stacked each line runs, 0 next to them, so that no two meet
     but at a node."""
     ends = {

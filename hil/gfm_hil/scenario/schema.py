@@ -26,8 +26,8 @@ from gfm_runtime.inner_file import named_inner
 from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, table_hash
 
-#: ``link.peer_timeout_s`` by mode where none is given: real time cannot wait; in lockstep no time
-#: passes meanwhile, and a busy machine may keep a side for seconds
+#: default of ``link.peer_timeout_s`` by mode: real time cannot wait; in lockstep simulated time
+#: stands still, and a busy machine may delay a side by seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
 _WITH_COUNTS = ("shm", "zmq")  # links
 _MOST_FLOWS = 3500  # columns of a network, in a file of signals
@@ -131,7 +131,7 @@ class LatePolicy(StrictSchema):
 
 
 class NetworkConverter(StrictSchema):
-    """One converter of a network; what it does not give is that of the scenario."""
+    """One converter of a network; a key that it leaves out has the scenario's value."""
 
     node: str = Field(min_length=1, description="where its line ends")
     law: str | None = Field(None, description="catalogue name or path of a law file")
@@ -268,27 +268,27 @@ class Scenario(StrictSchema):
         plant; none without a network."""
         if self.network is None:
             return {}
-        given = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
+        keys = ("law", "inner", "references", "link", "late_policy", "plant", "expect")
         plant = self.plant.model_copy(update={"grid": Plant().grid})
 
-        def whole(member: NetworkConverter) -> NetworkConverter:
-            if self.converter is not None:  # it was made whole before
+        def with_defaults(member: NetworkConverter) -> NetworkConverter:
+            if self.converter is not None:  # a folder's scenario.toml has all its keys
                 return member
-            own = {key: getattr(self, key) for key in given if getattr(member, key) is None}
+            own = {key: getattr(self, key) for key in keys if getattr(member, key) is None}
             return member.model_copy(update=own | ({"plant": plant} if "plant" in own else {}))
 
-        members = {name: whole(member) for name, member in self.network.converters.items()}
+        members = {name: with_defaults(member) for name, member in self.network.converters.items()}
         network = self.network.model_copy(update={"converters": members})
 
         def seen(name: str, member: NetworkConverter) -> Scenario:
-            own = {key: getattr(member, key) for key in given}
+            own = {key: getattr(member, key) for key in keys}
             own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
             return self.model_copy(update={**own, "network": network, "converter": name})
 
         return {name: seen(name, member) for name, member in members.items()}
 
     def __copy__(self) -> Scenario:
-        """A copy that may get other fields, so without what has been derived from these."""
+        """A copy without the cached properties, since the fields of a copy may be changed."""
         copy = super().__copy__()
         for derived in copy.__dict__.keys() - type(self).model_fields.keys():
             del copy.__dict__[derived]
@@ -307,8 +307,8 @@ class Scenario(StrictSchema):
 
     @property
     def answer_timeout_s(self) -> float:
-        """How long a model may take for an answer, s. It is half of the peer's time, so that its
-        controller can still say what has failed."""
+        """How long an external controller may take for u, s: half of the peer's time, so that its
+        side can still report what has failed."""
         return self.peer_timeout_s / 2
 
     @property
@@ -345,10 +345,10 @@ class Scenario(StrictSchema):
     def digest(self) -> str:
         """Hash of all that both sides must agree on: scenario, signal table, and the content of
         the law and converter files, wherever each machine keeps them."""
-        about = {"link", "title", "description", "compare", "waveforms"}
-        about |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
+        differ = {"link", "title", "description", "compare", "waveforms"}
+        differ |= {"expect", "expect_ripple", "expect_reason", "expect_after"}
         content = self.model_dump(
-            exclude={*about, "law", "inner", "counts", "events", "ready_laws"}
+            exclude={*differ, "law", "inner", "counts", "events", "ready_laws"}
         )
         if self.network is not None:
             members = content["network"]["converters"]
@@ -364,12 +364,12 @@ class Scenario(StrictSchema):
         names = self.laws()
         events = []
         for e in self.sorted_events():
-            known: dict[str, Any] = {}
+            by_content: dict[str, Any] = {}
             if hasattr(e, "law"):
-                known["law"] = names.index(e.law)
+                by_content["law"] = names.index(e.law)
             if hasattr(e, "file"):
-                known["file"] = file_hash(e.file)
-            events.append({**e.model_dump(), **known})
+                by_content["file"] = file_hash(e.file)
+            events.append({**e.model_dump(), **by_content})
         return _hash([content, events, self.laws_digest(), table_hash()])
 
     def laws_digest(self) -> str:
@@ -378,9 +378,9 @@ class Scenario(StrictSchema):
 
     @cached_property
     def carries(self) -> int:
-        """What frames and recording have beside y and u of Phi. With an inner stage in one of the
-        laws these are its signals (``INNER``), with laws that measure and modulate also counts
-        (``COUNTS``), else nothing (``PLAIN``)."""
+        """The signals of frames and recording beside y and u of Phi: ``PLAIN``, none; ``INNER``,
+        those of an inner stage, if a law has one; ``COUNTS``, those and the counts of A/D and
+        modulator, if a law measures and modulates."""
         each = [*self.each.values()] or [self]
         files = [(one, law_file(name)) for one in each for name in one.laws()]
         counts = named_counts(self.counts) if self.counts is not None else None
@@ -391,7 +391,7 @@ class Scenario(StrictSchema):
 
     @property
     def optional_signals(self) -> tuple[str, ...]:
-        """What the recording has by options of a plant, which are power and voltage at the
+        """The signals that options of a plant add to the recording: power and voltage at the
         connection point behind a transformer, and the charge of a battery."""
         plants = [one.plant for one in self.each.values()] or [self.plant]
         connection = any(one.lcl is not None for one in plants)
@@ -400,13 +400,13 @@ class Scenario(StrictSchema):
 
     @property
     def flows(self) -> tuple[str, ...]:
-        """What the recording has of the network, beside that of its first converter."""
+        """Columns of the network's parts, which the recording of its first converter has too."""
         if self.network is None:
             return ()
         nodes = {name: member.node for name, member in self.network.converters.items()}
         return tuple(name for one in self.network.recorded(nodes) for name in one.columns)
 
-    def _wrong_record(self) -> list[str]:
+    def _problems_of_record(self) -> list[str]:
         try:
             names = self.flows
         except ValueError as problem:
@@ -415,7 +415,7 @@ class Scenario(StrictSchema):
             return []
         return [f"network.record: {len(names)} columns; at most are {_MOST_FLOWS}; name fewer"]
 
-    def _wrong_links(self) -> list[str]:
+    def _problems_of_links(self) -> list[str]:
         problems = []
         own = dict(zip(self.parts or [""], self.links, strict=True))
         kinds = {link.type for link in own.values()}
@@ -453,7 +453,7 @@ class Scenario(StrictSchema):
                 problems.append(f"{where}.options: {problem}")
         return problems
 
-    def _wrong_snapshot(self) -> list[str]:
+    def _problems_of_snapshot(self) -> list[str]:
         problems = []
         if self.snapshot is not None and not 0 < round(self.snapshot / self.T_s) < self.ticks:
             problems.append(
@@ -465,7 +465,7 @@ class Scenario(StrictSchema):
         if self.snapshot is not None or self.start_from is not None:
             for link in self.links:
                 if link.impairment is not None and link.impairment.trace is not None:
-                    problems.append(f"{key}: goes with no link.impairment.trace")
+                    problems.append(f"{key}: cannot be combined with link.impairment.trace")
                 if int(link.options.get("every", 1)) > 1:  # the link has u of several ticks then
                     problems.append(f"{key}: needs link.options.every = 1")
         return problems
@@ -489,13 +489,13 @@ class Scenario(StrictSchema):
                     f"{self.duration:g} s"
                 )
             problems += [f"events.{k}: {line}" for line in event.misfits(self)]
-            asked = getattr(event, "converter", None)
-            if asked is not None and asked not in self.converters:
+            name = getattr(event, "converter", None)
+            if name is not None and name not in self.converters:
                 problems.append(
-                    f"events.{k}.converter = {asked!r}: must be one of {self.converters}"
-                    f"{meant(asked, self.converters)}"
+                    f"events.{k}.converter = {name!r}: must be one of {self.converters}"
+                    f"{meant(name, self.converters)}"
                 )
-        problems += self._wrong_record() + self._wrong_snapshot()
+        problems += self._problems_of_record() + self._problems_of_snapshot()
         if self.network is not None and self.plant.grid.load_R is not None:
             problems.append("plant.grid.load_R: a load of a network is one of network.loads")
         if self.network is not None and self.plant.grid.scr is not None:
@@ -503,7 +503,7 @@ class Scenario(StrictSchema):
                 f"plant.grid.scr = {self.plant.grid.scr:g}: is for one converter alone;"
                 " network.lines say how strong the grid of a network is"
             )
-        problems += self._wrong_links()
+        problems += self._problems_of_links()
         if problems:
             raise ValueError("; ".join(problems))
         return self

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from gfm_hil.core.errors import PeerLost, UserError
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.engine.drive import part_from
+from gfm_hil.engine.drive import end_exchange
 from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
@@ -258,5 +258,5 @@ def test_a_line_whose_other_side_is_gone_is_a_lost_peer(endpoint):
             plant.send(b"a")
     assert plant.receive() is None
     # at the end of a run: it closed once it had heard the first of several goodbyes
-    part_from(plant, FrameWriter("y"), FrameReader("u"), 0, STOPPED, 0, np.zeros(NY))
+    end_exchange(plant, FrameWriter("y"), FrameReader("u"), 0, STOPPED, 0, np.zeros(NY))
     plant.close()

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Rectangle
 
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram, fill_narrow
-from gfm_hil.results.single_line import Bar, give_lanes, give_rows
+from gfm_hil.results.single_line import Bar, assign_lanes, assign_rows
 from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 from gfm_plant import NetworkParts
 from gfm_plant.components.part import Component
@@ -125,10 +125,10 @@ def test_lines_of_a_narrow_page_meet_at_nodes_alone():
     bars["b"].right = [("load", "town", True)]
     ends = {"ab": "ab", "bc": "bc", "cd": "cd", "da": "da"}
     lines = {name: (0, *pair, "inductor", "", True) for name, pair in ends.items()}
-    assert give_rows(bars, lines, stacked=True) == 9
+    assert assign_rows(bars, lines, stacked=True) == 9
     assert [bars[name].rows for name in "abcd"] == [[0], [2, 3], [5], [8]]
     assert {name: line[0] for name, line in lines.items()} == {"ab": 1, "bc": 4, "cd": 6, "da": 7}
-    assert give_lanes(bars, lines) == {"ab": 0, "bc": 0, "cd": 0, "da": 1}
+    assert assign_lanes(bars, lines) == {"ab": 0, "bc": 0, "cd": 0, "da": 1}
 
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"

@@ -10,6 +10,7 @@ import contextlib
 import os
 import select
 import socket
+from collections.abc import Iterable
 from typing import Any
 
 import can
@@ -35,26 +36,27 @@ class LoopbackBus(can.BusABC):
     """
 
     def __init__(self, channel: Any, place: int | None = None, **more: Any) -> None:
-        self._is_shutdown = True  # until there is something to shut down
+        self._is_shutdown = True  # else python-can's __del__ shuts down a bus that failed to open
         first = int(str(channel).removeprefix(f"{_HOST}:"))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        taken = self._take(first, reversed(range(NODES)) if place is None else [place])
-        self._others = [_connected(first + k) for k in range(NODES) if k != taken]
+        own = self._bind(first, reversed(range(NODES)) if place is None else [place])
+        self._others = [_connected(first + k) for k in range(NODES) if k != own]
         self.record = np.zeros(1, socket_dtype)
         set_socket(self.record, LOOPBACK, self.fileno(), [other.fileno() for other in self._others])
         self._frame = np.zeros(1, frame_dtype)
-        self.channel_info = f"loopback bus at {_HOST}:{first}, place {taken}"
+        self.channel_info = f"loopback bus at {_HOST}:{first}, place {own}"
         self._can_protocol = can.CanProtocol.CAN_FD
         super().__init__(channel=channel, **more)
         self._is_shutdown = False
 
-    def _take(self, first: int, places: Any) -> int:
+    def _bind(self, first: int, places: Iterable[int]) -> int:
+        """Bind the socket to the first free one of these places, and return its index."""
         for place in places:
             with contextlib.suppress(OSError):
                 self._socket.bind((_HOST, first + place))
-                return int(place)
+                return place
         self._socket.close()
         raise can.CanInitializationError(f"occupied: {_HOST}:{first}")
 

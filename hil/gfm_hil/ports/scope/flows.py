@@ -8,11 +8,11 @@ from gfm_hil.ports.scope.watched import WatchedRun
 from gfm_hil.results.single_line import (
     Bar,
     Lines,
+    assign_lanes,
+    assign_rows,
     bars_of,
     collide,
     converters_of,
-    give_lanes,
-    give_rows,
 )
 from gfm_hil.scenario.events.breaker import GRID, switched
 from gfm_runtime.states import STATES
@@ -34,7 +34,7 @@ class Flows:
         self._runs = runs
         _, laws, nodes = converters_of(self._scenario)
         bars, lines = bars_of(self._scenario, nodes)
-        rows = give_rows(bars, lines)
+        rows = assign_rows(bars, lines)
         self._closed = {name: True for name in nodes} | {n: line[-1] for n, line in lines.items()}
         network = self._scenario.network
         feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
@@ -87,8 +87,8 @@ class Flows:
 
 def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
     """For a narrow page: the rows of each node, and the row and the lane of each line."""
-    rows = give_rows(bars, lines, stacked=True)
-    lanes = give_lanes(bars, lines)
+    rows = assign_rows(bars, lines, stacked=True)
+    lanes = assign_lanes(bars, lines)
     return {
         "rows": rows, "bars": {name: bar.rows for name, bar in bars.items()},
         "lines": {name: (line[0], lanes[name]) for name, line in lines.items()},

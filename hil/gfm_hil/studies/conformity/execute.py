@@ -31,7 +31,7 @@ from gfm_hil.run.runner import (
 )
 from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
-from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot, judge, own_droop
+from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot_judge, judge, own_droop
 from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_hil.studies.conformity.in_network import NetworkUnderTest
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
@@ -346,7 +346,7 @@ def _run_part(job: Job) -> PartResult:
     names = job.law, job.case.id, job.part.name
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
-        return PartResult(*names, "none", reason, cannot(criteria, reason))
+        return PartResult(*names, "none", reason, cannot_judge(criteria, reason))
     external, plot = job.external, _plot(job)
     with ExitStack() as stack:
         try:
@@ -358,7 +358,7 @@ def _run_part(job: Job) -> PartResult:
         except UserError as problem:
             text = str(problem).replace("\n", "; ").replace(job.file, job.law)
             reason = f"Cannot be judged: there is no such run: {text}"
-            return PartResult(*names, "none", reason, cannot(criteria, reason))
+            return PartResult(*names, "none", reason, cannot_judge(criteria, reason))
         if plot is not None:
             status, reason, recording = "completed", "", ""
             verdicts = plot.judge_scan(found)

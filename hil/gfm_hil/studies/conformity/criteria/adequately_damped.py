@@ -34,7 +34,7 @@ class AdequatelyDamped(Damped):
         )
         limit = f"halves within {self.halving_s:g} s"
         value = halves if halves < math.inf else None
-        return m.says(halves <= self.halving_s, value, "s", limit, text, "p")
+        return m.make_verdict(halves <= self.halving_s, value, "s", limit, text, "p")
 
 
 def halving_s(mode: Oscillation) -> float:

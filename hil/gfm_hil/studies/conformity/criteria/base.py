@@ -1,5 +1,4 @@
-"""What all criteria share: the clause of a test file, and the moment of a run at which it is
-judged.
+"""The base of all criteria: the clause of a test file, and the time of a run at which it is judged.
 
 p, q and V are those at the connection point: behind the converter's transformer if it has one, else
 at the filter. Powers, voltages, currents and frequencies are judged by their means over one cycle
@@ -91,27 +90,29 @@ class UnderTest(StrictSchema):
         return self._measured
 
     def with_measured(self, unit: Unit) -> UnderTest:
-        """The same with a unit that was measured on it."""
-        made = self.model_copy(update={"unit": unit})
-        made._measured = True
-        return made
+        """A copy with a unit that was measured on this converter."""
+        copy = self.model_copy(update={"unit": unit})
+        copy._measured = True
+        return copy
 
     @property
     def instruments(self) -> str:
-        """What its file says of the plant besides the converter, in words."""
-        told = self.plant.model_dump(exclude_unset=True, exclude={"converter"}, exclude_none=True)
-        words = {_NAMES.get(name, name): _plain(x).strip("{}") for name, x in told.items()}
+        """The instruments that its file declares beside the converter, as one line."""
+        declared = self.plant.model_dump(
+            exclude_unset=True, exclude={"converter"}, exclude_none=True
+        )
+        words = {_NAMES.get(name, name): _plain(x).strip("{}") for name, x in declared.items()}
         if not words:
             return "an ideal plant: its file gives no delay, modulation, limit or protection"
         return "; ".join(map(": ".join, words.items()))
 
 
 def own_droop(law: BuiltLaw) -> float:
-    """The frequency over the power at rest, p.u./p.u.: a law's gain from p to omega_u; inf: it has
-    none, or its errors are others than those of p."""
+    """The droop of a law, p.u./p.u.: its gain from p to omega_u at rest; inf: it has none, or the
+    second error of its error map is not that of p."""
     gains = (law.element(matrix, (1, 1))(_NEARLY_DC).real for matrix in ("phi", "psi"))
-    found = 0.0 if law.error_map in _OTHER_ERRORS else sum(gains)
-    return found if 0 < found < 1 else math.inf
+    droop = 0.0 if law.error_map in _OTHER_ERRORS else sum(gains)
+    return droop if 0 < droop < 1 else math.inf
 
 
 class Clause(StrictSchema):
@@ -135,11 +136,12 @@ class Clause(StrictSchema):
         "cannot be judged, it is informative and counts for nothing",
     )
 
-    whole_run: ClassVar[bool] = False  # it is about the whole run, whatever its events
-    of_cut_run: ClassVar[bool] = False  # a run that ended early can be judged too
-    alone: ClassVar[str] = ""  # why it judges a converter alone only, and none of a network
-    explains: ClassVar[int] = 2  # the failure of one with a smaller number explains those of others
-    #: the verdicts that hold of a recording too coarse for more: of samples up to two cycles apart
+    whole_run: ClassVar[bool] = False  # its window is the whole run
+    judges_early_end: ClassVar[bool] = False  # it also judges a run that ended early
+    alone: ClassVar[str] = ""  # why it cannot judge a converter of a network; empty: it can
+    explains: ClassVar[int] = 2  # rank: a failure explains those of higher rank
+    #: the verdicts that also hold for a recording whose samples are too far apart for the others,
+    #: up to two cycles
     coarse: ClassVar[tuple[Outcome, ...]] = ()
 
     def judge(self, m: Moment) -> Verdict:
@@ -159,9 +161,9 @@ class Clause(StrictSchema):
     def limits(self) -> str:
         """All limits in the words of the test file, for lists."""
         own = [key for key in type(self).model_fields if key not in (*Clause.model_fields, "kind")]
-        told = {key: getattr(self, key) for key in own}
+        limits = {key: getattr(self, key) for key in own}
         return ", ".join(
-            f"{k} = {_plain(x)}" for k, x in told.items() if x not in (None, [], False)
+            f"{k} = {_plain(x)}" for k, x in limits.items() if x not in (None, [], False)
         )
 
     def sourced(self, verdict: Verdict) -> Verdict:
@@ -170,7 +172,7 @@ class Clause(StrictSchema):
         return replace(verdict, source=words, known=self.known or "")
 
     def declared(self, under: UnderTest, scenario: Scenario) -> UnderTest:
-        """What the owner declares, with what is measured in its place where it is missing."""
+        """The owner's declarations, with measured values of what this clause needs besides."""
         return under
 
 
@@ -200,9 +202,15 @@ class Windowed(Clause):
 
 
 class Moment:
-    """One time of a finished run at which a clause is judged: ``at`` s and its tick, and the ticks
-    of the window, first to last. The run may have ended early; the others are those of the other
-    converters of a network. ``width`` is that of a cycle in ticks; not a whole number."""
+    """One time of a finished run at which a clause is judged.
+
+    Attributes:
+        at, tick: the time, s, and its tick.
+        first, last: ticks of the window; a run that ended early may lack the last ones.
+        width: ticks of a cycle; not a whole number.
+        others: runs of the other converters of a network, by name.
+        recording: how it was recorded, of a recording; empty of a run.
+    """
 
     def __init__(
         self, run: Run, under: UnderTest, others: Mapping[str, Run], clause: Clause, at: float
@@ -224,33 +232,33 @@ class Moment:
 
     def verdict(self) -> Verdict:
         """The verdict; a window that the run did not reach cannot be judged."""
-        if not self.clause.of_cut_run:
+        if not self.clause.judges_early_end:
             if self.run.ticks < self.last:
-                return self.cannot(f"{self.end()}, before the end of the window")
+                return self.cannot_judge(f"{self.end()}, before the end of the window")
             if self.last - self.first < 2 * whole_ticks(self.width):
-                return self.cannot("the window is shorter than two cycles")
+                return self.cannot_judge("the window is shorter than two cycles")
             if not self.clause.whole_run and self.tick < whole_ticks(self.width):
-                return self.cannot("no whole cycle was recorded before the event")
+                return self.cannot_judge("no whole cycle was recorded before the event")
         return self._of_recording() if self.recording else self.clause.judge(self)
 
     def _of_recording(self) -> Verdict:
         """The verdict on a recording; what it cannot show cannot be judged."""
         apart, cycle = self.recording["resolution_s"], 1 / self.f_n
         finest = self.clause.finest_s(cycle)
-        told = f"what the recording shows is {1e3 * apart:.3g} ms apart, and it takes "
+        too_coarse = f"what the recording shows is {1e3 * apart:.3g} ms apart, and it takes "
         if apart > 2 * cycle or (apart > finest and not self.clause.coarse):
-            return self.cannot(f"{told}{1e3 * finest:.3g} ms")
+            return self.cannot_judge(f"{too_coarse}{1e3 * finest:.3g} ms")
         try:
-            found = self.clause.judge(self)
+            verdict = self.clause.judge(self)
         except UserError as problem:
-            return self.cannot(str(problem))
-        if apart > finest and found.verdict not in (*self.clause.coarse, CANNOT, INFORMATIVE):
-            return self.cannot(
-                f"{told}{1e3 * finest:.3g} ms for more than: {found.text.rstrip('.')}"
+            return self.cannot_judge(str(problem))
+        if apart > finest and verdict.verdict not in (*self.clause.coarse, CANNOT, INFORMATIVE):
+            return self.cannot_judge(
+                f"{too_coarse}{1e3 * finest:.3g} ms for more than: {verdict.text.rstrip('.')}"
             )
-        return found
+        return verdict
 
-    def says(
+    def make_verdict(
         self,
         ok: bool,
         value: float | None,
@@ -272,12 +280,12 @@ class Moment:
             PASS if ok else FAIL, value, unit, limit, f"{text.rstrip('.')}.", low, high, limited,
         )  # fmt: skip
 
-    def cannot(self, reason: str) -> Verdict:
-        """That it cannot be judged, or is informative, and why."""
+    def cannot_judge(self, reason: str) -> Verdict:
+        """The verdict that the clause cannot be judged, or is informative, for this reason."""
         why = self.clause.informative
         text = f"Cannot be judged: {reason}" + (f" (informative: {why})." if why else ".")
-        made = self.says(True, None, "", "", text, getattr(self.clause, "signal", ""))
-        return replace(made, verdict=CANNOT if why is None else INFORMATIVE)
+        verdict = self.make_verdict(True, None, "", "", text, getattr(self.clause, "signal", ""))
+        return replace(verdict, verdict=CANNOT if why is None else INFORMATIVE)
 
     def end(self) -> str:
         """How the run ended early."""
@@ -289,8 +297,8 @@ class Moment:
 
     @property
     def droop(self) -> float:
-        """The declared droop, p.u./p.u.; inf: none. Raises UserError: it is a recording's, which
-        has no law that tells it, and none is declared."""
+        """The declared droop, p.u./p.u.; inf: none. Raises UserError: it is that of a
+        recording, which has no law to compute it from, and none is declared."""
         if self.under.droop is None and self.recording:
             raise UserError("its converter declares no droop; give one, or inf, by --converter")
         return math.inf if self.under.droop is None else self.under.droop
@@ -309,25 +317,25 @@ class Moment:
         return np.asarray(self.run.signals[at_connection(self.run, name)], np.float64)
 
     def check(self, name: str, first: int, last: int) -> None:
-        """See that a recording has a signal at some ticks. Raises UserError: it has not."""
+        """Raise UserError unless a recording has a signal at all ticks from first to last."""
         if name not in self.run.signals:
             raise UserError(f"the recording has no {name}")
         if np.isnan(self.run.signals[name][max(0, first) : last]).any():
             raise UserError(f"the recording does not have all of {name} in the window")
 
     def means(self, name: str, first: int, last: int) -> Vector:
-        """The one-cycle means of a signal that lie within some ticks."""
+        """The one-cycle means of a signal over ticks first to last, in its unit."""
         return self.mean_of(self.raw(name)[first:last])
 
     def mean_of(self, x: Vector) -> Vector:
-        """The one-cycle means of some ticks."""
+        """The one-cycle means of ticks, one for each at which a whole cycle begins, (m,)."""
         return np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), self.width)])
 
     def before(self, name: str) -> float:
         """The mean of the last cycle before the event."""
         return float(self.means(name, self.tick - whole_ticks(self.width), self.tick)[0])
 
-    def ending(self, name: str) -> float:
+    def mean_at_end(self, name: str) -> float:
         """The mean of the last cycle of the window."""
         return float(self.means(name, self.last - whole_ticks(self.width), self.last)[0])
 
@@ -344,8 +352,9 @@ class Moment:
         a = math.exp(-2 * math.pi * self.f_n * self.T_s)
         return before + np.asarray(scipy.signal.lfilter([1 - a], [1, -a], x - before))
 
-    def way(self, name: str, direction: str) -> tuple[checks.Window, float, float]:
-        """A signal, the sign of "up" or "down", and how far its one-cycle means go there."""
+    def excursion(self, name: str, direction: str) -> tuple[checks.Window, float, float]:
+        """The window of a signal, the sign of "up" or "down", and the largest change of its
+        one-cycle means in that direction, in its unit."""
         w, sign = self.window(name), 1.0 if direction == "up" else -1.0
         return w, sign, float(np.max(sign * (w.x - w.before)))
 
@@ -369,7 +378,7 @@ def judge(
     ]
 
 
-def cannot(criteria: Sequence[Clause], reason: str) -> list[Verdict]:
+def cannot_judge(criteria: Sequence[Clause], reason: str) -> list[Verdict]:
     """Verdicts on a run that did not take place, or none of a part without criteria."""
     return [
         c.sourced(

@@ -25,7 +25,7 @@ class Damped(Windowed):
         acts = acting(m.run.scenario, m.run.columns, m.run.ticks)
         m.first = free_from(acts, m.first, m.last)
         if m.last - m.first < 2 * whole_ticks(m.width):
-            return m.cannot("what the event does to the grid is not over within the window")
+            return m.cannot_judge("what the event does to the grid is not over within the window")
         raw = replace(
             w,
             x=m.raw("p")[m.first : m.last],
@@ -43,7 +43,7 @@ class Damped(Windowed):
             text = "p does not swing."
         else:
             text = f"The swing of p at {mode.hz:.3g} Hz has a damping ratio of {mode.damping:.3g}."
-        return m.says(found is None, value, "", f"at least {self.ratio:g}", text, "p")
+        return m.make_verdict(found is None, value, "", f"at least {self.ratio:g}", text, "p")
 
 
 CRITERION = Damped

@@ -37,7 +37,7 @@ class Energy(Windowed):
             + (f" and than the {by_droop:.3g} p.u. s of the droop" if by_droop else "")
             + f", as an inertia constant of {H:.3g} s would; at least {self.least_s:g} s are asked."
         )
-        return m.says(self.least_s <= H, H, "s", f"at least {self.least_s:g} s", text, "p")
+        return m.make_verdict(self.least_s <= H, H, "s", f"at least {self.least_s:g} s", text, "p")
 
 
 CRITERION = Energy

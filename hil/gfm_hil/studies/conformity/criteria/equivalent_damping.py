@@ -29,7 +29,7 @@ class EquivalentDamping(Windowed):
         jumps = [e for e in m.run.scenario.events if isinstance(e, PhaseJump)]
         jump = next((e for e in jumps if e.at(m.T_s) == m.tick), None)
         if jump is None:
-            return m.cannot("its time is not that of a phase jump")
+            return m.cannot_judge("its time is not that of a phase jump")
         w, omega_b = m.window("p"), 2 * math.pi * m.f_n
         every = max(1, len(w.t) // _SAMPLES)
         t, change = (w.t - m.at)[::every], (w.x - w.before)[::every]
@@ -37,10 +37,10 @@ class EquivalentDamping(Windowed):
         try:
             unit = fit_jump(t, change, np.radians(jump.degrees), omega_b, 0.0, skip)
         except UserError as problem:
-            return m.cannot(f"no swing equation fits the answer of p: {problem}")
+            return m.cannot_judge(f"no swing equation fits the answer of p: {problem}")
         ratio, text = damping_of(unit, omega_b)
         ok = self.low <= ratio <= self.high
-        return m.says(ok, ratio, "", f"{self.low:g} to {self.high:g}", text, "p")
+        return m.make_verdict(ok, ratio, "", f"{self.low:g} to {self.high:g}", text, "p")
 
 
 def damping_of(unit: Unit, omega_b: float) -> tuple[float, str]:

@@ -46,18 +46,18 @@ class InEnvelope(Windowed):
         """The value is how far p goes beyond its envelope, p.u."""
         unit, P_0 = m.under.unit, m.before("p")
         if unit is None:
-            return m.cannot(
+            return m.cannot_judge(
                 "D, H and X_eff are not declared, and no swing equation fits the answer to a small "
                 "phase jump"
             )
         after = m.T_s * np.arange(m.last - m.tick, dtype=np.float64)
         found = _expected(m, unit, after, P_0)
         if found is None:
-            return m.cannot("its time is not that of an event with an envelope")
+            return m.cannot_judge("its time is not that of an event with an envelope")
         if not np.isfinite([found.lower, found.upper]).all():
-            return m.cannot(f"its envelope has no finite limits at {unit.inertia(2)}")
+            return m.cannot_judge(f"its envelope has no finite limits at {unit.inertia(2)}")
         if (droops := _by_droop(m, P_0)) > 0.5 * float(np.min(found.upper - found.lower)):
-            return m.cannot(
+            return m.cannot_judge(
                 "the envelope of a ramp knows no droop, and the declared one of "
                 f"{100 * m.droop:g} % alone moves p by {droops:.3g} p.u."
             )
@@ -80,7 +80,9 @@ class InEnvelope(Windowed):
         else:
             text = f"{wrong.text} The envelope is that of {words}."
         every = max(1, len(t) // _CURVE)
-        made = m.says(wrong is None, beyond, "p.u.", "beyond the envelope: 0 p.u.", text, "p")
+        made = m.make_verdict(
+            wrong is None, beyond, "p.u.", "beyond the envelope: 0 p.u.", text, "p"
+        )
         if m.under.measured and wrong is None:
             made = replace(made, verdict=CONSISTENT)
         return replace(made, curve=(t[::every], low[::every], high[::every]))

@@ -27,7 +27,7 @@ class NegativeSequence(Windowed):
         v, i = (phasor(m, name) for name in ("v", "i"))
         size, across = float(np.mean(np.abs(i))), float(np.mean(np.abs(v)))
         if across < _LEAST_V:
-            return m.cannot(f"the voltage of the negative sequence is only {across:.2g} p.u.")
+            return m.cannot_judge(f"the voltage of the negative sequence is only {across:.2g} p.u.")
         middle = 0.5 * (self.leads_low + self.leads_high)
         lead = math.degrees(float(np.angle(np.mean(i * np.conj(v)))))
         lead = middle + (lead - middle + 180.0) % 360.0 - 180.0
@@ -41,7 +41,7 @@ class NegativeSequence(Windowed):
         )
         ok = size >= self.least and self.leads_low <= lead <= self.leads_high
         value, unit = (lead, "°") if size >= self.least else (size, "p.u.")
-        return m.says(ok, value, unit, limit, text, "i")
+        return m.make_verdict(ok, value, unit, limit, text, "i")
 
 
 def phasor(m: Moment, name: str) -> Vector:

@@ -26,7 +26,7 @@ class NoOscillation(Clause):
         scenario = m.run.scenario.model_copy(update={"expect_ripple": self.ripple})
         ripple = remaining_ripple(scenario, m.run.columns, m.run.events, m.run.ticks)
         if ripple is None:
-            return m.cannot("the run is at rest for less than 0.2 s at its end")
+            return m.cannot_judge("the run is at rest for less than 0.2 s at its end")
         name = ripple.oscillates or max(ripple.pu, key=lambda n: ripple.pu[n])
         size = round(ripple.pu[name], 4)
         moves = f"{size:.2g}" if size else "less than 0.0001"
@@ -34,7 +34,7 @@ class NoOscillation(Clause):
         if ripple.oscillates:
             text = ripple.words()[0].upper() + ripple.words()[1:] + "."
         limit = f"at most {ripple.limit:g} p.u."
-        return m.says(not ripple.oscillates, size, "p.u.", limit, text, name)
+        return m.make_verdict(not ripple.oscillates, size, "p.u.", limit, text, name)
 
 
 CRITERION = NoOscillation

@@ -17,7 +17,7 @@ class NoTrip(Clause):
     kind: Literal["no_trip"] = Field(description="kind of criterion")
 
     whole_run: ClassVar[bool] = True
-    of_cut_run: ClassVar[bool] = True
+    judges_early_end: ClassVar[bool] = True
     explains: ClassVar[int] = 0
     coarse: ClassVar[tuple[Outcome, ...]] = (PASS, FAIL)
 
@@ -26,9 +26,13 @@ class NoTrip(Clause):
         run = m.run
         if m.recording and run.status == "completed":
             if not m.recording["trips_seen"]:
-                return m.cannot("without current before the event a recording needs channel trip")
+                return m.cannot_judge(
+                    "without current before the event a recording needs channel trip"
+                )
             if run.ticks < run.scenario.ticks:
-                return m.cannot(f"the recording ends at {run.ticks * m.T_s:.4g} s of the test")
+                return m.cannot_judge(
+                    f"the recording ends at {run.ticks * m.T_s:.4g} s of the test"
+                )
         end, whole = run.ticks * m.T_s, run.scenario.ticks * m.T_s
         lost = {n: r for n, r in m.others.items() if r.status not in _LASTED}
         ok = run.status in _LASTED and run.ticks >= run.scenario.ticks and not lost
@@ -40,7 +44,7 @@ class NoTrip(Clause):
             text = f"{name} ended at {other.ticks * m.T_s:.4g} s: {other.status}: {what}."
         else:
             text = f"The run should last {whole:g} s, but {m.end()}."
-        return m.says(ok, end, "s", f"at least {whole:g} s", text)
+        return m.make_verdict(ok, end, "s", f"at least {whole:g} s", text)
 
 
 CRITERION = NoTrip

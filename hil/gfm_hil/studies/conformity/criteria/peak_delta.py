@@ -22,7 +22,7 @@ class PeakDelta(Windowed):
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the way to the peak, in the unit of the signal."""
-        w, sign, way = m.way(self.signal, self.direction)
+        w, sign, way = m.excursion(self.signal, self.direction)
         word, unit = "rises" if self.direction == "up" else "falls", unit_of(self.signal)
         text = (
             f"The one-cycle mean of {w.symbol} {word} by {way:.3g} {unit} at its peak"
@@ -33,7 +33,9 @@ class PeakDelta(Windowed):
         edge = w.before + sign * self.least
         low, high = (edge, None) if sign > 0 else (None, edge)
         limit = f"at least {self.least:g} {unit}"
-        return m.says(way >= self.least, way, unit, limit, text, self.signal, low, high, m.span)
+        return m.make_verdict(
+            way >= self.least, way, unit, limit, text, self.signal, low, high, m.span
+        )
 
 
 CRITERION = PeakDelta

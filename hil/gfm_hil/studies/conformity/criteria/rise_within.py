@@ -39,9 +39,9 @@ class Rise(Windowed):
 
     def judge(self, m: Moment) -> Verdict:
         """The value is the time that it takes, ms."""
-        w, sign, way = m.way(self.signal, self.direction)
+        w, sign, way = m.excursion(self.signal, self.direction)
         if way < _NO_RISE:
-            return m.cannot(f"{w.symbol} goes {self.direction} by {max(way, 0.0):.2g} only")
+            return m.cannot_judge(f"{w.symbol} goes {self.direction} by {max(way, 0.0):.2g} only")
         x = (
             m.means(self.signal, m.tick + 1 - whole_ticks(m.width), m.last)
             if self.mean
@@ -66,7 +66,7 @@ class Rise(Windowed):
             text += f", and {1e3 * (k + lost[0]) * m.T_s:.3g} ms after the event it falls back"
         ok = took <= self.within + 1e-9 and not wrong and not len(lost)
         limit = f"within {1e3 * self.within:g} ms, without falling back"
-        return m.says(ok, 1e3 * took, "ms", limit, text, self.signal)
+        return m.make_verdict(ok, 1e3 * took, "ms", limit, text, self.signal)
 
 
 CRITERION = Rise

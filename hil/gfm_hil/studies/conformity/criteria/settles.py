@@ -34,7 +34,7 @@ class Settles(Windowed):
         w = m.window(self.signal)
         to, why, limited = self._aim(m, w)
         if w.t[-1] < m.at + self.within:
-            return m.cannot(f"its window ends before {self.within:g} s have passed")
+            return m.cannot_judge(f"its window ends before {self.within:g} s have passed")
         found = checks.settles(w, to, self.within, self.tolerance)
         took = checks.settled_after(w, to, self.tolerance)
         if found is None:
@@ -47,7 +47,7 @@ class Settles(Windowed):
                 f"The one-cycle mean of {w.symbol} should settle at {w.show(to)} ({why})",
                 1,
             )
-        made = m.says(
+        made = m.make_verdict(
             found is None, took, "s", f"within {self.within:g} s, ± {self.tolerance:g}", text,
             self.signal, to - self.tolerance, to + self.tolerance,
             (m.at + self.within, m.last * m.T_s),
@@ -59,11 +59,11 @@ class Settles(Windowed):
         if self.to == "before":
             return w.before, "its value before", False
         if self.to == "grid":
-            return m.ending("omega_g") * m.f_n, "the frequency of the grid", False
+            return m.mean_at_end("omega_g") * m.f_n, "the frequency of the grid", False
         if self.to != "droop":
             return self.to, "the value asked for", False
-        omega_u, under = m.ending("omega_u"), m.under
-        asked = m.ending("ref_P_ref") + (1.0 - omega_u) / m.droop
+        omega_u, under = m.mean_at_end("omega_u"), m.under
+        asked = m.mean_at_end("ref_P_ref") + (1.0 - omega_u) / m.droop
         to = float(np.clip(asked, under.P_min, under.P_max))
         droop = "no droop" if math.isinf(m.droop) else f"the declared droop of {100 * m.droop:g} %"
         why = f"{droop} at {omega_u * m.f_n:.4g} Hz"

@@ -26,7 +26,7 @@ class InStep(Windowed):
             if far < 180
             else f"The converter falls out of step: its angle to the grid moves by {far:.4g}°."
         )
-        return m.says(far < 180, far, "°", "less than 180°", text, "delta")
+        return m.make_verdict(far < 180, far, "°", "less than 180°", text, "delta")
 
 
 CRITERION = InStep

@@ -64,7 +64,7 @@ class StaysWithin(Windowed):
             text = f"{stay}; it is beyond its limits for {beyond:.3g} s in one piece."
         else:
             text = f"{stay}."
-        return m.says(
+        return m.make_verdict(
             found is None, value, unit_of(self.signal), band, text, self.signal, low, high, m.span
         )
 
