@@ -96,7 +96,7 @@ class Case:
 
     def __init__(self, name: str, scenario: Scenario) -> None:
         self.name, n = name, max(1, len(scenario.converters))
-        ticks = max(2000, min(CHUNK, TICKS // n))
+        ticks = max(4000, min(CHUNK, TICKS // n))
         scenario = scenario.model_copy(update={"duration": ticks * scenario.T_s})
         began = time.process_time()
         self.benches = benches = make_benches(scenario)

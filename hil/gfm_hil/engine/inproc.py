@@ -15,19 +15,20 @@ from gfm_hil.engine.replay import Trace, no_trace, replay, stands_still
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
-from gfm_hil.realtime.atomics import row_at
+from gfm_hil.realtime.atomics import prefetch, row_at
 from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
 _PIECE = 1_000  # ticks of all converters that are recorded at a time, in the processor's cache
 # the least of both in a network: Python handles each converter at the end of each
-_LEAST_CHUNK, _LEAST_PIECE = 1_000, 100
+_LEAST_CHUNK, _LEAST_PIECE = 3_000, 100
+_LINE = 64  # bytes of a line of the processor's cache
 
 
 class Stack(NamedTuple):
@@ -86,6 +87,14 @@ def places(*rows: Iterable[NDArray[np.float64]]) -> Places:
     return Places(plant, controller, flows, np.array([each[0].shape[1] for each in all_rows]))
 
 
+@inlined
+def _fetch(at, width, k):
+    """Fetch the lines of row k meanwhile, which are not in the processor's cache."""
+    first = at + 8 * width * k
+    for line in range(first, first + 8 * width, _LINE):
+        prefetch(line)
+
+
 @compiled
 def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, kept):
     """``run_ticks``; also whether every tick was done and left nothing to see to."""
@@ -97,6 +106,9 @@ def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, ke
         changed, trips = False, 0
         plant_flows(plant, row_at(places.flows[0], widths[2], k - first))
         for i in range(len(ctl)):
+            if i + 1 < len(ctl):
+                _fetch(places.plant[i + 1], widths[0], k - first)
+                _fetch(places.controller[i + 1], widths[1], k - first)
             before, changes = ctl[i].state, ctl[i].changes
             row = row_at(places.plant[i], widths[0], k - first)
             tripped = sample(plant, i, y[i], row)
