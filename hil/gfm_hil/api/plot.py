@@ -216,7 +216,8 @@ def root_locus(sweep: GainSweep) -> Axes:
     figure.colorbar(cloud, ax=axes, label=sweep.gain)
     if sweep.values[0] <= sweep.own <= sweep.values[-1]:
         near = sweep.poles[int(np.argmin(np.abs(sweep.values - sweep.own)))]
-        axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=f"near {sweep.own:g}")
+        label = f"near the law's {sweep.own:g}"
+        axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
         axes.legend(fontsize=rc("legend.fontsize", 8), loc="upper left")
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)

@@ -238,7 +238,7 @@ def _print(result: Conformity, wall_s: float) -> None:
                 for said in _why(f)
             ]
             rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
-        console.print(Table(("test", "", "why"), rows, text=None))
+        console.print(Table(("test", "verdict", "why"), rows, text=None))
     else:
         cells = {at: Cell(f"{SIGNS[v]} {v}", _STYLES[v]) for at, v in result.matrix.items()}
         rows = [[case.id, *(cells[law, case.id] for law in result.laws)] for case in result.cases]

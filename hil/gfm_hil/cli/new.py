@@ -37,7 +37,7 @@ def call(options: argparse.Namespace) -> int:
     project = options.kind == "project"
     path = Path(options.name if project else f"{options.name.removesuffix('.toml')}.toml")
     if path.exists():
-        raise UserError(f"{path}: is there already; choose another name")
+        raise UserError(f"{path}: is there already; choose another name, or delete it")
     words = {"NAME": path.name.removesuffix(".toml"), "SCENARIO": "rig_pref_step", "LAW": "droop-3"}
     if project:
         words |= {"SCENARIO": "lab.toml", "LAW": f"laws/{path}.toml"}

@@ -30,7 +30,7 @@ _LONGEST = 1 << 17  # bytes of an entry, at most: a name and an extra field of 6
 def check_empty(folder: Path) -> None:
     """Raise UserError if a folder to write to holds something already, or is none."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder}: is not empty; choose another folder")
+        raise UserError(f"{folder}: is not empty; choose another folder, or delete it")
 
 
 def open_file(path: Path, most: int | None = None) -> io.BufferedReader:
@@ -146,7 +146,7 @@ def write_new(path: Path, text: str) -> Path:
     """Write a text file; returns its path. Raises UserError: it is there already, or cannot be
     written."""
     if path.exists():
-        raise UserError(f"{path}: is there already; choose another name")
+        raise UserError(f"{path}: is there already; choose another name, or delete it")
     try:
         write_text(path, text)
     except OSError as problem:

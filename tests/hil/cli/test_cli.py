@@ -120,7 +120,7 @@ def test_a_start_file_runs_is_stable_and_is_never_overwritten(call, here):
         assert gfmhil.run("sag.toml", law).status == "completed"
     before = Path("mine.toml").read_bytes()
     assert call("new", "law", "mine")[::2] == (
-        2, "gfmhil: mine.toml: is there already; choose another name\n"
+        2, "gfmhil: mine.toml: is there already; choose another name, or delete it\n"
     )  # fmt: skip
     assert Path("mine.toml").read_bytes() == before
     assert call("new", "law", "../Mine")[0] == 2 and not list(here.parent.glob("*.toml"))

@@ -17,6 +17,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.results.export.comtrade import write_cfg, write_dat
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.studies.conformity.criteria.base import judge
+from gfm_hil.studies.conformity.result import explained
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test, scenario_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS
 
@@ -166,6 +167,17 @@ def test_comtrade_at_4_khz_has_the_verdicts_of_the_run(
     found = judged(place, {}, kind="cfg")
     assert found.pop("stays_in_step") == CANNOT
     assert found == {kind: verdicts[kind] for kind in found}
+
+
+def test_the_first_page_is_about_the_recording(place: Path, waves: Columns) -> None:
+    file = place / "page.mat"
+    savemat(file, waves)
+    converter = place / "converter.toml"
+    made = gfmhil.judge_recording(file, place / "waves.toml", TEST, PART, converter=converter)
+    facts = dict(made.about("page"))
+    assert facts["part"] == f"{PART}; not judged: +10"
+    assert not facts.keys() & {"law", "inner stage"}
+    assert "about what was recorded" in explained(made, "page")
 
 
 def test_a_clock_of_its_own_changes_no_verdict(

@@ -177,11 +177,15 @@ class Conformity:
         words = "" if droop is None else "none" if droop == math.inf else f"{100 * droop:.3g} %"
         if law in self.recordings:
             own = [("recording", law), ("read as", self.recordings[law])]
+            (case,), (shown,) = self.cases, self.parts  # a recording is of one part of one test
+            if others := [p.name for p in case.test.runs() if p.name != shown.part]:
+                own.append(("part", f"{shown.part}; not judged: {', '.join(others)}"))
+        else:
+            own.append(("inner stage", "the law's own" if self.inner is None else self.inner))
         if under.droop is None and law not in self.recordings:
             words = ", ".join(filter(None, [words, "that of the law itself"]))
         return [
             *own,
-            ("inner stage", "the law's own" if self.inner is None else self.inner),
             *([("network", self.network)] if self.network else []),
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
@@ -304,12 +308,17 @@ def explained(found: Conformity, law: str) -> str:
     for of in found.counts(law).values():
         counts.update(of)
     terms = " ".join(text for verdict, text in _MEANINGS.items() if counts[verdict])
+    about = (
+        "These verdicts are about what was recorded, by the bases and units of its map."
+        if law in found.recordings
+        else "These verdicts are about this model, not about a product."
+    )
     return (
         f"Clauses, each as often as it is judged. {found.saturated(law)} of them are judged while "
         "a limiter of the controller acts: the tables mark them with the limiter and the part of "
         f"the window in which it does. {terms} A test, and the law, has the first that it has of "
-        "fail, cannot judge, limited, consistent with itself, pass. These verdicts are about this "
-        "model, not about a product; check each limit against the source before you rely on it."
+        f"fail, cannot judge, limited, consistent with itself, pass. {about} Check each limit "
+        "against the source before you rely on it."
     )
 
 
