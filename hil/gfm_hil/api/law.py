@@ -308,16 +308,23 @@ class Law:
         return self.file.model_copy(update={"inner": named_inner(inner)})
 
     def to_c(
-        self, folder: str | Path, T_s: float = 1e-4, real: str = "float32", f_n: float = 50.0
+        self,
+        folder: str | Path,
+        T_s: float = 1e-4,
+        real: str = "float32",
+        f_n: float = 50.0,
+        *,
+        overwrite: bool = False,
     ) -> Path:
         """Write this law as C99 with golden vectors and a self-test, as ``gfmhil firmware export``
         does; returns the folder.
 
         Args:
-            folder: new, or an empty one.
+            folder: new or empty, unless ``overwrite``.
             T_s: sampling time, s.
             real: ``float32`` or ``float64``.
             f_n: rated frequency of the converter, Hz, for an inner stage.
+            overwrite: replace files of an export before.
 
         Raises:
             UserError: the folder is not empty or cannot be written.
@@ -326,7 +333,8 @@ class Law:
         from gfm_runtime.firmware import export
 
         folder = Path(folder)
-        check_empty(folder)
+        if not overwrite:
+            check_empty(folder)
         omega_b = 2 * math.pi * f_n
         files = export({self.name: self.built()}, T_s, real, "unrolled", omega_b)
         try:
@@ -341,13 +349,13 @@ class Law:
         """The text of its law file."""
         return toml_text(self.file.model_dump(mode="json", exclude_none=True))
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write a law file; returns its path.
 
         Raises:
-            UserError: it is there already, or cannot be written.
+            UserError: it is there already and not to ``overwrite``, or cannot be written.
         """
-        return write_new(Path(path), self.to_toml())
+        return write_new(Path(path), self.to_toml(), overwrite)
 
     def __repr__(self) -> str:
         cells = [

@@ -142,10 +142,10 @@ def write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def write_new(path: Path, text: str) -> Path:
-    """Write a text file; returns its path. Raises UserError: it is there already, or cannot be
-    written."""
-    if path.exists():
+def write_new(path: Path, text: str, overwrite: bool = False) -> Path:
+    """Write a text file; returns its path. Raises UserError: it is there already and not to
+    ``overwrite``, or cannot be written."""
+    if path.exists() and not overwrite:
         raise UserError(f"{path}: is there already; choose another name, or delete it")
     try:
         write_text(path, text)

@@ -145,3 +145,14 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(gfmhil.UserError, match="is not empty"):
         NAMED.to_c(tmp_path)
+
+
+def test_a_script_that_runs_again_may_replace_what_it_wrote(tmp_path):
+    softer = gfmhil.Law.from_toml(NAMED.to_toml().replace("90.0", "80.0"))
+    file, folder = NAMED.save(tmp_path / "law.toml"), NAMED.to_c(tmp_path / "c")
+    before = {path.name for path in folder.iterdir()}
+    with pytest.raises(gfmhil.UserError, match="is there already"):
+        softer.save(file)
+    assert softer.save(file, overwrite=True).read_text() == softer.to_toml() != NAMED.to_toml()
+    assert softer.to_c(folder, overwrite=True) == folder
+    assert {path.name for path in folder.iterdir()} == before
