@@ -5,7 +5,7 @@ lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 """
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,6 +18,7 @@ from gfm_hil.core.files import replacing
 from gfm_hil.results.figures import as_svg, in_a_page
 from gfm_hil.results.single_line import (
     Bar,
+    Line,
     assign_lanes,
     assign_rows,
     bars_of,
@@ -32,8 +33,9 @@ _INK, _GREY, _RED = "#222222", "#666666", "#b34500"
 #: x of the terminal, of a converter's line and of the first busbar; from one busbar to the next
 _TERMINAL, _LINE, _BARS, _COLUMN = 3.9, 4.9, 6.7, 3.4
 _ROW = 1.75
-#: of a narrow page: from one row to the next, from one vertical line to the next, its width
-_STACKED_ROW, _LANE, _NARROW = 1.0, 0.4, 5.1
+#: of a narrow page: from one row to the next, from one vertical line to the next, its width, and
+#: what is left of it for words, at least
+_STACKED_ROW, _LANE, _NARROW, _WORDS = 1.0, 0.4, 5.1, 2.9
 #: fragments of a report's address, before names: the chapter of one converter, and the curves of
 #: only these converters
 OF, ONLY = "of-", "only="
@@ -89,7 +91,7 @@ def fill_diagram(
     axes.set(xlim=(-0.2, width), ylim=(-_ROW * top + 0.55, 0.95), aspect="equal")
     axes.axis("off")
     passing = [(r, 0.0) for bar in bars.values() for r in bar.rows[: len(bar.converters)]]
-    passing += [(r, min(_x_of(bars[a]), _x_of(bars[b]))) for r, a, b, *_ in lines.values()]
+    passing += [(x.row, min(_x_of(bars[end]) for end in x.ends)) for x in lines.values()]
     spots: _Spots = {}
     for name, bar in bars.items():
         x = _x_of(bar)
@@ -104,23 +106,24 @@ def fill_diagram(
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
             _shunt(axes, x, -_ROW * row, symbol, text, closed)
         ys = [-_ROW * row for row in bar.rows]
-        ys += [-_ROW * row for row, start, end, *_ in lines.values() if name in (start, end)]
+        ys += [-_ROW * line.row for line in lines.values() if name in line.ends]
         ends = min(ys) - 0.35, max(ys) + 0.35
         axes.plot([x, x], ends, color=_INK, lw=3.5, solid_capstyle="butt", zorder=2.4)
         for row, left in passing:  # wires of others pass behind it
             if left < x and ends[0] < -_ROW * row < ends[1] and -_ROW * row not in ys:
                 axes.plot([x - 0.15, x + 0.15], [-_ROW * row] * 2, color="white", lw=4, zorder=2.2)
         axes.text(x, max(ys) + 0.45, name, ha="center", fontsize=8.5, color=_INK)
-    for name, (row, start, end, symbol, text, closed) in lines.items():
-        (left, right), y = sorted((_x_of(bars[start]), _x_of(bars[end]))), -_ROW * row
+    for name, line in lines.items():
+        start, end = (_x_of(bars[node]) for node in line.ends)
+        (left, right), y = sorted((start, end)), -_ROW * line.row
         _wire(axes, (left, y), (right, y))
-        _IN_LINE.get(symbol, _box)(axes, (left + right) / 2, y)
-        _breaker(axes, left + 0.5, y, closed)
-        axes.text((left + right) / 2, y - 0.5, f"{name}\n{text}", ha="center", va="top", **_SMALL)
-        at_ends = [c for c, node in nodes.items() if node in (start, end)]
-        if report is not None and at_ends:
-            _link_area(axes, (left + 0.1, right - 0.1), y, f"{report}#{ONLY}{','.join(at_ends)}")
-        spots[name] = (_x_of(bars[start]), y), (_x_of(bars[end]), y)
+        _IN_LINE.get(line.symbol, _box)(axes, (left + right) / 2, y)
+        _breaker(axes, left + 0.5, y, line.closed)
+        label = f"{name}\n{line.text}"
+        axes.text((left + right) / 2, y - 0.5, label, ha="center", va="top", **_SMALL)
+        if url := _url_of(line, nodes, report):
+            _link_area(axes, (left + 0.1, right - 0.1), y, url)
+        spots[name] = (start, y), (end, y)
     for name, bar in bars.items():
         spots[f"node {name}"] = ((_x_of(bar), -_ROW * bar.rows[0]),) * 2
     for event in scenario.events:
@@ -135,16 +138,16 @@ def fill_narrow(
     figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
 ) -> Axes:
     """As ``fill_diagram`` for a narrow page: nodes below each other, lines on their left, and a
-    converter's filter as text."""
+    converter's filter as text. A mesh with many lines beside each other needs a wider one."""
     plants, laws, nodes = converters_of(scenario)
     bars, lines = bars_of(scenario, nodes)
     top, lanes = assign_rows(bars, lines, stacked=True), assign_lanes(bars, lines)
-    height = _STACKED_ROW * (top + 0.3)
-    figure.set_size_inches(0.72 * _NARROW, 0.72 * height)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, _NARROW), ylim=(0.75 - height, 0.75), aspect="equal")
-    axes.axis("off")
     x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
+    width, height = max(_NARROW, x + _WORDS), _STACKED_ROW * (top + 0.3)
+    figure.set_size_inches(0.72 * width, 0.72 * height)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(0.0, width), ylim=(0.75 - height, 0.75), aspect="equal")
+    axes.axis("off")
     spots: _Spots = {}
     labels: dict[str, tuple[float, float]] = {}  # (x, y) of the text of a fault, by the same names
     for name, bar in bars.items():
@@ -154,31 +157,30 @@ def fill_narrow(
         spots[f"node {name}"] = ((x, ys[-1] - 0.3),) * 2
         labels[f"node {name}"] = x + 0.3, ys[-1] - 0.5
         for y, converter in zip(ys, bar.converters, strict=False):
-            _in_words(axes, x, y, converter, plants[converter], laws[converter])
+            _in_words(axes, x, y, width, converter, plants[converter], laws[converter])
             spots[converter], labels[converter] = ((x + 0.35, y), (x, y)), (x + 0.3, y - 0.5)
             if report is not None:
-                _link_area(axes, (x, _NARROW), y, f"{report}#{leads_to}{converter}", 0.45)
+                _link_area(axes, (x, width), y, f"{report}#{leads_to}{converter}", 0.45)
         for y, (symbol, text, closed) in zip(ys[len(bar.converters) :], bar.right, strict=False):
-            _shunt(axes, x, y, symbol, _wrap_lines(text, x + 1.5), closed, 0.75)
-    for name, (row, start, end, symbol, text, closed) in lines.items():
-        upper, lower = sorted((bars[start].rows, bars[end].rows))
-        y, at = -_STACKED_ROW * row, x - _LANE * (1 + lanes[name])
+            _shunt(axes, x, y, symbol, _wrap_lines(text, width - x - 1.5), closed, 0.75)
+    for name, line in lines.items():
+        upper, lower = sorted(bars[node].rows for node in line.ends)
+        y, at = -_STACKED_ROW * line.row, x - _LANE * (1 + lanes[name])
         ends = -_STACKED_ROW * upper[-1] - 0.22, -_STACKED_ROW * lower[0] + 0.22
         for end_y in ends:
             _wire(axes, (x, end_y), (at, end_y))
         inner = [ends[0] - 0.05, ends[1] + 0.05]  # passes before the ends of others
         axes.plot([at, at], inner, color="white", lw=4, solid_capstyle="butt", zorder=2.1)
         axes.plot([at, at], ends, color=_INK, lw=1.1, solid_capstyle="round", zorder=2.2)
-        _IN_LINE.get(symbol, _box)(axes, at, y, True)
-        _breaker(axes, at, y + 0.57, closed)
-        label = f"{name}\n{_wrap_lines(text, x + 0.25)}"
+        _IN_LINE.get(line.symbol, _box)(axes, at, y, True)
+        _breaker(axes, at, y + 0.57, line.closed)
+        label = f"{name}\n{_wrap_lines(line.text, width - x - 0.25)}"
         axes.text(x + 0.25, y, label, va="center", **_SMALL)
-        begin, finish = ends if bars[start].rows == upper else ends[::-1]
+        begin, finish = ends if bars[line.ends[0]].rows == upper else ends[::-1]
         spots[name] = (at, begin), (at, finish)
         labels[name] = x + 0.3, y - 0.45
-        at_ends = [c for c, node in nodes.items() if node in (start, end)]
-        if report is not None and at_ends:
-            _link_area(axes, (at - 0.3, _NARROW), y, f"{report}#{ONLY}{','.join(at_ends)}", 0.45)
+        if url := _url_of(line, nodes, report):
+            _link_area(axes, (at - 0.3, width), y, url, 0.45)
     for event in scenario.events:
         if isinstance(event, Fault):
             *_, text = _fault(axes, scenario, event, spots)
@@ -190,14 +192,16 @@ def fill_narrow(
 _Spots = dict[str, tuple[tuple[float, float], tuple[float, float]]]
 
 
-def _wrap_lines(text: str, x: float) -> str:
-    """The text in lines that fit between x and the right edge of a narrow page."""
-    letters = int((_NARROW - x) * 0.72 * 72 / 4.3)  # mean width of a small letter, points
+def _wrap_lines(text: str, room: float) -> str:
+    """The text in lines that fit into the room that is left of a narrow page."""
+    letters = int(room * 0.72 * 72 / 4.3)  # mean width of a small letter, points
     unbroken = [line.replace(" ", "\xa0").replace(",\xa0", ", ") for line in text.splitlines()]
     return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in unbroken)
 
 
-def _in_words(axes: Axes, x: float, y: float, name: str, plant: Plant, law: str) -> None:
+def _in_words(
+    axes: Axes, x: float, y: float, width: float, name: str, plant: Plant, law: str
+) -> None:
     """A converter on the right of its node, on a narrow page."""
     parameters = load_converter(plant.converter)
     pu = parameters.pu(plant.real_factors())
@@ -212,8 +216,14 @@ def _in_words(axes: Axes, x: float, y: float, name: str, plant: Plant, law: str)
     if not name:
         elements.append(f"SCR {1 / abs(complex(pu['R_g'], pu['L_g'])):.3g}")
     text = f"{name}: {law}" if name else law
-    text = "\n".join(_wrap_lines(one, x + 1.2) for one in (text, ", ".join(elements)))
+    text = "\n".join(_wrap_lines(one, width - x - 1.2) for one in (text, ", ".join(elements)))
     axes.text(x + 1.2, y, text, va="center", **_SMALL | {"color": _INK})
+
+
+def _url_of(line: Line, nodes: Mapping[str, str], report: str | None) -> str | None:
+    """The curves of the converters at the ends of a line, if there are any in a report."""
+    at_ends = [converter for converter, node in nodes.items() if node in line.ends]
+    return f"{report}#{ONLY}{','.join(at_ends)}" if report is not None and at_ends else None
 
 
 def _link_area(axes: Axes, x: tuple[float, float], y: float, url: str, half: float = 0.8) -> None:

@@ -20,6 +20,20 @@ class Bar:
     rows: list[int] = field(default_factory=list)
 
 
+@dataclass
+class Line:
+    """What lies between two nodes, ``ends``, in a row of its own."""
+
+    ends: tuple[str, str]
+    symbol: str
+    text: str
+    closed: bool
+    row: int = 0
+
+
+Lines = dict[str, Line]  #: by name
+
+
 def converters_of(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
     """The plant, what results call the law, and the node of each converter, by its name."""
     if scenario.network is None:
@@ -29,9 +43,6 @@ def converters_of(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str],
     titles = law_titles(s.law for s in each.values())
     laws = {name: titles[s.law] for name, s in each.items()}
     return {name: s.plant for name, s in each.items()}, laws, nodes
-
-
-Lines = dict[str, tuple[int, str, str, str, str, bool]]  #: row, start, end, symbol, text, closed
 
 
 def bars_of(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, Bar], Lines]:
@@ -51,9 +62,9 @@ def bars_of(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, Bar
         each = [(name, one, getattr(one, "closed", True)) for _, name, one in network.components()]
         for name, one, closed in each:
             if hasattr(one, "start") and hasattr(one, "end"):
-                lines[name] = 0, one.start, one.end, one.symbol, one.label(), closed
-        for _, start, end, *_ in lines.values():
-            for node in (start, end):
+                lines[name] = Line((one.start, one.end), one.symbol, one.label(), closed)
+        for line in lines.values():
+            for node in line.ends:
                 bars.setdefault(node, Bar())
         for name, one, closed in sorted(each, key=lambda item: item[1].symbol == "capacitor"):
             if hasattr(one, "node"):  # banks below the others
@@ -74,13 +85,13 @@ def _assign_columns(bars: Mapping[str, Bar], lines: Lines, last: str | None) -> 
     first = last or next(iter(bars))
     away, front = {first: 0}, [first]
     for here in front:
-        for _, start, end, *_ in lines.values():
+        for start, end in (line.ends for line in lines.values()):
             other = {start: end, end: start}.get(here)
             if other is not None and other not in front:
                 front.append(other)
     for k, name in enumerate(front[1:], 1):
-        ends = [{start: end, end: start}.get(name) for _, start, end, *_ in lines.values()]
-        away[name] = 1 + max(away[other] for other in front[:k] if other in ends)
+        beside = {node for line in lines.values() if name in line.ends for node in line.ends}
+        away[name] = 1 + max(away[other] for other in front[:k] if other in beside)
     for name, bar in bars.items():
         bar.column = max(away.values()) - away.get(name, 0)
 
@@ -93,9 +104,9 @@ def assign_rows(bars: Mapping[str, Bar], lines: Lines, stacked: bool = False) ->
     """
     row, done = 0, set[str]()
     for name, bar in sorted(bars.items(), key=lambda item: -item[1].column):
-        for line, (_, start, end, symbol, text, closed) in lines.items():
-            if {start, end} & done and name in (start, end):
-                lines[line] = row, start, end, symbol, text, closed
+        for line in lines.values():
+            if done.intersection(line.ends) and name in line.ends:
+                line.row = row
                 row += 1
         own = len(bar.converters), len(bar.right)
         count = max(1, sum(own) if stacked else max(own))
@@ -110,7 +121,7 @@ def collide(bars: Mapping[str, Bar], lines: Lines) -> bool:
     would look like one."""
     taken: dict[int, list[tuple[int, int]]] = {}
     for name, bar in bars.items():
-        rows = [*bar.rows, *(row for row, *ends in lines.values() if name in ends[:2])]
+        rows = [*bar.rows, *(line.row for line in lines.values() if name in line.ends)]
         taken.setdefault(bar.column, []).append((min(rows), max(rows)))
     return any(
         later[0] <= earlier[1]
@@ -122,10 +133,7 @@ def collide(bars: Mapping[str, Bar], lines: Lines) -> bool:
 def assign_lanes(bars: Mapping[str, Bar], lines: Lines) -> dict[str, int]:
     """How far left of nodes that are stacked each line runs, 0 next to them, so that no two meet
     but at a node."""
-    ends = {
-        name: sorted((bars[start].rows, bars[end].rows))
-        for name, (_, start, end, *_) in lines.items()
-    }
+    ends = {name: sorted(bars[node].rows for node in line.ends) for name, line in lines.items()}
     taken: list[list[tuple[int, int]]] = []  # of each lane, from row to row
     lanes = {}
     for name in sorted(lines, key=lambda name: ends[name][1][0] - ends[name][0][-1]):

@@ -307,8 +307,8 @@ class Scenario(StrictSchema):
 
     @property
     def answer_timeout_s(self) -> float:
-        """How long an external controller may take for u, s: half of the peer's time, so that its
-        side can still report what has failed."""
+        """How long an external controller may take for u, s, which is half of the peer's time, so
+        that its side can still report what has failed."""
         return self.peer_timeout_s / 2
 
     @property
@@ -378,7 +378,7 @@ class Scenario(StrictSchema):
 
     @cached_property
     def carries(self) -> int:
-        """The signals of frames and recording beside y and u of Phi: ``PLAIN``, none; ``INNER``,
+        """The signals of frames and recording beside y and u of Phi. ``PLAIN``, none; ``INNER``,
         those of an inner stage, if a law has one; ``COUNTS``, those and the counts of A/D and
         modulator, if a law measures and modulates."""
         each = [*self.each.values()] or [self]
@@ -391,7 +391,7 @@ class Scenario(StrictSchema):
 
     @property
     def optional_signals(self) -> tuple[str, ...]:
-        """The signals that options of a plant add to the recording: power and voltage at the
+        """The signals that options of a plant add to the recording, power and voltage at the
         connection point behind a transformer, and the charge of a battery."""
         plants = [one.plant for one in self.each.values()] or [self.plant]
         connection = any(one.lcl is not None for one in plants)

@@ -35,7 +35,7 @@ class Flows:
         _, laws, nodes = converters_of(self._scenario)
         bars, lines = bars_of(self._scenario, nodes)
         rows = assign_rows(bars, lines)
-        self._closed = {name: True for name in nodes} | {n: line[-1] for n, line in lines.items()}
+        self._closed = dict.fromkeys(nodes, True) | {n: one.closed for n, one in lines.items()}
         network = self._scenario.network
         feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
         nodes_shown: list[dict[str, Any]] = []
@@ -52,8 +52,9 @@ class Flows:
         self.diagram = {
             "rows": rows, "bars": nodes_shown, "laws": laws,
             "lines": [
-                {"name": name, "row": row, "start": start, "end": end, "symbol": symbol}
-                for name, (row, start, end, symbol, *_) in lines.items()
+                {"name": name, "row": one.row, "start": one.ends[0], "end": one.ends[1],
+                 "symbol": one.symbol}
+                for name, one in lines.items()
             ],
             "mesh": collide(bars, lines), "stacked": _stacked(bars, lines),
         }  # fmt: skip
@@ -91,7 +92,7 @@ def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
     lanes = assign_lanes(bars, lines)
     return {
         "rows": rows, "bars": {name: bar.rows for name, bar in bars.items()},
-        "lines": {name: (line[0], lanes[name]) for name, line in lines.items()},
+        "lines": {name: (one.row, lanes[name]) for name, one in lines.items()},
     }  # fmt: skip
 
 
