@@ -233,7 +233,7 @@ def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, a
         async def clock(self) -> None:
             look("clock")
 
-    monkeypatch.setattr("gfm_hil.ports.port.present", lambda folder: look("look"))
+    monkeypatch.setattr("gfm_hil.ports.port.running_roles", lambda folder: look("look"))
     with Interrupt() as interrupt, BesideRun(tmp_path, "modbus", False, interrupt) as run:
         run.serve_until(supervised("the clock", lambda: tick([Stub()], time.monotonic())))
     assert caplog.text.count("Too many open files") == 5

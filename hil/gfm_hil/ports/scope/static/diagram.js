@@ -3,7 +3,8 @@
 import { value } from "./text.js";
 
 const BOX = 204, FIRST = BOX + 66, COLUMN = 150, TOP = 22; // pixels
-const NARROW = 356, LANE = 22; // a narrow page, whose nodes are below each other
+// A narrow page, whose nodes are below each other: its width, a line's, and what words need, at least.
+const NARROW = 356, LANE = 22, WORDS = 230;
 const LEAST = 5e-4; // p.u.; a smaller power has no arrow
 const SPACE = "http://www.w3.org/2000/svg";
 
@@ -30,7 +31,8 @@ export class Diagram {
     const left = 10 + LANE * Math.max(0, ...lanes);
     const at = Object.fromEntries(network.bars.map((bar) =>
       [bar.name, narrow ? left : FIRST + COLUMN * bar.column]));
-    const wide = narrow ? NARROW : Math.max(...Object.values(at)) + this.reach + 150;
+    this.right = Math.max(NARROW, left + WORDS);
+    const wide = narrow ? this.right : Math.max(...Object.values(at)) + this.reach + 150;
     const high = TOP + this.row * (narrow ? stacked.rows : network.rows);
     this.element = svg("svg", { viewBox: `0 0 ${wide} ${high}`,
       role: "img", "aria-label": "Single-line diagram" });
@@ -87,7 +89,7 @@ export class Diagram {
   }
 
   converter(name, law, x, y, shown) {
-    const at = this.narrow ? x + 36 : 1, width = this.narrow ? NARROW - 1 - at : BOX;
+    const at = this.narrow ? x + 36 : 1, width = this.narrow ? this.right - 1 - at : BOX;
     const numbers = text(at + 9, y + 2, "–", "flow"), more = text(at + 9, y + 17, "", "flow");
     const box = svg("rect", { x: at, y: y - 26, width, height: 50, rx: 5 });
     const link = svg("a", { href: `?of=${encodeURIComponent(name)}`, class: "converter",
