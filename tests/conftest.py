@@ -13,6 +13,7 @@ The mark ``alone`` is for tests of the last two that fail beside another one on 
 """
 
 import os
+import signal
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -30,6 +31,13 @@ os.environ.pop("COLUMNS", None)
 
 # Figures are drawn without a display.
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# In the background, as with nohup, a shell has programs ignore signals that tests send.
+for number, handler in (
+    (signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL),
+):  # fmt: skip
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # The first example may compile a kernel, which takes longer than hypothesis' deadline.
 settings.register_profile("gfmhil", deadline=None)
