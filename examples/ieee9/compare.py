@@ -6,18 +6,19 @@ The reference points in points.csv come from ANDES (andes_points.py says how).
 """
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.engine.setup import make_benches
-from gfm_hil.scenario import load_scenario
-from gfm_plant import Network, plant_command, plant_step
-from gfm_plant.components import SynchronousMachine
+from gfm_plant import Network
 from gfm_plant.grid import fault, line_breaker
 
 HERE = Path(__file__).parent
+sys.path.append(str(HERE))
+from trajectory import start, trajectory  # noqa: E402
+
 EVENT_S, POINT_S, END_S = 1.0, 0.05, 6.0
 LOST = {"load": "load6", "machine": "M3"}
 """By event, the part whose breaker opens."""
@@ -37,31 +38,19 @@ def points(event: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     )
 
 
-def start() -> Network:
-    """The plant at its operating point, the converter's breaker open."""
-    bench = make_benches(load_scenario(HERE / "network.toml", in_process=True))[0]
-    plant_command(bench.plant.records, 0, np.array([*bench.u[:3], 0.0]))
-    line_breaker(bench.plant, "probe", closed=False, clearing="instant")
-    return bench.plant
+def happen(plant: Network, event: str) -> None:
+    """What an event does to the plant."""
+    if event == "fault":  # p.u. of the converter's 10 MVA
+        fault(plant, None, FAULT_R / 10.0, FAULT_S, node=FAULT_BUS)
+    else:
+        line_breaker(plant, LOST[event], closed=False)
 
 
 def run(event: str) -> NDArray[np.float64]:
     """``COLUMNS`` at the times of ``points``, (K, 5)."""
-    plant, rows = start(), []
-    T_s, machines = float(plant.net[0]["T_s"]), plant.of(SynchronousMachine)
-    each = round(POINT_S / T_s)
-    for tick in range(1, round(END_S / T_s) + 1):
-        if tick == round(EVENT_S / T_s) + 1:
-            if event == "fault":  # p.u. of the converter's 10 MVA
-                fault(plant, None, FAULT_R / 10.0, FAULT_S, node=FAULT_BUS)
-            else:
-                line_breaker(plant, LOST[event], closed=False)
-        plant_step(plant.records)
-        if tick % each == 0:
-            turns = plant.now[0]["unit"][machines["source"]]
-            angles = np.angle(turns[1:] / turns[0])
-            rows.append([*machines["omega"], *angles])
-    return np.array(rows)
+    plant = start(HERE / "network.toml", "probe")
+    speeds, turns = trajectory(plant, lambda of: happen(of, event), EVENT_S, POINT_S, END_S)
+    return np.hstack([speeds, np.angle(turns[:, 1:] / turns[:, :1])])
 
 
 def distances(event: str, theirs_of: str = "") -> dict[str, float]:
