@@ -2,9 +2,10 @@
 
 Its voltage is a phasor that turns at the speed of its command, so that the series of the network
 takes it as one more source. Nothing in the circuit sees its DC link before the next command is
-limited by v_dc. So the link goes on behind the circuit, from edge to edge of the switched bridges
-as that of `gfm_plant.period` does from piece to piece: the power that the bridge draws is a
-parabola through its values at the beginning, the middle and the end.
+limited by v_dc. So the link goes on behind the circuit: behind a `port` once a unit of the carrier,
+else here from edge to edge of the switched bridges, as that of `gfm_plant.period` does from piece
+to piece: the power that the bridge draws is a parabola through its values at the beginning, the
+middle and the end.
 """
 
 from typing import Any

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gfm_plant.beside import advance_link, begin_average
 from gfm_plant.dc_link import discharge
-from gfm_plant.layout import field
+from gfm_plant.layout import LARGEST, field
 from gfm_plant.model import DELTA, terminal
 from gfm_plant.period import limit_voltage, take_command
 from gfm_plant.port import begin_port, end_port
@@ -26,7 +26,6 @@ from gfm_plant.powers import begin_powers
 from gfm_plant.records import COMPARE, N_GATES, PlantRecords
 from gfm_plant.series import (
     DC,
-    LARGEST,
     MID,
     REG,
     SOURCE,
@@ -45,8 +44,10 @@ from gfm_plant.series import (
     make_powers,
     normal,
 )
-from gfm_plant.solution import circuit, grid_source, integrals
+from gfm_plant.solution import circuit, grid_source
 from gfm_plant.sparse import turned
+from gfm_plant.strides import ask_for_strides, is_whole
+from gfm_plant.walk import low_pass, walk, walks
 from gfm_runtime.compiled import compiled, inlined
 
 _AXES = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.75))])
@@ -183,7 +184,12 @@ def advance_bridges(plant: PlantRecords, begin: float, end: float) -> None:
                     else:
                         _load(plant, k, c, unit)
             a, b = max(begin, first) - first, min(end, last) - first
-            _advance_unit(plant, c, a, b, a == 0.0 and b == last - first)
+            whole, t = a == 0.0 and b == last - first, a
+            while t < b:
+                if walks(plant, c):
+                    t = walk(plant, c, t, b)
+                if t < b:
+                    t = _advance_unit(plant, c, t, b, whole)
             for k in range(n.n_converters):
                 s = plant.st[k]
                 half = turned(0.5 * n.omega_b * s.u_now[1] * (b - a))
@@ -259,10 +265,10 @@ def _watch_source(r: Any, s: Any) -> None:
     s.winds = 0.0 if s.limit * (1.0 - s.ends[0, DC]) > 0.0 else 1.0
 
 
-@inlined
-def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float, whole: bool) -> None:
+@compiled
+def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float, whole: bool) -> float:
     """Go on from edge to edge, between two instants of a unit, s after its beginning; ``whole``:
-    it is all of it."""
+    it is all of it. Returns how far: to its end, or until `walk` may go on."""
     n, t, events = plant.net[0], begin, 0
     behind = whole and begin_port(plant)
     longest = LARGEST / field(n, "fastest")[c]
@@ -309,8 +315,11 @@ def _advance_unit(plant: PlantRecords, c: int, begin: float, end: float, whole: 
         if what != _NOTHING:
             events += 1
             _change(plant, which, c, what)
+        elif alone and walks(plant, c) and is_whole(plant, t):
+            break
     if behind:
         end_port(plant)
+    return t
 
 
 @inlined
@@ -515,9 +524,12 @@ def _prepare(plant: PlantRecords, k: int, c: int) -> None:
     plant.st[k].due = 0
     if not field(plant.net[0], "alone")[c]:
         _set_rates(plant, k, c)
-    elif choose_powers(plant, c, _key(plant.net[0], plant.par[0], plant.st[0], c)):
-        _set_rates(plant, 0, c)
-        make_powers(plant, c)
+    else:
+        if choose_powers(plant, c, _key(plant.net[0], plant.par[0], plant.st[0], c)):
+            _set_rates(plant, 0, c)
+            make_powers(plant, c)
+        if is_plain(plant, 0):
+            ask_for_strides(plant, c)
 
 
 @inlined
@@ -761,7 +773,7 @@ def _sense(plant: PlantRecords, k: int, c: int, h: float, terms: int, tau: float
         look(plant, k, c, h, terms, tau)
     if not r.filtered:
         return
-    b_0, b_1, b_2, b_3 = _weights(step * r.omega_s)
+    b_0, b_1, b_2, b_3 = low_pass(step * r.omega_s)
     if r.levels > 0:
         v_1 = 0.5 * (v_0 + v_2) + 0.125 * step * (_dc_slope(r, s, 0) - _dc_slope(r, s, 1))
     s.sensed[0] = b_0 * s.sensed[0] + b_1 * v_0 + b_2 * v_1 + b_3 * v_2
@@ -805,21 +817,3 @@ def _drawn(r: Any, s: Any, end: int) -> float:
     """Return the power that the bridge draws, p.u.; the midpoint takes no part in it on average."""
     i_a, i_b = s.ends[end, 0], s.ends[end, 1]
     return s.ends[end, DC] * r.current * (s.by_dc.real * i_a + s.by_dc.imag * i_b)
-
-
-@inlined
-def _weights(x: float) -> tuple[float, float, float, float]:
-    """Return the weights of a first-order low-pass after x time constants: of its state, and of a
-    parabola through its input at the beginning, the middle and the end."""
-    if x < 0.1:
-        y = x * x  # by powers of two, so that few products wait for each other
-        f_3 = (1 / 6 - x * (1 / 24)) + y * ((1 / 120 - x * (1 / 720)) + y * (1 / 5040))
-        f_2 = 0.5 - x * f_3
-        f_1 = (1.0 - 0.5 * x) + y * f_3
-        whole = (1.0 - x) + y * f_2
-    else:
-        whole, f_1, f_2, f_3 = integrals(x)
-    return (
-        whole, x * (f_1 - 3.0 * f_2 + 4.0 * f_3), x * (4.0 * f_2 - 8.0 * f_3),
-        x * (4.0 * f_3 - f_2),
-    )  # fmt: skip

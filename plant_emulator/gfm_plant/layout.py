@@ -35,6 +35,15 @@ TERMS = 24
 POWERS, ORDER, SLOTS = 5, 16, 256
 """How many powers of a matrix `powers` keeps, of which order, and of how many matrices."""
 
+LARGEST = 0.6
+"""Of the norm of A times the length of an interval that a series goes through."""
+
+COARSE, FINE = 160, 128
+"""How many matrices of `strides` there are for steps of FINE counts, and for those of one."""
+
+EDGES = 16
+"""How many ends of intervals `walk` goes along at a time."""
+
 SPEEDS, MOMENTS, DRIVES, LANES = 6, 5, 24, 16
 """Behind a `port`: powers of time that a source has, moments of a current, powers of time in a
 unit, and those in an interval, at most."""
@@ -179,6 +188,11 @@ _NOW: _Arrays = {
     "slot_by_dc": (complex, ("n_slots",)),
     "power": (float, ("n_slots", POWERS, ORDER, ORDER)),
     "vector": (float, (POWERS + 1, ORDER)),
+    # of `strides`, without and with a voltage, matrices by columns; what they were made for, the
+    # equations and the speed of the grid, and what they were last wanted for, and how often
+    "strides": (float, ("n_strides", COARSE + FINE, 9, 8)),
+    "stride_for": (float, ("n_strides", 5)),
+    "walked": (float, (27, EDGES + 8)),  # see `walk`
     "source": (complex, ("n_s",)),
     "source_term": (complex, ("n_s",)),
     "source_speed": (float, ("n_s",)),
@@ -368,6 +382,7 @@ def make_net_and_now(
         "n_port_rows": DRIVES + -(-(states + MOMENTS * converters) // 12) * 12 if ports else 0,
         "n_port_columns": states + SPEEDS * sources if ports else 0,
         "n_slots": SLOTS if units and converters == 1 else 0,
+        "n_strides": 2 if units and converters == 1 else 0,
     }  # fmt: skip
     net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
     net["connections"], net["sparse"] = connections, entries > 0

@@ -232,7 +232,7 @@ def _bytes(record: Record) -> NDArray[np.uint8]:
 def _connect(plant: Network, wiring: Wiring) -> None:
     net, N, order = plant.net[0], len(wiring.units), wiring.order
     net["n_states"] = len(order)
-    plant.now["slot_key"] = 0
+    plant.now["slot_key"] = plant.now["stride_for"] = 0
     net["to_grid"] = 0.0
     for name, factor in wiring.to_grid().items():
         net["to_grid"][order.index(name)] = factor

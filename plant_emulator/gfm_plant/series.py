@@ -33,9 +33,6 @@ DC, REG, SOURCE, MID = 6, 7, 8, 9
 """Places in ``ends`` of v_dc, the integral of its source's control, its source's current, and the
 midpoint, behind i_f, v and i_o. Without a lag the source's current is what its control asks for."""
 
-LARGEST = 0.6
-"""Of the norm of A times the length of an interval; a longer one is cut."""
-
 _PER = np.array([1.0 / max(j, 1) for j in range(TERMS + 1)])  # 1 / j
 _TWO_LEVELS = ENOUGH[2 * POWERS - 1]
 
@@ -276,11 +273,18 @@ def find_tangent(plant: PlantRecords, k: int, c: int) -> tuple[float, float, flo
     """Return the current of L_f at the beginning of an interval, p.u. of the network, what it
     changes by in a second, and a bound of its second derivative there, of the only switched bridge;
     in a network of a plain one."""
-    n, s = plant.net[0], plant.st[k]
-    if field(n, "alone")[c]:
+    if field(plant.net[0], "alone")[c]:
         x = field(plant.now[0], "vector")
         return x[0, 0], x[0, 1], x[1, 0], x[1, 1], abs(x[2, 0]) + abs(x[2, 1])
-    q, by_v, by_i = field(n, "own_rates")[c, k, 0], s.di_v[0], s.di_i[0]
+    return plain_tangent(plant, k, c)
+
+
+@inlined
+def plain_tangent(plant: PlantRecords, k: int, c: int) -> tuple[float, float, float, float, float]:
+    """``find_tangent`` of a plain bridge, by its voltage and ``ends``."""
+    n, r, s = plant.net[0], plant.par[k], plant.st[k]
+    q, by_v = field(n, "own_rates")[c, k, 0], r.omega_b / (r.L_f * r.current)
+    by_i = by_v * r.R_f * r.current
     i_a, i_b, v_a, v_b, o_a, o_b, v_dc = (
         s.ends[0, 0], s.ends[0, 1], s.ends[0, 2], s.ends[0, 3], s.ends[0, 4], s.ends[0, 5],
         s.ends[0, DC],
