@@ -7,6 +7,8 @@ published case instead, with converters at the buses of ``--converters``, and ``
 paper's rig with an averaged bridge, with switched ones, and from ADC counts to compare counts, and
 four converters on feeders of which none, one or all are switched. ``--record`` has each number of
 converters twice, the second time with all that ``network.record`` can name.
+``--cores 1,2`` has two such buses instead, which a line of travelling waves connects: as one
+circuit, and its parts on one processor core and on two, in time of the clock, with the ratios.
 Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
@@ -17,8 +19,10 @@ bridge: no DC link, no sensor, no controller, no recording.
 from __future__ import annotations
 
 import argparse
+import itertools
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +62,21 @@ def star(
     )  # fmt: skip
 
 
+def halves(n: int, cores: int | None) -> Scenario:
+    """n converters on the feeders of two buses, and a long line between these."""
+    content = star(n).model_dump(mode="json", exclude_none=True)
+    network = content["network"]
+    for k in range(n // 2, n):
+        network["lines"][f"to_c{k}"]["end"] = "other"
+    load = network["loads"]["load"] | {"P": 0.225 * n, "Q": 0.05 * n}
+    network["loads"] = {"load": load, "load2": load | {"node": "other"}}
+    network["capacitors"] = {f"at_{bus}": {"node": bus, "Q": 0.02 * n} for bus in ("bus", "other")}
+    size = 100 * np.pi * 1.3e-4  # 0.13 ms
+    long = {"start": "bus", "end": "other", "L": 2 * size / n, "R": 0.02 / n, "B": size * n / 2}
+    network["bergeron_lines"] = {"long": long}
+    return load_scenario(content | {"cores": cores})
+
+
 def rigs() -> dict[str, Scenario]:
     """The rig with MIMO-GFM, nominal resistances and several bridges, and four converters."""
     late = {"kind": "two-level", "dead_time_s": 2e-6}
@@ -94,7 +113,10 @@ def published(case: str, converters: str, share: float, folder: str) -> Scenario
 class Case:
     """A network ready to run the same ticks again and again."""
 
-    def __init__(self, name: str, scenario: Scenario) -> None:
+    def __init__(
+        self, name: str, scenario: Scenario, clock: Callable[[], float] = time.thread_time
+    ) -> None:
+        self.clock = clock
         self.name, n = name, max(1, len(scenario.converters))
         ticks = max(4000, min(CHUNK, TICKS // n))
         scenario = scenario.model_copy(update={"duration": ticks * scenario.T_s})
@@ -103,11 +125,14 @@ class Case:
         self.set_up = time.process_time() - began
         self.ticks, self.columns = ticks, len(benches[0].flows)
         self.kept = [*zip(*make_room(benches), strict=True)]
-        self.plant = benches[0].plant
-        self.start, self.old = self.plant.copy(), [array.copy() for array in self.arrays()]
-        wiring = self.plant.wiring
-        self.sizes = n, len(wiring.fed), len(wiring.branches) + n, len(wiring.order)
-        net = self.plant.net[0]
+        self.plants = [*{id(bench.plant): bench.plant for bench in benches}.values()]
+        self.starts = [plant.copy() for plant in self.plants]
+        self.old = [array.copy() for array in self.arrays()]
+        each = [plant.wiring for plant in self.plants]
+        fed = {name for wiring in each for name, _ in wiring.fed}
+        lines = sum(len(wiring.branches) for wiring in each) + n
+        self.sizes = n, len(fed), lines, sum(len(wiring.order) for wiring in each)
+        net = self.plants[0].net[0]
         self.way = "series" if net["sparse"] or net["n_units"] else "modes"
         self.ns: list[float] = []
         self.ends: list[Any] = []
@@ -121,13 +146,14 @@ class Case:
 
     def round(self) -> None:
         """Run from the start as ``gfmhil.run`` does in memory; keep what a tick took, in ns."""
-        self.plant.restore(self.start)
+        for plant, start in zip(self.plants, self.starts, strict=True):
+            plant.restore(start)
         for array, old in zip(self.arrays(), self.old, strict=True):
             array[:] = old
         timelines = [TimelineInMemory(bench) for bench in self.benches]
-        began = time.thread_time()
+        began = self.clock()
         done = run_inproc(self.benches, *self.kept, timelines, lambda ticks: True)
-        self.ns.append((time.thread_time() - began) / self.ticks * 1e9)
+        self.ns.append((self.clock() - began) / self.ticks * 1e9)
         if done != self.ticks:
             raise SystemExit(f"{self.name}: the run ended at tick {done}")
         self.ends = [*self.ends[:1], [bench.u.tolist() for bench in self.benches]]
@@ -190,14 +216,23 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of them, beside machines")
     parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
     parser.add_argument("--record", action="store_true", help="with and without network.record")
+    parser.add_argument("--cores", help="1,2: two buses and a long line, on so many of them")
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
+    ways: dict[str, int | None] = {"one circuit": None}
     if asked.case:
         with tempfile.TemporaryDirectory() as folder:
             scenario = published(asked.case, asked.converters, asked.share, folder)
             cases = [Case(asked.case, scenario)]
     elif asked.bridges:
         cases = [Case(name, scenario) for name, scenario in rigs().items()]
+    elif asked.cores:
+        ways |= {f"cores: {c}": int(c) for c in asked.cores.split(",")}
+        cases = [
+            Case(name, halves(int(n), cores), time.perf_counter)
+            for n in asked.sizes.split(",")
+            for name, cores in ways.items()
+        ]
     elif asked.record:
         cases = [
             Case("all recorded" if record else "feeders", star(int(n), record=record))
@@ -224,6 +259,10 @@ def main() -> None:
             f"| {case.name} | {sizes} | {case.way} | {case.set_up:.2g} | {least:.3g} |"
             f" {middle:.3g} | {100 / least:.3g} |{theirs}"
         )
+    for k in range(0, len(cases) if asked.cores else 0, len(ways)):
+        for a, b in itertools.combinations(cases[k : k + len(ways)], 2):
+            least, middle = min(a.ns) / min(b.ns), np.median(np.divide(a.ns, b.ns))
+            print(f"{a.sizes[0]} converters, {a.name} / {b.name}: {least:.3g}, median {middle:.3g}")
     if asked.record:
         for plain, case in zip(cases[::2], cases[1::2], strict=True):
             ratio = np.median(np.divide(case.ns, plain.ns))

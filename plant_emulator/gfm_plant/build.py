@@ -186,6 +186,31 @@ def _make(
     return network
 
 
+def make_part(whole: Network, units: Sequence[int], wiring: Wiring) -> Network:
+    """Return a plant of some converters of another one, in memory of its own and not connected yet.
+
+    Args:
+        whole: without switched bridges.
+        units: which of its converters.
+        wiring: what of its wiring belongs to them.
+    """
+    par, st, net = whole.par[units], whole.st[units], whole.net[0]
+    entries = entries_of(wiring) if len(wiring.order) > MOST_BY_MODES else 0
+    fed = [("network", name, one) for name, one in wiring.fed]
+    part = _network(
+        par, st, wiring, float(net["T_s"]), fed, bool(net["connections"]), 0, entries, False
+    )
+    if wiring.grid is not None and len(finite := whole.of(FiniteGrid)):
+        k = DYNAMIC.index(FiniteGrid)
+        part.parts = (*part.parts[:k], finite.copy(), *part.parts[k + 1 :])
+        part.net["n_dynamic"] += 1
+    for name in ("joins", "updates", "switched", "batteries", "conversions"):
+        part.net[name] = net[name]
+    part.now["unit"] = part.now["sequence"][:, 0] = 1.0
+    part.at_least = whole.fastest
+    return part
+
+
 def _together(
     each: Sequence[tuple[str, str, Component]], grid_node: str | None
 ) -> tuple[Capacitor, ...]:

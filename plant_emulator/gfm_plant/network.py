@@ -29,6 +29,8 @@ from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
+THE_GRID, FIRST_LINE = "\0grid", "\0line"
+"""In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
@@ -49,6 +51,11 @@ class Network:
     now: Record
     parts: tuple[Record, ...]
     wiring: Wiring  # how its parts are connected now
+    # of a part of another plant, see `parted`: names in the others, and the rate, rad/s, that
+    # Simpson's rule follows at least; and that which it follows
+    elsewhere: frozenset[str] = frozenset()
+    at_least: float = 0.0
+    fastest: float = 0.0
 
     @cached_property
     def records(self) -> PlantRecords:
@@ -81,13 +88,16 @@ class Network:
         """Return the same plant at the same instant, in memory of its own."""
         copies = (_bytes(record).copy().view(record.dtype) for record in self.memory)
         par, st, net, now, *parts = copies
-        return Network(par, st, net, now, tuple(parts), self.wiring)
+        return Network(
+            par, st, net, now, tuple(parts), self.wiring, self.elsewhere, self.at_least,
+            self.fastest,
+        )  # fmt: skip
 
     def restore(self, kept: Network) -> None:
         """Take the wiring, the parameters and the instant of a copy."""
         for record, old in zip(self.memory, kept.memory, strict=True):
             _bytes(record)[:] = _bytes(old)
-        self.wiring = kept.wiring
+        self.wiring, self.fastest = kept.wiring, kept.fastest
 
     def without_current(self, k: int, ticks: int) -> NDArray[np.float64]:
         """What the A/D at the phases of converter k has read before the first tick, when nothing
@@ -114,7 +124,6 @@ class Network:
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u[:, :COMPARE], ((0, 0), (0, COMPARE - u[:, :COMPARE].shape[1])))
-        told = np.pad(u, ((0, 0), (0, N_COMMANDS - COMPARE)), constant_values=-1.0)
         now, N, wiring = self.now[0], len(self.par), self.wiring
         turn = np.exp(1j * x[:, DELTA])
         now["unit"][:N] = turn
@@ -149,6 +158,12 @@ class Network:
             current = float(self.par[k]["current"])
             w[N_OWN * k : N_OWN * (k + 1)] = i_f / current, v, i_o / current
         now["w"][: len(order)] = w
+        self.begin(x, u)
+
+    def begin(self, x: NDArray[np.float64], u: NDArray[np.float64]) -> None:
+        """Fill the delay lines, sensors and DC sources of a plant whose circuit is at rest; x and u
+        are (N, 8) and (N, 4), as of ``start``."""
+        told = np.pad(u, ((0, 0), (0, N_COMMANDS - COMPARE)), constant_values=-1.0)
         plant_start(self.records, x, told)
 
     def rewire(self, wiring: Wiring) -> None:
@@ -238,7 +253,7 @@ def _connect(plant: Network, wiring: Wiring) -> None:
         net["to_grid"][order.index(name)] = factor
     banks = {unit.terminal: unit.states[1] for unit in wiring.units}
     banks |= {bank.node: bank.name for bank in reversed(wiring.capacitors)}
-    may_lead = wiring.grid is None
+    may_lead = wiring.grid is None and not wiring.led
     for name, one, record in plant.fed():
         seen = one.sees(name, banks)
         record["sees"] = order.index(seen) if isinstance(seen, str) else [*map(order.index, seen)]
@@ -260,7 +275,8 @@ def _connect(plant: Network, wiring: Wiring) -> None:
     fastest += [np.abs(modes.rates.imag).max() for modes, _ in found.values()]
     if wiring.joint:
         fastest.append(_pack_joint(plant, wiring))
-    _pack_pieces(plant, max(fastest))
+    plant.fastest = max(*fastest, plant.at_least)
+    _pack_pieces(plant, plant.fastest)
     places = wiring.sources()
     for circuit, (modes, sources) in found.items():
         n = net["n_modes"][circuit] = len(modes.rates)

@@ -203,6 +203,7 @@ class Wiring:
     blocked: frozenset[int] = frozenset()
     check: Check | None = None  # the synchro-check that waits to close a breaker, or None
     recorded: tuple[Terminal, ...] = ()  # where the run records currents and powers
+    led: bool = False  # whether another part of the plant sets the frequency, see `parted`
 
     @property
     def order(self) -> tuple[str, ...]:

@@ -163,7 +163,7 @@ def test_the_lattice_of_a_step(G):
         (1 + r_s) * r_n * first * (r_s * r_n) ** k * (at > (2 * k + 2) * tau) for k in range(8)
     )
     np.testing.assert_allclose(np.array(seen), np.stack([v_m, v_n], axis=1), atol=1e-12)
-    last = [(one.count - 1 - k) % bergeron_line.PIECES for k in range(round(tau / h))]
+    last = [(one.count[0] - 1 - k) % bergeron_line.PIECES for k in range(round(tau / h))]
     held = h / 4 * (np.abs(one.a[last, :, 1]) ** 2).sum()
     assert energy == pytest.approx(held, abs=1e-15)
 

@@ -45,6 +45,7 @@ OPTIONS = {
     "inner": "--inner",
     "counts": "--counts",
     "waveforms": "--waveforms",
+    "cores": "--cores",
     "snapshot": "--snapshot",
     "start_from": "--from",
 }

@@ -38,6 +38,10 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     common.add_map(command, "--controller", action="append", default=[])
     command.add_argument(
+        "--cores", type=int, metavar="N",
+        help="processor cores for the parts of a network that lines of travelling waves cut",
+    )  # fmt: skip
+    command.add_argument(
         "--snapshot", type=float, metavar="S",
         help="keep the state of both sides at this time in the run folder, s; lockstep",
     )  # fmt: skip
@@ -67,6 +71,7 @@ def call(options: argparse.Namespace) -> int:
         options.mode = "lockstep"  # QEMU keeps no time
     scenario = common.resolve(
         options, law=options.law, waveforms=options.waveforms, snapshot=options.snapshot,
+        cores=options.cores,
         start_from=options.start_from and str(Path(options.start_from).absolute()),
     )  # fmt: skip
     folder = common.new_folder(options.out, find_scenario(options.scenario).stem)

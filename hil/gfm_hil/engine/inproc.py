@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.engine.loop_records import ControllerRecords, ReturnReason
+from gfm_hil.engine.parts import run_threads
 from gfm_hil.engine.replay import Trace, no_trace, replay, stands_still
 from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
@@ -179,27 +180,88 @@ def run_inproc(
 ) -> int:
     """Run a whole scenario: of each converter its bench, its parts of the recording, and its
     timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
+    whole = Converters(benches, plant_parts, controller_parts, timelines)
+    chunk = max(_LEAST_CHUNK, CHUNK // len(benches))
+
+    def ask(k: int) -> bool:
+        if not go_on(k):
+            for timeline in timelines:
+                timeline.end("interrupted", "stopped by the operator", k)
+        return any(timeline.running for timeline in timelines)
+
+    if not any(timeline.running for timeline in timelines):
+        k = 0
+    elif benches[0].scenario.cores is None:
+        k = _run_plant(whole, chunk, ask)
+    else:
+        k = _run_parts(whole, benches[0].scenario.cores, chunk, ask)
+    for timeline in timelines:
+        timeline.finish(k)
+    return k
+
+
+class Converters(NamedTuple):
+    """The converters of a run, or of a part of its plant."""
+
+    benches: Sequence[Bench]
+    plant_parts: Sequence[RolePart | Kept]
+    controller_parts: Sequence[RolePart | Kept]
+    timelines: Sequence[Timeline]
+
+
+class FlowsOfPart(NamedTuple):
+    """What a part of the plant records of the network."""
+
+    rows: NDArray[np.float64]  # those of the whole network, (ticks, columns)
+    columns: list[int]  # which of these
+
+    @staticmethod
+    def put_to(flows: NDArray[np.float64], k: int, here: Places) -> Places:
+        """Places, of which the network's are in ``flows``, (ticks, columns), from tick k on."""
+        begin = flows.ctypes.data - k * flows.strides[0]
+        widths = np.array([*here.widths[:2], flows.shape[1]])
+        return here._replace(flows=np.array([begin]), widths=widths)
+
+
+def _run_plant(
+    those: Converters, chunk: int, ask: Callable[[int], bool], of_part: FlowsOfPart | None = None
+) -> int:
+    """Run the converters of one plant; returns the ticks done.
+
+    Args:
+        chunk: a multiple of it ends each call of the compiled loop, if nothing else does.
+        ask: whether to go on after so many ticks.
+        of_part: of a part of the plant, which columns of the network it records.
+    """
+    benches, plant_parts, controller_parts, timelines = those
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
     survives_trip, plant = bench.scenario.survives_trips, bench.plant.records
     controllers = stack(benches)
-    chunk = max(_LEAST_CHUNK, CHUNK // len(benches))
     piece = max(_LEAST_PIECE, _PIECE // len(benches))
     where = _where_they_stay(plant_parts, controller_parts)
     plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
-    flows = np.empty((piece, len(bench.flows)))
+    flows = np.empty((piece, len(of_part.columns if of_part else bench.flows)))
     here = where or places(plant_rows, controller_rows, [flows])
-    while k < ticks and any(timeline.running for timeline in timelines):
+    if of_part is not None:
+        here = of_part.put_to(flows, 0, here)
+    going = True
+    while k < ticks and going:
         for timeline in timelines:
             timeline.carry_out(k)
-        stop, calm = min(k + chunk, ticks, *(timeline.next_tick() for timeline in timelines)), True
+        stop = min(k + chunk - k % chunk, ticks, *(timeline.next_tick() for timeline in timelines))
+        calm = True
         while k < stop and calm:
             end, first = (stop, 0) if where else (min(k + piece, stop), k)
+            if of_part is not None and of_part.columns:
+                end, here = min(k + piece, stop), of_part.put_to(flows, k, here)
             done, calm = _run_ticks(
                 plant, controllers, here, k, end, first, survives_trip, *bench.trace
             )
             if where is None:
                 _put(k, plant_parts, plant_rows[:, : done - k], flows[: done - k])
                 _put(k, controller_parts, controller_rows[:, : done - k], flows[:0])
+            if of_part is not None and of_part.columns:
+                of_part.rows[k:done, of_part.columns] = flows[: done - k]
             k = done
         if bench.plant.net[0]["joins"]:
             follow_trips(bench.plant)
@@ -208,12 +270,35 @@ def run_inproc(
         report_check(bench.plant, timelines, k)
         for timeline in timelines:
             timeline.look(k - 1)
-        if not go_on(k):
-            for timeline in timelines:
-                timeline.end("interrupted", "stopped by the operator", k)
-    for timeline in timelines:
-        timeline.finish(k)
+        going = ask(k)
     return k
+
+
+def _run_parts(whole: Converters, cores: int, chunk: int, ask: Callable[[int], bool]) -> int:
+    """``_run_plant`` of all parts of a plant, a thread each, on some processor cores."""
+    names, flow_rows = whole.benches[0].flows, whole.plant_parts[0].flow_rows
+    parts = dict[int, list[int]]()
+    for k, bench in enumerate(whole.benches):
+        parts.setdefault(id(bench.plant), []).append(k)
+    each = [
+        Converters(
+            [whole.benches[k] for k in places],
+            [whole.plant_parts[k] for k in places],
+            [whole.controller_parts[k] for k in places],
+            [whole.timelines[k] for k in places],
+        )
+        for places in parts.values()
+    ]
+
+    def run(p: int, go_on: Callable[[int], bool]) -> int:
+        recorded = each[p].benches[0].plant.wiring.recorded
+        columns = [names.index(name) for one in recorded for name in one.columns]
+        return _run_plant(each[p], chunk, go_on, FlowsOfPart(flow_rows, columns))
+
+    def meets(k: int) -> bool:
+        return k % chunk == 0 or k == whole.benches[0].scenario.ticks
+
+    return run_threads([one.benches[0].plant for one in each], cores, run, meets, ask)
 
 
 def _put(

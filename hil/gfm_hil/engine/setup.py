@@ -17,10 +17,12 @@ from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.replay import Trace, no_trace, trace_of
 from gfm_hil.engine.snapshot import start_from
 from gfm_hil.scenario import Scenario, plant_of
+from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.gains import gains_of
 from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
 from gfm_plant.model import DELTA
 from gfm_plant.names import MAY_START
+from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
@@ -35,7 +37,7 @@ class Bench:
     """Everything that one run changes."""
 
     scenario: Scenario
-    plant: Network  # the plant, in common with the other converters of a network
+    plant: Network  # in common with the other converters of a network, or of its part
     place: int  # the converter's index in it
     controller: Controller  # the controller, its first law at rest and RUNNING
     start: OperatingPoint
@@ -47,6 +49,8 @@ class Bench:
     external: SteppedController | None = None
     trace: Trace = field(default_factory=no_trace)  # what the run replays
     before: int = 0  # ticks of the plant before tick 0, of a run that starts from a snapshot
+    # columns of the network, which the recording of its first converter has
+    flows: tuple[str, ...] = ()
 
     @property
     def inner(self) -> int:
@@ -58,12 +62,6 @@ class Bench:
         """What the recording has by the plant's options."""
         n = self.plant.net[0]
         return (CONNECTION if n["connections"] else ()) + (BATTERY if n["batteries"] else ())
-
-    @property
-    def flows(self) -> tuple[str, ...]:
-        """What the recording has of the network, which is beside that of its first converter."""
-        those = self.plant.wiring.recorded if self.place == 0 else ()
-        return tuple(name for one in those for name in one.columns)
 
     def keep(self, plant: Network) -> None:
         """Remember this instant as the start, to which a reset goes back; ``plant`` is a copy of
@@ -162,7 +160,8 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    inner, kept = scenario.carries, plant.copy()
+    inner = scenario.carries
+    plants = _plants(scenario, plant, x, u)
     benches = []
     for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
         controller.inner = inner
@@ -176,13 +175,34 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
             controller.start(start.x_law, start.u)
         told = _commands(start, inner)
         trace = trace_of(one, told)
-        bench = Bench(one, plant, k, controller, start, np.zeros(len(y)), told, trace=trace)
+        its, kept, place = plants[k]
+        bench = Bench(one, its, place, controller, start, np.zeros(len(y)), told, trace=trace)
+        bench.flows = scenario.flows if k == 0 else ()
         bench.keep(kept)
         gains_of(one, controller.omega_b)
         benches.append(bench)
     if scenario.start_from is not None:
         start_from(scenario, benches)
     return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
+
+
+def _plants(
+    scenario: Scenario, plant: Network, x: NDArray[np.float64], u: NDArray[np.float64]
+) -> list[tuple[Network, Network, int]]:
+    """Of each converter its plant, the one or with ``cores`` a part of it, a copy of that, and
+    its place there. Raises UserError: the plant cannot be cut."""
+    parts = [(plant, tuple(range(len(x))))]
+    if scenario.cores is not None:
+        try:
+            faults = [e.acts_on() or "" for e in scenario.events if isinstance(e, Fault)]
+            parts = cut(plant, x, u, faults)
+        except ValueError as problem:
+            raise UserError(f"cores = {scenario.cores}: {problem}") from None
+    found = dict[int, tuple[Network, Network, int]]()
+    for part, units in parts:
+        kept = part.copy()
+        found |= {k: (part, kept, place) for place, k in enumerate(units)}
+    return [found[k] for k in range(len(x))]
 
 
 def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:

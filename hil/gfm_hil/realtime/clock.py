@@ -10,6 +10,7 @@ from numba import types
 
 from gfm_hil.realtime.atomics import intrinsic
 from gfm_hil.realtime.atomics import pause as pause
+from gfm_plant.atomics import yield_processor as yield_processor
 from gfm_runtime.compiled import compiled
 
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
@@ -24,8 +25,6 @@ _SPINS_A_YIELD = 16  # polls per yield, once a peer that delivers directly is la
 #: wake this long before a deadline and spin the rest: a sleep may end this late
 AHEAD_NS = 40_000
 
-#: yield_processor(): yield the processor
-yield_processor: Any = types.ExternalFunction("sched_yield", types.int32())
 _raise: Any = types.ExternalFunction("raise", types.int32(types.int32))
 
 

@@ -15,6 +15,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario.events.base import PlantEvent
 from gfm_hil.scenario.schema import INPROC, Scenario
 from gfm_plant import ConverterParameters, Network, load_converter, make_network, make_plant
+from gfm_plant.parted import find_places
 from gfm_runtime import BuiltLaw, LawError, discretise, load_law
 from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import allowed, meant, printable
@@ -360,6 +361,12 @@ def _try_plant(scenario: Scenario) -> None:
         plant = plant_of(scenario)
     except ValueError as problem:
         raise UserError(str(problem)) from None
+    if scenario.cores is not None and scenario.cores > (parts := len(find_places(plant.wiring))):
+        raise UserError(
+            f"cores = {scenario.cores}: at most {parts}: the network has {parts} part"
+            f"{'s' * (parts > 1)} with converters; network.bergeron_lines cut it, where nothing"
+            " else connects their ends"
+        )
     for k, event in enumerate(scenario.events):
         if isinstance(event, PlantEvent):
             try:

@@ -216,6 +216,14 @@ class Scenario(StrictSchema):
         description="[from, to], s: the window of the figure of the three phases; from 3 cycles "
         "before the first event to 7 after it if none",
     )
+    cores: int | None = Field(
+        None,
+        ge=1,
+        le=64,
+        description="in process: lines of travelling waves cut the network into parts, a thread "
+        "each, which so many processor cores run; the results do not depend on how many; if none, "
+        "the network is solved as one circuit",
+    )
     snapshot: float | None = Field(
         None, gt=0, description="s: when both sides keep their state in the run folder, before the "
         "events of that tick; lockstep only",
@@ -424,6 +432,13 @@ class Scenario(StrictSchema):
                 f"network.converters: link.type is {INPROC!r} of some and not of others; choose"
                 " links for all, or for none"
             )
+        if self.cores is not None and self.network is None:
+            problems.append(f"cores = {self.cores}: goes with a network, whose parts they run")
+        elif self.cores is not None and kinds != {INPROC}:
+            problems.append(
+                f"cores = {self.cores}: with link.type = {INPROC!r} only; over links each loop has"
+                " a processor of its own"
+            )
         if kinds == {INPROC} and self.mode == "realtime":
             problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
         places = [link.endpoint for link in own.values() if link.endpoint is not None]
@@ -459,6 +474,8 @@ class Scenario(StrictSchema):
             problems.append(
                 f"snapshot = {self.snapshot:g} s: must lie within the run of {self.duration:g} s"
             )
+        if self.cores is not None and (self.snapshot or self.start_from):
+            problems.append(f"cores = {self.cores}: not with snapshot or start_from")
         if self.snapshot is not None and self.mode == "realtime":
             problems.append(f"snapshot = {self.snapshot:g} s: needs mode = 'lockstep'")
         key = "start_from" if self.snapshot is None else "snapshot"

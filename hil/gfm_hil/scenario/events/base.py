@@ -101,6 +101,10 @@ class PlantEvent(Event):
         nothing has changed."""
         raise NotImplementedError
 
+    def acts_on(self) -> str | None:
+        """The node or part of a network that it is at; None: what all parts of a plant have."""
+        return None
+
     def try_on(self, plant: Network) -> None:
         """Try the event of a scenario on its plant before the run. Raises UserError, ValueError: it
         is not possible."""
@@ -114,5 +118,6 @@ class PlantEvent(Event):
         self.apply(target.plant.copy())
 
     def carry_out(self, target: EventTarget) -> None:
-        if target.place == 0:  # a network's plant is one, and changes once
+        # a plant of several converters changes once, and of its parts only where the event is
+        if target.place == 0 and self.acts_on() not in target.plant.elsewhere:
             self.apply(target.plant)

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 import gfm_plant
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
+from gfm_plant.network import THE_GRID
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario
@@ -100,6 +101,9 @@ class LineBreaker(Switch):
     def label(self) -> str:
         return f"{self.name} " + ("on" if self.closed else "off") + self.when()
 
+    def acts_on(self) -> str | None:
+        return self.name
+
     def switch(self, plant: gfm_plant.Network) -> None:
         gfm_plant.line_breaker(plant, self.name, self.closed, self.clearing)
 
@@ -131,6 +135,9 @@ class GridBreaker(Switch):
     def misfits(self, scenario: Scenario) -> list[str]:
         alone = scenario.plant.grid.load_R is None and not scenario.network
         return ["the breaker needs plant.grid.load_R and load_L"] if alone else []
+
+    def acts_on(self) -> str | None:
+        return THE_GRID
 
     def switch(self, plant: gfm_plant.Network) -> None:
         gfm_plant.breaker(plant, self.closed, self.clearing)

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
 from gfm_plant.names import FAULTED_PHASES
+from gfm_plant.network import FIRST_LINE
 
 
 class Fault(PlantEvent):
@@ -86,6 +87,9 @@ class Fault(PlantEvent):
         if self.node is not None:
             where = f"node {self.node}"
         return f"{self.what} at {where}" + (f" for {self.duration:g} s" if self.duration else "")
+
+    def acts_on(self) -> str | None:
+        return self.node or self.line or FIRST_LINE
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.fault(

@@ -8,6 +8,7 @@ from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
+from gfm_plant.network import THE_GRID
 
 
 class GridLoad(PlantEvent):
@@ -18,6 +19,9 @@ class GridLoad(PlantEvent):
 
     def label(self) -> str:
         return f"grid load {self.change:+g} p.u."
+
+    def acts_on(self) -> str | None:
+        return THE_GRID
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.grid_load(plant, self.change)
