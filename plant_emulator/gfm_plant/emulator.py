@@ -5,18 +5,20 @@ The functions are compiled and allocate nothing. `plant` is the `PlantRecords` o
 """
 
 import math
+from typing import Any
 
 import numpy as np
+from numba import typeof
 from numpy.typing import NDArray
 
 from gfm_plant.clearing import advance_clearing, begin_clearing
 from gfm_plant.components import every_at_rest, every_tick
 from gfm_plant.dc_link import limit_dc_source
-from gfm_plant.going_on import advance
+from gfm_plant.going_on import address_of, advance, call_at
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
-from gfm_plant.period import go_back, keep, length, stretch
+from gfm_plant.period import go_back, keep, length
 from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
@@ -101,9 +103,25 @@ def plant_command(plant: PlantRecords, k: int, u: NDArray[np.float64]) -> None:
             trip(plant, k, BAD_COMMAND, u[j])
 
 
-@compiled
+@inlined
 def plant_step(plant: PlantRecords) -> None:
-    """Go on by one sampling period under the commands in the delay lines."""
+    """Go on by one sampling period under the commands in the delay lines.
+
+    The loops reach it by an address in the plant's records: it is compiled once for all."""
+    call_at(plant.net[0].step, plant, 0.0, 0.0)
+
+
+def find_step(plant: PlantRecords) -> int:
+    """Compile, or load, ``plant_step`` itself for such records, and return its address."""
+    return address_of(typeof(plant), _step_at)
+
+
+def _step_at(plant: Any, begin: float, end: float) -> None:
+    _step(plant[0])
+
+
+@compiled
+def _step(plant: PlantRecords) -> None:
     n, now = plant.net[0], plant.now[0]
     keep(plant)
     if field(n, "unbalanced")[circuit(n, now)]:
@@ -114,11 +132,8 @@ def plant_step(plant: PlantRecords) -> None:
         advance_clearing(plant)
     elif n.conversions > 1:
         _advance_converting(plant)
-    elif n.n_units or n.n_dynamic:
-        advance(plant, 0.0, math.inf)
     else:
-        for part in range(n.n_parts):
-            stretch(plant, part, True, math.inf)
+        advance(plant, 0.0, math.inf)
 
     worst, largest = 0, 0.0
     for k in range(n.n_converters):

@@ -5,18 +5,17 @@ the currents of a fault's phases, which are in p.u. of its nominal peak value of
 reach them by an address in the plant's records: only who records a network compiles them.
 """
 
-from functools import cache
 from typing import Any
 
-from numba import types
+from numba import typeof
 
 from gfm_plant.clearing import contact_currents
 from gfm_plant.components import every_flow
-from gfm_plant.going_on import call_at
+from gfm_plant.going_on import address_of, call_at
 from gfm_plant.layout import field
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import grid_source, node_voltage
-from gfm_runtime.compiled import FREE, callback, compiled, inlined
+from gfm_runtime.compiled import compiled, inlined
 
 
 @compiled
@@ -50,13 +49,9 @@ def look_at_flows(plant: PlantRecords) -> None:
             out[j], out[j + 1], out[j + 2] = contact_currents(plant, 0.0, 0)
 
 
-@cache
-def find_look(kind: Any) -> int:
-    """Compile, or load, ``look_at_flows`` for plants with records of this type; returns its
-    address."""
-    signature = types.void(types.CPointer(kind), types.float64, types.float64)
-    address: Any = callback(_look, signature, **FREE).address
-    return address
+def find_look(plant: PlantRecords) -> int:
+    """Compile, or load, ``look_at_flows`` for such records, and return its address."""
+    return address_of(typeof(plant), _look)
 
 
 def _look(plant: Any, begin: float, end: float) -> None:

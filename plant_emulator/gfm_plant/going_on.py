@@ -3,8 +3,7 @@ without components that have states of their own, or with them.
 
 A compiled function contains all that it calls, and LLVM optimises the callees again in each caller.
 The ways are large and have several callers. So callers reach them by an address in the plant's
-records: each is compiled once, and only for a plant that needs it. One averaged converter without
-such components goes through a whole period faster in the loop itself, see ``plant_step``.
+records: each is compiled once, and only for a plant that needs it.
 """
 
 from collections.abc import Callable
@@ -27,12 +26,13 @@ def find_address(plant: PlantRecords) -> int:
     """Compile, or load, the way of this plant, and return its address."""
     net = plant.net[0]
     ways = (_switched, _moving) if net["n_units"] else (_alone, _with_components)
-    way = ways[int(net["n_dynamic"] > 0)]
-    return _compile(typeof(plant), way)
+    return address_of(typeof(plant), ways[int(net["n_dynamic"] > 0)])
 
 
 @cache
-def _compile(kind: Any, way: Callable[..., None]) -> int:
+def address_of(kind: Any, way: Callable[..., None]) -> int:
+    """Compile, or load, a function for ``call_at``, and return its address; ``kind``: numba's type
+    of the plant's records."""
     signature = types.void(types.CPointer(kind), types.float64, types.float64)
     address: Any = callback(way, signature, **FREE).address
     return address

@@ -13,8 +13,8 @@ from gfm_plant.circuit import GROUND, Branch
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.emulator import clear, reconnect, synchronise
 from gfm_plant.model import DELTA
-from gfm_plant.names import CLEARINGS, FAULTED_PHASES
-from gfm_plant.network import THE_GRID, Network
+from gfm_plant.names import CLEARINGS, FAULTED_PHASES, THE_GRID
+from gfm_plant.network import Network
 from gfm_plant.synchro_check import NONE, TIME_OVER, WATCHING
 from gfm_plant.wiring import GRID_SOURCE, Check, FaultPlace, OpeningBreaker, Wiring
 

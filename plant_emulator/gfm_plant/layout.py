@@ -16,6 +16,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
 from numpy.typing import NDArray
 
+from gfm_plant.names import ADDRESSES
+
 intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
 
 MOST_CONTACTS = 8
@@ -236,8 +238,7 @@ net_dtype = _header(
     [
         ("omega_b", "f8"),  # rad/s
         ("T_s", "f8"),
-        ("advance", "i8"),  # addresses, see `going_on`; of the second 0: nothing is recorded
-        ("look", "i8"),
+        *((name, "i8") for name in ADDRESSES),
         ("conversions", "i8"),  # of the A/D at the phases in a period
         ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then

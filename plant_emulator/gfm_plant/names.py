@@ -1,4 +1,4 @@
-"""Names of the plant's true values, of its trips and of their reasons."""
+"""Names of the plant's true values, of its trips and their reasons, and in its records."""
 
 from gfm_runtime.signals import D_NAMES, U_NAMES, Y_NAMES
 
@@ -67,3 +67,9 @@ CONNECTION = ("p_c", "q_c", "V_c")
 
 BATTERY = ("soc",)
 """State of charge of a battery behind the DC source, in [0, 1]."""
+
+ADDRESSES = ("step", "advance", "look")
+"""In a plant's records, those of functions, see `going_on`; of ``look`` 0: nothing is recorded."""
+
+THE_GRID, FIRST_LINE = "\0grid", "\0line"
+"""In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""

@@ -11,26 +11,24 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numba import typeof
 from numpy.typing import NDArray
 
 from gfm_plant.circuit import Branch
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed
 from gfm_plant.contacts import OWN_PATH, join
-from gfm_plant.emulator import plant_start, reconnect
+from gfm_plant.emulator import find_step, plant_start, reconnect
 from gfm_plant.flows import find_look
 from gfm_plant.going_on import find_address
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
+from gfm_plant.names import ADDRESSES
 from gfm_plant.phases import convert_nothing
 from gfm_plant.port import pack_port
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
-THE_GRID, FIRST_LINE = "\0grid", "\0line"
-"""In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
@@ -57,12 +55,19 @@ class Network:
     at_least: float = 0.0
     fastest: float = 0.0
 
+    @property
+    def typed(self) -> PlantRecords:
+        """The same memory as the compiled functions take it; what they call by address may not be
+        known yet."""
+        return PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+
     @cached_property
     def records(self) -> PlantRecords:
         """The same memory, as the compiled functions take it."""
-        records = PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+        records = self.typed
+        self.net["step"] = find_step(records)
         self.net["advance"] = find_address(records)
-        self.net["look"] = find_look(typeof(records)) if self.wiring.recorded else 0
+        self.net["look"] = find_look(records) if self.wiring.recorded else 0
         return records
 
     @property
@@ -95,8 +100,11 @@ class Network:
 
     def restore(self, kept: Network) -> None:
         """Take the wiring, the parameters and the instant of a copy."""
+        addresses = [int(self.net[name][0]) for name in ADDRESSES]
         for record, old in zip(self.memory, kept.memory, strict=True):
             _bytes(record)[:] = _bytes(old)
+        for name, address in zip(ADDRESSES, addresses, strict=True):
+            self.net[name] = address
         self.wiring, self.fastest = kept.wiring, kept.fastest
 
     def without_current(self, k: int, ticks: int) -> NDArray[np.float64]:
@@ -104,7 +112,7 @@ class Network:
         flowed: counts, (ticks, 10)."""
         rows = np.empty((ticks, N_PHASES))
         if ticks:
-            convert_nothing(self.records, k, rows)
+            convert_nothing(self.typed, k, rows)
         return rows
 
     def start(
@@ -164,7 +172,7 @@ class Network:
         """Fill the delay lines, sensors and DC sources of a plant whose circuit is at rest; x and u
         are (N, 8) and (N, 4), as of ``start``."""
         told = np.pad(u, ((0, 0), (0, N_COMMANDS - COMPARE)), constant_values=-1.0)
-        plant_start(self.records, x, told)
+        plant_start(self.typed, x, told)
 
     def rewire(self, wiring: Wiring) -> None:
         """Go on from the present state with another wiring.

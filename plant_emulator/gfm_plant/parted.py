@@ -22,7 +22,8 @@ from gfm_plant.components import DYNAMIC
 from gfm_plant.components.bergeron_line import BergeronLine
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.part import FAULT
-from gfm_plant.network import FIRST_LINE, THE_GRID, Network
+from gfm_plant.names import FIRST_LINE, THE_GRID
+from gfm_plant.network import Network
 from gfm_plant.wiring import Wiring
 
 _OWN = {"source", "sees", "lag", "leads", "first", "last", "here", "other", "led", "spins"}

@@ -215,8 +215,9 @@ def _sense(n: Any, s: Any, k: int, j: int, part: int, f_0: float, f_1: float, f_
     )
 
 
-def _make_ways(kind: str, *hooks: Any) -> tuple[Any, Any]:
-    """The functions that go on by a stretch and between two instants of the period.
+def _make_way(kind: str, *hooks: Any) -> Any:
+    """A function (plant, begin, end) that goes on between two instants, s after the period's
+    beginning; inf: to its end.
 
     Args:
         kind: of plants that they are for.
@@ -299,7 +300,7 @@ def _make_ways(kind: str, *hooks: Any) -> tuple[Any, Any]:
                 stretch(plant, part, begin <= starts, h)
             starts = ends
 
-    return stretch, inlined_as(f"advance_{kind}", go_on_between)
+    return inlined_as(f"advance_{kind}", go_on_between)
 
 
 @inlined
@@ -307,11 +308,8 @@ def _none(plant: PlantRecords, c: int, part: int) -> None:
     return
 
 
-#: (plant, part, begins, h): go on by h s of a stretch of the period, inf: by all of it, under the
-#: commands that act in it; ``begins``: from its beginning.
-#: (plant, begin, end): go on between two instants, s after the period's beginning; inf: to its end
-stretch, advance_alone = _make_ways("alone", _none, _none, _none, _none)
+advance_alone = _make_way("alone", _none, _none, _none, _none)
 #: the same for a plant with components that have records
-_, advance_with_components = _make_ways(
+advance_with_components = _make_way(
     "with_components", every_begin, every_drive, every_middle, every_end
 )

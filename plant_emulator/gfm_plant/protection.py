@@ -117,7 +117,7 @@ def start_condition(plant: PlantRecords, k: int) -> int:
     return MAY_START
 
 
-@compiled
+@inlined
 def protect(plant: PlantRecords, k: int) -> None:
     """Check every threshold of converter k on the true values of this tick."""
     r, s = plant.par[k], plant.st[k]

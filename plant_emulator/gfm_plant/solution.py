@@ -64,7 +64,7 @@ def mirror_sources(n: Any, now: Any, tick: float) -> None:
         unit[now.n_s + k] = unit[k].conjugate() * turn
 
 
-@compiled
+@inlined
 def drive(n: Any, now: Any, c: int, part: int, k: int, E: complex, omega: float) -> None:
     """Add to the forcing of every mode what source k does to it, in an unbalanced circuit with its
     mirror image, and turn their phasors.
@@ -100,7 +100,7 @@ def _drive(
     _turn_on(now, part, k)
 
 
-@compiled
+@inlined
 def _set_source(n: Any, now: Any, part: int, k: int, E: complex, omega: float) -> None:
     """``drive`` of a series: keep the source at the beginning and in the middle of a piece."""
     if field(now, "gain_omega")[part, k] != omega:
@@ -217,7 +217,7 @@ def state(n: Any, now: Any, c: int, i: int) -> complex:
     return w
 
 
-@compiled
+@inlined
 def read_states(n: Any, now: Any, c: int) -> None:
     """Write all states of w at the end of a piece, or by the modes as they are."""
     if by_series(n, now):

@@ -125,8 +125,11 @@ class _Cache(FunctionCache):
         return super().load_overload(sig, target_context)
 
 
-#: options of numba; a division by 0 gives infinity or NaN as in C, and no branch
-FREE: dict[str, Any] = {"nogil": True, "_nrt": False, "error_model": "numpy"}
+#: options of numba; a division by 0 gives infinity or NaN as in C, and no branch. Without a word on
+#: ``forceinline`` a function would inherit it from the caller that has it compiled first.
+FREE: dict[str, Any] = {
+    "nogil": True, "_nrt": False, "error_model": "numpy", "forceinline": False,
+}  # fmt: skip
 
 
 def _decorator(**options: Any) -> Any:
@@ -160,7 +163,7 @@ compiled: Any = _decorator(**FREE)
 
 #: decorator for the innermost functions, which become part of their callers: the compiler would
 #: otherwise emit a call, pass every word of every array on the stack, and save registers
-inlined: Any = _decorator(**FREE, forceinline=True)
+inlined: Any = _decorator(**{**FREE, "forceinline": True})
 
 #: decorator for a function whose sums may be taken in any order, so that they are taken of several
 #: numbers at a time; their last bits then depend on the processor
@@ -184,4 +187,4 @@ def inlined_as(name: str, function: Callable[..., Any]) -> Any:
 
 
 #: decorator for a function of a tick that needs numba's runtime, as slices of arrays do
-cached: Any = _decorator(nogil=True, error_model="numpy")
+cached: Any = _decorator(**{**FREE, "_nrt": True})

@@ -13,8 +13,11 @@ a function.
 
 from __future__ import annotations
 
+import gc
 import hashlib
-from functools import cached_property
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache, cached_property
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -27,6 +30,8 @@ from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering
+from numba.core.types import Boolean, Function, Number
+from numba.core.typing.context import Context
 
 
 class _Library(JITCodeLibrary):
@@ -239,13 +244,57 @@ class _Arguments(tuple[Any, ...]):
         return self._written
 
 
+class _Typing(Context):
+    """numba's typing of calls, which remembers those of operators on numbers.
+
+    ``a * b`` may be of arrays, strings, dates and much else, and numba tries one after the other
+    at every place that multiplies."""
+
+    def __init__(self, context: Any) -> None:
+        self.__dict__ = context.__dict__
+
+    def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
+        """As numba asks for it at each call that it types."""
+        kind = self._lookup_global(func) or func
+        if type(kind) is not Function or kws or not all(isinstance(a, _NUMBERS) for a in args):
+            return super().resolve_function_type(func, args, kws)
+        known = _signatures.get((kind, args))
+        if known is None:
+            known = _signatures[kind, args] = super().resolve_function_type(func, args, kws)
+        return known
+
+
+_NUMBERS = Number, Boolean
+_signatures: dict[Any, Any] = {}
+_typing = cache(_Typing)
+
+
+@contextmanager
+def _garbage_kept() -> Iterator[None]:
+    """Collect no garbage meanwhile: numba keeps millions of objects while it compiles, and looking
+    through them again and again took a tenth of the time."""
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
 class Deferring(Compiler):
     """numba's compiler, up to the machine code."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(self, typing: Any, *args: Any) -> None:
+        super().__init__(_typing(typing), *args)
         self.state.flags = _Flags(self.state.flags)
         self.state.args = _Arguments(self.state.args)
+
+    def compile_extra(self, func: Any) -> Any:
+        """As numba asks for it; those of callees are compiled in the course of it."""
+        with _garbage_kept():
+            return super().compile_extra(func)
 
     def define_pipelines(self) -> Any:
         """As numba asks for it, once a compilation."""

@@ -191,6 +191,18 @@ def tripping(**limits: float) -> Network:
     )
 
 
+def test_a_plant_restored_from_a_copy_of_its_start_repeats_its_course():
+    plant = tripping(a=10.0)
+    u = start(plant, 1.0, 0.2)
+    u[:, 2] *= 1.01
+    kept, after = plant.copy(), []
+    for _ in range(2):
+        go(plant, u, 3)
+        after.append(plant.st["x"].tobytes())
+        plant.restore(kept)
+    assert after[0] == after[1] != kept.st["x"].tobytes()
+
+
 def test_one_trips_and_the_other_goes_on():
     plant = tripping(a=0.01)
     u = start(plant, 1.0, 0.2)

@@ -14,16 +14,19 @@ from numba.core import event
 
 from gfm_hil.controllers import ExternalController
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine.compiling_beside import Beside
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.inproc import compile_loop, rows
 from gfm_hil.engine.process import compile_role
-from gfm_hil.engine.setup import Bench, make_bench, make_benches
+from gfm_hil.engine.setup import Bench, make_bench, make_benches, unstarted_benches
 from gfm_hil.links import link_kind, link_names
 from gfm_hil.links.impaired import link as impaired
 from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
+from gfm_plant.emulator import find_step
+from gfm_plant.going_on import find_address
 from gfm_runtime.compiled import wheel_code
 
 
@@ -83,19 +86,46 @@ def compiled_benches(
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
-    sets = [Set(_START, lambda: found.extend(make_benches(scenario)))]
+    with Beside(scenario, [*roles], notice) as beside:
+        sets = [Set(_START, lambda: found.extend(make_benches(scenario)))]
+        if "plant" in roles:
+            sets.append(Set(_PERIOD, lambda: find_step(found[0].plant.typed)))
+        sets.append(Set("the loops", beside.wait))
+        compile_sets([*sets, *_loops(scenario, roles, lambda: found)], beside.begin)
+    return found
+
+
+def compile_loops_alone(scenario: Scenario, roles: Iterable[Role]) -> None:
+    """Compile the loops of a scenario, and how its plant goes on between two instants, without the
+    operating point. Arguments and errors as of ``compiled_benches``."""
+    benches = _unstarted(scenario)
+    for one in _loops(scenario, roles, lambda: benches):
+        one.compile()
+    if "plant" in roles:
+        find_address(benches[0].plant.typed)
+
+
+def _unstarted(scenario: Scenario) -> list[Bench]:
+    benches = unstarted_benches(scenario)
+    benches[0].plant.records = benches[0].plant.typed
+    return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
+
+
+def _loops(
+    scenario: Scenario, roles: Iterable[Role], found: Callable[[], list[Bench]]
+) -> list[Set]:
+    """What the ticks of a scenario call."""
     if scenario.in_process:
-        sets.append(_both(lambda: found))
+        sets = [_both(found)]
     else:
-        sets += [_role(role, lambda: found) for role in roles]
+        sets = [_role(role, found) for role in roles]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
         sets += [_link(link.type, link.options, scenario.carries) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
             sets.append(_IMPAIRMENT)
         if scenario.mode == "realtime":
             sets.append(_IDLE)
-    compile_sets(sets, notice)
-    return found
+    return sets
 
 
 def everything() -> list[Set]:
@@ -105,21 +135,23 @@ def everything() -> list[Set]:
 
     @cache
     def found() -> list[Bench]:
-        return [make_bench(Scenario(title="warm-up", duration=1.0))]
+        return _unstarted(Scenario(title="warm-up", duration=1.0))
 
-    def with_components() -> None:
+    def between(dynamic: int) -> None:
         plant = found()[0].plant.copy()
-        plant.net["n_dynamic"] = 1
-        assert plant.records
+        plant.net["n_dynamic"] = dynamic
+        find_address(plant.typed)
 
     return [
-        Set(_START, found),
+        Set(_PERIOD, lambda: find_step(found()[0].plant.typed)),
+        Set(_START, lambda: make_bench(Scenario(title="warm-up", duration=1.0))),
         *(_link(name, {}) for name in link_names()),
         _IMPAIRMENT,
         _IDLE,
         *(_role(role, found) for role in reversed(ROLES)),
         Set("the operating point of an inner stage", lambda: make_bench(limited), (_START,)),
-        Set("the components of networks", with_components, (_START,)),
+        Set("the plant between two instants", lambda: between(0)),
+        Set("the components of networks", lambda: between(1), (_PERIOD,)),
         _both(found),
     ]
 
@@ -145,6 +177,7 @@ def compile_external(
 
 
 _START = "the operating point"
+_PERIOD = "the plant's period"
 _IDLE = Set("the thread that keeps a processor busy", prevent_idle.warm_up)
 _IMPAIRMENT = Set("a link's impairment", impaired.warm_up)
 
@@ -167,7 +200,7 @@ def _role(role: Role, found: Callable[[], list[Bench]], which: str = "") -> Set:
         ]
         compile_role(role, benches, parts)
 
-    return Set(f"the {role}{which}", compile_it, (_START,))
+    return Set(f"the {role}{which}", compile_it)
 
 
 def _link(name: str, options: dict[str, Any], inner: int = False) -> Set:

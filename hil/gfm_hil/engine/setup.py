@@ -7,6 +7,7 @@ frames have to cross the link.
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, carried
+from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, Vector, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
 ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
@@ -143,11 +144,10 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     controller of its own and one plant in common; as the controller of one of them sees it, the
     bench of that one. Arguments and errors as of ``make_bench``.
     """
-    each = [*scenario.each.values()] or [scenario]
-    plant = plant_of(scenario)
-    controllers = [_controller(one, plant, real) for one in each]
-    laws = [controller.active_law for controller in controllers]
-    refs = [np.asarray(one.references.vector()) for one in each]
+    benches = unstarted_benches(scenario, real)
+    plant = benches[0].plant
+    laws = [bench.controller.active_law for bench in benches]
+    refs = [np.asarray(bench.scenario.references.vector()) for bench in benches]
     try:
         if scenario.network is None:
             grid = scenario.plant.grid
@@ -160,27 +160,21 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
-    inner = scenario.carries
     plants = _plants(scenario, plant, x, u)
-    benches = []
-    for k, (one, controller, start) in enumerate(zip(each, controllers, starts, strict=True)):
-        controller.inner = inner
-        y = np.zeros(len(carried("y", inner)))
-        if inner:
+    for k, (bench, start) in enumerate(zip(benches, starts, strict=True)):
+        bench.plant, kept, bench.place = plants[k]
+        bench.start, controller = start, bench.controller
+        if bench.inner:
             own = np.concatenate([start.y, start.x[: NY_INNER - NY]])
             angle = np.exp(1j * start.x[DELTA])
             rows = plant.without_current(k, controller.calibrations)
             controller.start(start.x_law, start.u, own, start.e, angle, rows)
         else:
             controller.start(start.x_law, start.u)
-        told = _commands(start, inner)
-        trace = trace_of(one, told)
-        its, kept, place = plants[k]
-        bench = Bench(one, its, place, controller, start, np.zeros(len(y)), told, trace=trace)
-        bench.flows = scenario.flows if k == 0 else ()
+        bench.u[:] = _commands(start, bench.inner)
+        bench.trace = trace_of(bench.scenario, bench.u)
         bench.keep(kept)
-        gains_of(one, controller.omega_b)
-        benches.append(bench)
+        gains_of(bench.scenario, controller.omega_b)
     if scenario.start_from is not None:
         start_from(scenario, benches)
     return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
@@ -203,6 +197,20 @@ def _plants(
         kept = part.copy()
         found |= {k: (part, kept, place) for place, k in enumerate(units)}
     return [found[k] for k in range(len(x))]
+
+
+def unstarted_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
+    """The benches of all converters before anyone knows the operating point: none can run, but the
+    loops can be compiled for their records. Arguments as of ``make_bench``."""
+    plant, nowhere, benches = plant_of(scenario), cast(OperatingPoint, None), list[Bench]()
+    vectors: tuple[Vector, Vector] = "y", "u"
+    for k, one in enumerate([*scenario.each.values()] or [scenario]):
+        controller = _controller(one, plant, real)
+        inner = controller.inner = scenario.carries
+        y, u = (np.zeros(len(carried(group, inner))) for group in vectors)
+        flows = scenario.flows if k == 0 else ()
+        benches.append(Bench(one, plant, k, controller, nowhere, y, u, flows=flows))
+    return benches
 
 
 def _controller(scenario: Scenario, plant: Network, real: str) -> Controller:

@@ -2,7 +2,7 @@
 
 from gfm_hil.realtime.atomics import prefetch
 from gfm_plant import CONNECTION, TRUTH, plant_options, plant_truth
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.signals import N_ADC, NU, NU_INNER, NY, NY_INNER
 
 _TRUE, _Y_INNER = NY + NU, NY + NU + len(TRUTH)
@@ -14,7 +14,7 @@ _CONNECTION = len(CONNECTION)
 _SOON = 8  # rows; a page that is new to the processor would hold up the tick that begins it
 
 
-@compiled
+@inlined
 def record_sample(row, y, plant, i):
     """Fill the part of a row of PLANT_COLUMNS that is known when converter i is sampled."""
     prefetch(row.ctypes.data + _SOON * row.nbytes)

@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from numba import njit
+from numba import njit, typeof
 
 from gfm_hil.cli import main
 from gfm_hil.engine.compiling import Set, compile_sets, everything
+from gfm_hil.engine.setup import make_benches, unstarted_benches
 from gfm_hil.links import link_names
 from gfm_hil.run.runner import run_scenario
 
@@ -74,6 +75,58 @@ def test_only_what_is_compiled_is_said_and_which_of_how_many():
     ]  # fmt: skip
     assert compile_sets(sets, said.append) == 1
     assert said == ["compiling a sum (2 of 3, once a machine) …"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {},
+        {"inner": "virtual-stator"},
+        {"law": "mimo-gfm", "ready_laws": ["vsg-2"], "plant": {"bridge": {"kind": "two-level"}}},
+    ],
+)
+def test_loops_are_compiled_for_the_records_that_a_started_bench_has(make, content):
+    scenario = make(**content)
+    for ours, started in zip(unstarted_benches(scenario), make_benches(scenario), strict=True):
+        assert typeof(ours.plant.typed) == typeof(started.plant.records)
+        for a, b in [(ours.controller, started.controller), (ours, started)]:
+            arrays = [name for name, value in vars(a).items() if hasattr(value, "dtype")]
+            assert arrays
+            assert [typeof(vars(a)[n]) for n in arrays] == [typeof(vars(b)[n]) for n in arrays]
+
+
+def _fresh(tmp_path: Path, code: str) -> list[str]:
+    """What a process with a cache of its own prints."""
+    begin = "from gfm_hil.engine import compiling_beside as beside, compiling; import sys\n"
+    return subprocess.run(
+        [sys.executable, "-c", begin + code], capture_output=True, text=True, check=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+    ).stdout.splitlines()  # fmt: skip
+
+
+_RUN = """
+from gfm_hil.scenario.loading import check_scenario
+one = {"title": "test", "duration": 0.1, "link": {"type": "inproc"}}
+(bench,) = compiling.compiled_benches(check_scenario(one, "test"), print)
+"""
+
+
+@pytest.mark.full  # compiles a whole run
+def test_a_second_process_compiles_the_loop_meanwhile(tmp_path):
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("one processor")
+    said = _fresh(tmp_path, _RUN)
+    assert any("the operating point" in line for line in said)
+    assert not any("the loop of both sides" in line for line in said)
+    assert list(tmp_path.rglob("*_run_ticks*.nbc"))
+    assert _fresh(tmp_path, _RUN) == []
+
+
+@pytest.mark.full  # compiles a whole run
+def test_a_second_process_that_dies_leaves_its_work_to_the_first(tmp_path):
+    code = "import shutil; beside.sys.executable = shutil.which('false')\n"
+    said = _fresh(tmp_path, code + _RUN)
+    assert any("the loop of both sides" in line for line in said)
 
 
 def cached(folder: Path) -> dict[Path, int]:

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 import gfm_plant
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
-from gfm_plant.network import THE_GRID
+from gfm_plant.names import THE_GRID
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario

@@ -8,8 +8,7 @@ from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-from gfm_plant.names import FAULTED_PHASES
-from gfm_plant.network import FIRST_LINE
+from gfm_plant.names import FAULTED_PHASES, FIRST_LINE
 
 
 class Fault(PlantEvent):

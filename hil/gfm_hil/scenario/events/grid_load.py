@@ -8,7 +8,7 @@ from pydantic import Field
 
 import gfm_plant
 from gfm_hil.scenario.events.base import PlantEvent
-from gfm_plant.network import THE_GRID
+from gfm_plant.names import THE_GRID
 
 
 class GridLoad(PlantEvent):

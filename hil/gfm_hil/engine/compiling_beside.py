@@ -1,0 +1,68 @@
+"""A second process that compiles a scenario's loops while the first compiles what starts a run.
+
+The operating point takes as long to compile as the loops do, and the loops can do without it:
+they are compiled for the types of a bench's records. The first process then loads what the second
+has put into numba's cache, and compiles what it has not.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+from gfm_hil.core.roles import Role
+from gfm_hil.scenario import Scenario
+
+
+class Beside:
+    """The second process, as a context that ends it.
+
+    Args:
+        scenario: checked.
+        roles: the sides whose loops it compiles.
+        notice: told when it starts, and when this process has to wait for it.
+    """
+
+    def __init__(
+        self, scenario: Scenario, roles: Sequence[Role], notice: Callable[[str], None]
+    ) -> None:
+        self._task, self._notice = (scenario, tuple(roles)), notice
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> "Beside":
+        return self
+
+    def __exit__(self, *problem: Any) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+    def begin(self, text: str) -> None:
+        """Pass on that a set of functions is being compiled; before the first one, start the
+        process, unless this machine has one processor."""
+        self._notice(text)
+        if self._process is None and len(os.sched_getaffinity(0)) > 1:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+            assert self._process.stdin is not None
+            with suppress(BrokenPipeError), self._process.stdin as into:
+                pickle.dump(self._task, into)
+
+    def wait(self) -> None:
+        """Wait until it has done its work."""
+        if self._process is not None and self._process.poll() is None:
+            self._notice("compiling the loops, in a second process (once a machine) …")
+            self._process.wait()
+
+
+if __name__ == "__main__":
+    from gfm_hil.engine.compiling import compile_loops_alone
+    from gfm_runtime.children import end_with_parent
+
+    end_with_parent()
+    compile_loops_alone(*pickle.load(sys.stdin.buffer))
