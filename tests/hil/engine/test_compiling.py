@@ -1,6 +1,7 @@
 """What is compiled when: nothing by an import, everything by a warm-up, and runs say so."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 from numba import njit, typeof
 
 from gfm_hil.cli import main
+from gfm_hil.core.roles import ROLES
+from gfm_hil.engine import compiling_beside
 from gfm_hil.engine.compiling import Set, compile_sets, everything
 from gfm_hil.engine.setup import make_benches, unstarted_benches
 from gfm_hil.links import link_names
@@ -95,38 +98,37 @@ def test_loops_are_compiled_for_the_records_that_a_started_bench_has(make, conte
             assert [typeof(vars(a)[n]) for n in arrays] == [typeof(vars(b)[n]) for n in arrays]
 
 
-def _fresh(tmp_path: Path, code: str) -> list[str]:
-    """What a process with a cache of its own prints."""
-    begin = "from gfm_hil.engine import compiling_beside as beside, compiling; import sys\n"
-    return subprocess.run(
-        [sys.executable, "-c", begin + code], capture_output=True, text=True, check=True,
-        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
-    ).stdout.splitlines()  # fmt: skip
-
-
 _RUN = """
+from gfm_hil.engine.compiling import compiled_benches
 from gfm_hil.scenario.loading import check_scenario
 one = {"title": "test", "duration": 0.1, "link": {"type": "inproc"}}
-(bench,) = compiling.compiled_benches(check_scenario(one, "test"), print)
+compiled_benches(check_scenario(one, "test"), print)
 """
 
 
 @pytest.mark.full  # compiles a whole run
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one processor")
 def test_a_second_process_compiles_the_loop_meanwhile(tmp_path):
-    if len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("one processor")
-    said = _fresh(tmp_path, _RUN)
-    assert any("the operating point" in line for line in said)
-    assert not any("the loop of both sides" in line for line in said)
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", _RUN], capture_output=True, text=True, check=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        ).stdout
+        for _ in range(2)
+    )  # fmt: skip
+    assert "the operating point" in first and "the loop of both sides" not in first
     assert list(tmp_path.rglob("*_run_ticks*.nbc"))
-    assert _fresh(tmp_path, _RUN) == []
+    assert second == ""
 
 
-@pytest.mark.full  # compiles a whole run
-def test_a_second_process_that_dies_leaves_its_work_to_the_first(tmp_path):
-    code = "import shutil; beside.sys.executable = shutil.which('false')\n"
-    said = _fresh(tmp_path, code + _RUN)
-    assert any("the loop of both sides" in line for line in said)
+def test_a_second_process_that_dies_holds_nothing_up(make, monkeypatch):
+    monkeypatch.setattr(compiling_beside.sys, "executable", shutil.which("false"))
+    said: list[str] = []
+    with compiling_beside.Beside(make(), ROLES, said.append) as beside:
+        beside.begin("a set")
+        beside.wait()
+        beside.begin("another")  # which this process now compiles
+    assert said[0] == "a set" and said[-1] == "another"
 
 
 def cached(folder: Path) -> dict[Path, int]:
