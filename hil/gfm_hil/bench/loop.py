@@ -323,11 +323,11 @@ class InprocLoop:
         )
         self._rows = plant, controller
         step = b.controller.ctl, b.controller.laws, b.controller.states, b.controller.est
-        self._kept = [*b.plant.memory, *step, b.y, b.u]
+        records, out = b.plant.records, (b.y, b.u)  # first: its memory has what it calls
+        self._kept = [*b.plant.memory, *step, *out]
         self._start = [a.copy() for a in self._kept]
         self.whole()
         y, u = np.split(plant[:, : NY + NU].copy(), [NY], axis=1)
-        records, out = b.plant.records, (b.y, b.u)
         self._parts: dict[str, tuple[Callable[..., object], tuple[Any, ...]]] = {
             "plant": (plant_alone, (records, *out, u)),
             "controller": (controller_alone, (*step, *out, y)),
