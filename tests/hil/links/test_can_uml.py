@@ -10,6 +10,9 @@ import pytest
 
 pytestmark = [pytest.mark.apt, pytest.mark.uml]
 
+# how Linux 6.1 ends before its first program on processors with AMX, whose registers take 11 kB
+_LACKING = "ptrace set fp regs failed"
+
 
 @pytest.mark.skipif(
     "GFMHIL_UML" not in os.environ, reason="boots a kernel; GFMHIL_UML=1 asks for it"
@@ -17,6 +20,8 @@ pytestmark = [pytest.mark.apt, pytest.mark.uml]
 @pytest.mark.timeout(1500)
 def test_socketcan_and_netem_inside_user_mode_linux(uml_kernel):
     status, said = uml_kernel.result(timeout=1450)
+    if status == "" and _LACKING in said:
+        pytest.skip("user-mode Linux of this version has no room for this processor's registers")
     assert status == "0", said
     assert " passed" in said
     print(said)
