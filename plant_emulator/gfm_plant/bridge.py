@@ -43,6 +43,7 @@ from gfm_plant.series import (
     look,
     make_powers,
     normal,
+    of_leg,
 )
 from gfm_plant.solution import circuit, grid_source
 from gfm_plant.sparse import turned
@@ -250,7 +251,7 @@ def _over_peak(n: Any, c: int, r: Any, s: Any, end: int) -> float:
     interval."""
     most = 0.0
     for x in range(3):
-        most = max(most, abs(_of_leg(n, c, x, s.ends[end, 0], s.ends[end, 1])))
+        most = max(most, abs(of_leg(n, c, x, s.ends[end, 0], s.ends[end, 1])))
     return r.current * most - r.i_peak
 
 
@@ -379,7 +380,7 @@ def _stay(n: Any, r: Any, s: Any, path: Any, c: int, t: float) -> bool:
     for y in range(3):
         changes = s.next[y] <= at + _INSTANT
         if changes or s.flows[y] != 0:
-            i, slope = _of_leg(n, c, y, i_a, i_b), _of_leg(n, c, y, di_a, di_b)
+            i, slope = of_leg(n, c, y, i_a, i_b), of_leg(n, c, y, di_a, di_b)
             begin = i if s.flows[y] != 0 else i + slope * (at - t)
             end = i + slope * (at - t + (r.dead if changes else 0.0))
             if not (min(begin, end) > unsure or max(begin, end) < -unsure):
@@ -413,13 +414,6 @@ def _voltage(r: Any, s: Any, x: int, side: int, end: int, i: float) -> float:
 
 
 @inlined
-def _of_leg(n: Any, c: int, x: int, a: float, b: float) -> float:
-    """Return the part of a space vector a + jb of circuit c along the axis of leg x."""
-    axis = field(n, "leg_axis")[c, x]
-    return axis.real * a + axis.imag * b
-
-
-@inlined
 def _settle(plant: PlantRecords, k: int, c: int) -> None:
     """Find which devices of bridge k conduct, after its gates have changed or a current has become
     zero."""
@@ -428,7 +422,7 @@ def _settle(plant: PlantRecords, k: int, c: int) -> None:
     s.flows[0] = s.flows[1] = s.flows[2] = 0
     for x in range(3):
         if r.wide[s.gate[x]]:
-            along = r.current * _of_leg(n, c, x, s.ends[0, 0], s.ends[0, 1])
+            along = r.current * of_leg(n, c, x, s.ends[0, 0], s.ends[0, 1])
             if abs(along) > _NO_CURRENT:
                 s.flows[x] = 1 if along > 0.0 else -1
             else:
@@ -464,7 +458,7 @@ def _drives(n: Any, c: int, r: Any, s: Any) -> tuple[float, int, int]:
 def _against(n: Any, c: int, r: Any, s: Any, x: int, side: int, end: int) -> float:
     """Return by how much the voltage by which a current leaves, or enters, leg x is above the
     circuit's."""
-    outside = _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / (1.5 * r.leg)
+    outside = of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / (1.5 * r.leg)
     return _voltage(r, s, x, side, end, 0.0) - outside
 
 
@@ -488,9 +482,9 @@ def _beyond(n: Any, c: int, r: Any, s: Any, x: int, end: int) -> tuple[float, fl
     for y in range(3):
         if y != x:
             side = 1 if s.flows[y] < 0 else 0
-            i = r.current * _of_leg(n, c, y, s.ends[end, 0], s.ends[end, 1])
+            i = r.current * of_leg(n, c, y, s.ends[end, 0], s.ends[end, 1])
             mean += 0.5 * _voltage(r, s, y, side, end, i)
-    has = mean + _of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / r.leg
+    has = mean + of_leg(n, c, x, s.ends[end, 2], s.ends[end, 3]) / r.leg
     return _voltage(r, s, x, 0, end, 0.0) - has, has - _voltage(r, s, x, 1, end, 0.0)
 
 
@@ -514,7 +508,7 @@ def _end_current(plant: PlantRecords, k: int, c: int, x: int) -> None:
     """Take what rounding has left of leg x's current."""
     n, s = plant.net[0], plant.st[k]
     a, b, axis = s.ends[0, 0], s.ends[0, 1], field(n, "leg_axis")[c, x]
-    along = _of_leg(n, c, x, a, b)
+    along = of_leg(n, c, x, a, b)
     hold_current(plant, k, c, complex(a - along * axis.real, b - along * axis.imag))
 
 
@@ -648,7 +642,7 @@ def _excess(n: Any, c: int, r: Any, s: Any, what: int, end: int) -> float:
     """Return what is above zero where an event has happened, at an end of the interval, or a term
     of its series: rows of ``ends``."""
     if what < _OUT:
-        return -s.flows[what] * r.current * _of_leg(n, c, what, s.ends[end, 0], s.ends[end, 1])
+        return -s.flows[what] * r.current * of_leg(n, c, what, s.ends[end, 0], s.ends[end, 1])
     if what < _PAIR:
         return _beyond(n, c, r, s, what % 3, end)[0 if what < _IN else 1]
     if what < _PEAK:
@@ -657,7 +651,7 @@ def _excess(n: Any, c: int, r: Any, s: Any, what: int, end: int) -> float:
     one = 1.0 if end < 2 else 0.0
     if what < _LIMIT:
         sign = 1.0 if what < _PEAK + 3 else -1.0
-        i = _of_leg(n, c, (what - _PEAK) % 3, s.ends[end, 0], s.ends[end, 1])
+        i = of_leg(n, c, (what - _PEAK) % 3, s.ends[end, 0], s.ends[end, 1])
         return sign * r.current * i - one * r.i_peak
     below = one - s.ends[end, DC]
     asked = r.k_p * below + s.ends[end, REG]

@@ -651,3 +651,10 @@ def make_powers(plant: PlantRecords, c: int) -> None:
         A[s.slot, 0, column, 4], A[s.slot, 0, column + 1, 5] = link[c, 1, 0, 0], link[c, 1, 0, 1]
     _turn_grid(now, s.slot, field(now, "source_speed")[grid_source(n)])
     fill_powers(now, s.slot, 0)
+
+
+@inlined
+def of_leg(n: Any, c: int, x: int, a: float, b: float) -> float:
+    """Return the part of a space vector a + jb of circuit c along the axis of leg x."""
+    axis = field(n, "leg_axis")[c, x]
+    return axis.real * a + axis.imag * b

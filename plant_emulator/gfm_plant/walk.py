@@ -13,12 +13,12 @@ import numpy as np
 from gfm_plant.layout import EDGES, field
 from gfm_plant.powers import P
 from gfm_plant.records import PlantRecords
-from gfm_plant.series import DC, REG, is_plain, plain_tangent
+from gfm_plant.series import DC, REG, is_plain, of_leg, plain_tangent
 from gfm_plant.solution import integrals
 from gfm_plant.strides import serve, stride
 from gfm_runtime.compiled import compiled, inlined
 
-# of the voltage, by the legs at the upper rail, of which the first one counts 1, the second one 2
+# direction of the bridge's voltage by which legs are at the upper rail: leg k counts 2^k
 _ANGLES = np.exp(1j * np.pi / 3 * np.array([0, 0, 2, 1, 4, 5, 3, 0]))
 _ANGLES[[0, 7]] = 0.0
 _INSTANT = 1e-15  # s
@@ -83,7 +83,7 @@ def _set_gates(n: Any, c: int, r: Any, s: Any, t: float) -> int:
             s.on_at[leg] = r.dead + (e_1 if t >= e_1 else (max(e_0, 0.0) if t >= e_0 else 0.0))
         if s.on_at[leg] <= t:
             s.gate[leg], s.on_at[leg] = 2 * level, math.inf
-        into = _of_leg(n, c, leg, s.ends[0, 0], s.ends[0, 1]) < 0.0
+        into = of_leg(n, c, leg, s.ends[0, 0], s.ends[0, 1]) < 0.0
         rails += 1 << leg if s.gate[leg] == 2 or (s.gate[leg] == r.off and into) else 0
     return rails
 
@@ -100,7 +100,7 @@ def _look_ahead(plant: PlantRecords, c: int, t: float, end: float, rails: int) -
         e_0, e_1, on_at = s.edges[leg, 0], s.edges[leg, 1], s.on_at[leg]
         edge, stops = e_0 if t < e_0 else (e_1 if t < e_1 else math.inf), False
         if r.dead > 0.0:
-            i, slope = _of_leg(n, c, leg, i_a, i_b), _of_leg(n, c, leg, di_a, di_b)
+            i, slope = of_leg(n, c, leg, i_a, i_b), of_leg(n, c, leg, di_a, di_b)
             if s.gate[leg] == r.off:
                 then, unsure = i + slope * (on_at - t), (on_at - t) ** 2 * bends
                 if not (min(i, then) > unsure or max(i, then) < -unsure):
@@ -117,12 +117,6 @@ def _look_ahead(plant: PlantRecords, c: int, t: float, end: float, rails: int) -
             edge += 0.0 if stops else r.dead
         until = min(until, edge)
     return until
-
-
-@inlined
-def _of_leg(n: Any, c: int, leg: int, a: float, b: float) -> float:
-    axis = field(n, "leg_axis")[c, leg]
-    return axis.real * a + axis.imag * b
 
 
 @inlined

@@ -217,7 +217,8 @@ class FlowsOfPart(NamedTuple):
 
     @staticmethod
     def put_to(flows: NDArray[np.float64], k: int, here: Places) -> Places:
-        """Places, of which the network's are in ``flows``, (ticks, columns), from tick k on."""
+        """Return ``here`` with the network's rows in ``flows``, (ticks, columns), which begins with
+        tick k."""
         begin = flows.ctypes.data - k * flows.strides[0]
         widths = np.array([*here.widths[:2], flows.shape[1]])
         return here._replace(flows=np.array([begin]), widths=widths)
