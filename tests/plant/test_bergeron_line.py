@@ -51,7 +51,7 @@ def stepped(plant: Network, e: complex, duration: float) -> tuple[np.ndarray, np
     return np.array(rows), T_s * np.arange(len(rows))
 
 
-def exact(plant: Network, e: complex, duration: float, load: float, begins: float) -> np.ndarray:
+def exact(plant: Network, e: complex, duration: float, load: float) -> np.ndarray:
     """The same end by DOP853 of the delay equations, one delay after the other."""
     r, (_, one) = plant.par[0], plant.wiring.fed[0]
     w_b, Z, h, tau = OMEGA_B, one.Z, one.h, one.delay(OMEGA_B)
@@ -64,20 +64,18 @@ def exact(plant: Network, e: complex, duration: float, load: float, begins: floa
         return 0.5 * np.array([(1 + h) * a[1] + (1 - h) * a[0], (1 + h) * a[0] + (1 - h) * a[1]])
 
     times = [*np.arange(0.0, duration - 1e-12, tau), duration]
-    for a, b in pairwise([times[0], *(t for t in times[1:])]):
+    for a, b in pairwise(times):
 
         def slope(t: float, x: np.ndarray, past: Any = past) -> np.ndarray:
             i_f, v, i_o, v_m, v_n = x
-            E, drive = E_at(past, t), e if t >= begins else 0.0
+            E = E_at(past, t)
             return w_b * np.array([
-                (drive - v - r["R_f"] * i_f) / r["L_f"], (i_f - i_o) / r["C_f"],
+                (e - v - r["R_f"] * i_f) / r["L_f"], (i_f - i_o) / r["C_f"],
                 (v - v_m - r["R_g"] * i_o) / r["L_g"], (i_o - (v_m - E[0]) / Z) / C_M,
                 (-load * v_n - (v_n - E[1]) / Z) / C_N,
             ]) - 1j * w_b * x  # fmt: skip
 
-        found = solve_ivp(
-            slope, (a, b), x, "DOP853", rtol=1e-11, atol=1e-13, dense_output=True, max_step=1e-5
-        )
+        found = solve_ivp(slope, (a, b), x, "DOP853", rtol=1e-8, atol=1e-10, dense_output=True)
         x = found.y[:, -1]
 
         def past(t: float, sol: Any = found.sol, before: Any = past) -> np.ndarray:
@@ -87,15 +85,13 @@ def exact(plant: Network, e: complex, duration: float, load: float, begins: floa
 
 
 @pytest.mark.full  # compiles the plant for several converters
-@pytest.mark.parametrize(("load", "R"), [(0.0, 0.0), (1.0, 0.0), (50.0, 0.0), (0.8, 0.1)])
+@pytest.mark.parametrize(("load", "R"), [(0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (0.8, 0.1)])
 def test_against_the_delay_equations(load, R):
     """An open end, a matched one, one that is nearly shorted, and a lossy line; filter and banks
     ring at 0.6 to 1.3 kHz with the size of 1 to 4 p.u."""
-    errors = []
-    for T_s in (1e-4, 2.5e-5):  # pieces of 50 and of 25 us
-        plant = make(line(tau=5.3e-4, R=R), load, T_s)
-        rows, _ = stepped(plant, 1.0, 0.01)
-        errors.append(np.abs(rows[-1] - exact(plant, 1.0, 0.01, load, 0.0)).max())
+    plants = [make(line(tau=5.3e-4, R=R), load, T_s) for T_s in (1e-4, 2.5e-5)]
+    end = exact(plants[0], 1.0, 0.01, load)
+    errors = [np.abs(stepped(plant, 1.0, 0.01)[0][-1] - end).max() for plant in plants]
     assert errors[0] < 0.1 and 3.0 < errors[0] / errors[1] < 6.0
 
 
