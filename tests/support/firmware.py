@@ -25,6 +25,8 @@ from .laws import LAWS
 
 T_S = 1e-4
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+#: instructions on a Cortex-M4F in float32, unrolled: a law and its limits
+MOST = 300
 #: one of each error map, one without states, the most states
 SOME = ("vsg-1", "psc-dc", "dvoc", "hybrid-angle", "matching-2", "vsg-12")
 
