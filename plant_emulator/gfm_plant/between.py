@@ -13,9 +13,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gfm_plant.going_on import advance
 from gfm_plant.layout import field
 from gfm_plant.model import V_DC
+from gfm_plant.period import advance
 from gfm_plant.phases import along, stands
 from gfm_plant.records import I_F, I_O, PlantRecords, V
 from gfm_plant.solution import circuit, mirror_sources, own

@@ -8,10 +8,9 @@ exactly at every time, so this is the zero to rounding.
 import math
 from typing import Any
 
-from gfm_plant.going_on import advance
 from gfm_plant.joint import drop_dead, fault_phases
 from gfm_plant.layout import field
-from gfm_plant.period import go_back, keep
+from gfm_plant.period import advance, go_back, keep
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import circuit, enter, mirror_sources
 from gfm_runtime.compiled import compiled, inlined

@@ -5,27 +5,25 @@ The functions are compiled and allocate nothing. `plant` is the `PlantRecords` o
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import typeof
 from numpy.typing import NDArray
 
-from gfm_plant.clearing import advance_clearing, begin_clearing
-from gfm_plant.components import every_at_rest, every_tick
+from gfm_plant.by_address import call_at
+from gfm_plant.clearing import begin_clearing
+from gfm_plant.components import TICK, act_of_components, every_at_rest
 from gfm_plant.dc_link import limit_dc_source
-from gfm_plant.going_on import address_of, advance, call_at
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
-from gfm_plant.period import go_back, keep, length
+from gfm_plant.period import advance, go_back, keep, length
 from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
 from gfm_plant.records import COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
 from gfm_plant.solution import circuit, enter, mirror_sources, node_voltage, own
-from gfm_plant.synchro_check import WATCHING, watch
+from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.compiled import cached, compiled, inlined
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
@@ -107,21 +105,13 @@ def plant_command(plant: PlantRecords, k: int, u: NDArray[np.float64]) -> None:
 def plant_step(plant: PlantRecords) -> None:
     """Go on by one sampling period under the commands in the delay lines.
 
-    The loops reach it by an address in the plant's records: it is compiled once for all."""
+    The loops reach it by an address in the plant's records, see `ways`."""
     call_at(plant.net[0].step, plant, 0.0, 0.0)
 
 
-def find_step(plant: PlantRecords) -> int:
-    """Compile, or load, ``plant_step`` itself for such records, and return its address."""
-    return address_of(typeof(plant), _step_at)
-
-
-def _step_at(plant: Any, begin: float, end: float) -> None:
-    _step(plant[0])
-
-
 @compiled
-def _step(plant: PlantRecords) -> None:
+def whole_period(plant: PlantRecords) -> None:
+    """``plant_step`` itself."""
     n, now = plant.net[0], plant.now[0]
     keep(plant)
     if field(n, "unbalanced")[circuit(n, now)]:
@@ -129,7 +119,7 @@ def _step(plant: PlantRecords) -> None:
     for k in range(n.n_converters):
         plant.st[k].phase_sums[0] = math.nan
     if now.clearing:
-        advance_clearing(plant)
+        call_at(n.clear, plant, 0.0, 0.0)
     elif n.conversions > 1:
         _advance_converting(plant)
     else:
@@ -153,10 +143,10 @@ def _step(plant: PlantRecords) -> None:
         go_back(plant)
         trip(plant, worst, DIVERGED, largest)
         enter(n, now, plant.st[0].tick, circuit(n, now))
-    every_tick(plant, circuit(n, now), 0)
+    act_of_components(plant, TICK, circuit(n, now))
     advance_grid(now, n.T_s)
     if now.check == WATCHING:
-        watch(plant)
+        call_at(n.watch, plant, 0.0, 0.0)
     if now.contact:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s and begin_clearing(n, now):
@@ -215,7 +205,7 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     out[13], out[14] = r.current * i.real, r.current * i.imag
 
 
-@compiled
+@inlined
 def plant_options(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     """Write what a plant with options has besides `TRUTH` at this tick to out: with ``connections``
     p, q and V at the connection point, in the order of `CONNECTION`, which is behind the second
@@ -223,12 +213,20 @@ def plant_options(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None
     ``batteries`` the state of charge."""
     n, now = plant.net[0], plant.now[0]
     if n.connections != 0:
-        place, scale = CHECK_SIDES + k, plant.par[k].current
-        v = node_voltage(n, now, place, plant.st[k].tick)
-        i = field(now, "w")[field(n, "node_i")[place]]
-        out[0], out[1], out[2] = terminal(v.real, v.imag, scale * i.real, scale * i.imag)
+        call_at(n.connection, plant, k, 0.0)
+        out[0], out[1], out[2] = now.connection[0], now.connection[1], now.connection[2]
     if n.batteries != 0:
         out[len(out) - 1] = plant.st[k].soc
+
+
+@compiled
+def look_at_connection(plant: PlantRecords, k: int) -> None:
+    """Write p, q and V at the connection point of converter k to ``connection``."""
+    n, now, place = plant.net[0], plant.now[0], CHECK_SIDES + k
+    v, scale = node_voltage(n, now, place, plant.st[k].tick), plant.par[k].current
+    i = field(now, "w")[field(n, "node_i")[place]]
+    p, q, V = terminal(v.real, v.imag, scale * i.real, scale * i.imag)
+    now.connection[0], now.connection[1], now.connection[2] = p, q, V
 
 
 @compiled

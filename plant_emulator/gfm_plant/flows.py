@@ -7,11 +7,9 @@ reach them by an address in the plant's records: only who records a network comp
 
 from typing import Any
 
-from numba import typeof
-
+from gfm_plant.by_address import call_at
 from gfm_plant.clearing import contact_currents
 from gfm_plant.components import every_flow
-from gfm_plant.going_on import address_of, call_at
 from gfm_plant.layout import field
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import grid_source, node_voltage
@@ -47,15 +45,6 @@ def look_at_flows(plant: PlantRecords) -> None:
         out[j] = out[j + 1] = out[j + 2] = 0.0
         if n.flow_fault > 1 and (now.contact != 0 or now.joint != 0):
             out[j], out[j + 1], out[j + 2] = contact_currents(plant, 0.0, 0)
-
-
-def find_look(plant: PlantRecords) -> int:
-    """Compile, or load, ``look_at_flows`` for such records, and return its address."""
-    return address_of(typeof(plant), _look)
-
-
-def _look(plant: Any, begin: float, end: float) -> None:
-    look_at_flows(plant[0])
 
 
 @inlined

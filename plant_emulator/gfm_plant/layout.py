@@ -322,6 +322,7 @@ now_dtype = _header(
         ("check_seen", "f8", (3,)),
         ("check_lasted", "f8"),
         ("check_left", "f8"),
+        ("connection", "f8", (3,)),  # p, q and V of a converter's connection point, p.u.
     ],
     _NOW,
 )

@@ -68,8 +68,11 @@ CONNECTION = ("p_c", "q_c", "V_c")
 BATTERY = ("soc",)
 """State of charge of a battery behind the DC source, in [0, 1]."""
 
-ADDRESSES = ("step", "advance", "look")
-"""In a plant's records, those of functions, see `going_on`; of ``look`` 0: nothing is recorded."""
+ADDRESSES = (
+    "step", "advance", "components", "series", "sample", "connection", "look", "clear", "join",
+    "watch",
+)  # fmt: skip
+"""In a plant's records, those of functions, see `ways`; 0: it does not call that one."""
 
 THE_GRID, FIRST_LINE = "\0grid", "\0line"
 """In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""

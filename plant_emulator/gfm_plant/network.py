@@ -17,9 +17,7 @@ from gfm_plant.circuit import Branch
 from gfm_plant.components import DYNAMIC
 from gfm_plant.components.part import Dynamic, Fed
 from gfm_plant.contacts import OWN_PATH, join
-from gfm_plant.emulator import find_step, plant_start, reconnect
-from gfm_plant.flows import find_look
-from gfm_plant.going_on import find_address
+from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
 from gfm_plant.names import ADDRESSES
@@ -27,6 +25,7 @@ from gfm_plant.phases import convert_nothing
 from gfm_plant.port import pack_port
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.sparse import pack_sparse
+from gfm_plant.ways import find_ways
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
@@ -65,9 +64,7 @@ class Network:
     def records(self) -> PlantRecords:
         """The same memory, as the compiled functions take it."""
         records = self.typed
-        self.net["step"] = find_step(records)
-        self.net["advance"] = find_address(records)
-        self.net["look"] = find_look(records) if self.wiring.recorded else 0
+        find_ways(records, self.wiring)
         return records
 
     @property
@@ -208,7 +205,9 @@ class Network:
         now["clearing"] = bool(wiring.opening) or opens * (now["contact"][0] > 0)
         if before.grid is None and self._leader() is None:  # the last machine is gone
             self.now["omega_g_slope"] = 0.0
-        reconnect(self.records)
+        if "records" not in vars(self):  # it has no ticks yet
+            find_ways(self.typed, wiring, ("join",))
+        reconnect(self.typed)
 
     def conducting(self) -> dict[str, tuple[str, int]]:
         """The phases of each contact that conduct, and whether they open as their currents pass
@@ -245,6 +244,8 @@ class Network:
         _connect(changed, wiring)
         changed.wiring = wiring
         self.restore(changed)
+        if "records" in vars(self):  # else they are made with all that this wiring needs
+            find_ways(self.records, wiring)
 
 
 def _bytes(record: Record) -> NDArray[np.uint8]:

@@ -7,12 +7,14 @@ The functions are as those of `gfm_plant.emulator`.
 import math
 from typing import Any
 
+from gfm_plant.by_address import call_at
 from gfm_plant.components import (
+    GO_BACK,
+    KEEP,
+    act_of_components,
     every_begin,
     every_drive,
     every_end,
-    every_go_back,
-    every_keep,
     every_middle,
 )
 from gfm_plant.dc_link import advance_dc_link
@@ -32,6 +34,14 @@ from gfm_plant.solution import (
     state,
 )
 from gfm_runtime.compiled import compiled, inlined, inlined_as
+
+
+@inlined
+def advance(plant: PlantRecords, begin: float, end: float) -> None:
+    """Go on between two instants of the period, s after its beginning; inf: to its end.
+
+    It reaches the plant's way by an address in its records, see `ways`."""
+    call_at(plant.net[0].advance, plant, begin, end)
 
 
 @inlined
@@ -55,7 +65,7 @@ def keep(plant: PlantRecords) -> None:
     w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
         w_before[i] = w[i]
-    every_keep(plant, circuit(n, now), 0)
+    act_of_components(plant, KEEP, circuit(n, now))
 
 
 @compiled
@@ -79,7 +89,7 @@ def go_back(plant: PlantRecords) -> None:
     w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
         w[i] = w_before[i]
-    every_go_back(plant, circuit(n, now), 0)
+    act_of_components(plant, GO_BACK, circuit(n, now))
 
 
 @inlined

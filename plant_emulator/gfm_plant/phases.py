@@ -35,9 +35,9 @@ def along(x: int, z: complex) -> float:
 
 
 @compiled
-def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: int) -> None:
-    """Write the counts of converter k's A/D at this tick to y from ``first`` on, in the order of
-    the signal table's group ``adc``.
+def read_phases(plant: PlantRecords, k: int) -> None:
+    """Have the counts of converter k's A/D at this tick in ``phase_sums``, in the order of the
+    signal table's group ``adc``.
 
     Several conversions are those since the last tick, see ``convert``; where that has no instants
     between, at the start and in a period that clears a fault, all are at the tick.
@@ -46,8 +46,6 @@ def sample_phases(plant: PlantRecords, k: int, y: NDArray[np.float64], first: in
     if math.isnan(s.phase_sums[0]):
         for m in range(plant.par[k].phase_samples):
             convert(plant, k, m, 0.0)
-    for j in range(N_PHASES):
-        y[first + j] = s.phase_sums[j]
 
 
 @compiled

@@ -170,7 +170,7 @@ def _look_back(plant: PlantRecords, k: int, i: float) -> None:
     s.ring[place, 0], s.ring[place, 1] = s.sums[0], s.sums[1]
 
 
-@compiled
+@inlined
 def _watch(plant: PlantRecords, k: int, what: int, value: float, sign: float) -> None:
     r, s = plant.par[k], plant.st[k]
     if r.trip_ticks[what] < 0 or sign * (value - r.trip_limit[what]) <= 0.0:

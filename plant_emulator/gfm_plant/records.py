@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfm_plant.layout import Record as Record
+from gfm_runtime.signals import NY_INNER
 
 MAX_DELAY = 5  # samples; a fraction of one may come on top
 N_OWN = 3  # states of the circuit that a converter brings: i_f, v, i_o
@@ -152,6 +153,7 @@ converter_state_dtype = np.dtype(
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
+        ("reads", "f8", (NY_INNER,)),  # what the A/D of `sensors` gave last, p.u.
         # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
         ("phase_seen", "f8", (2, N_PHASES)),
         ("phase_sums", "f8", (N_PHASES,)),  # of this period's conversions, NaN if there were none

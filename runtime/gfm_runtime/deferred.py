@@ -30,7 +30,7 @@ from numba.core.funcdesc import default_mangler
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering
-from numba.core.types import Boolean, Function, Number
+from numba.core.types import Boolean, Function, Number, unliteral
 from numba.core.typing.context import Context
 
 
@@ -317,7 +317,10 @@ class DeferredDispatcher(CPUDispatcher):
     _replaced: tuple[Any, ...] = ()  # Python goes on to call them
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """As numba asks for it where a function that it compiles calls this one."""
+        """As numba asks for it where a function that it compiles calls this one.
+
+        numba would compile it anew for each number that someone passes: to it, 0 is a type."""
+        args = tuple(map(unliteral, args))
         with global_compiler_lock:
             before, self._inside = self._inside, True
             try:

@@ -31,9 +31,9 @@ from gfm_plant.circuit import (
     find_rates,
 )
 from gfm_plant.components import NetworkParts
-from gfm_plant.going_on import advance
 from gfm_plant.model import V_DC
 from gfm_plant.options import Grid
+from gfm_plant.period import advance
 from gfm_plant.protection import trip
 
 from ..support.switched import Reference

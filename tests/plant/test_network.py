@@ -24,7 +24,7 @@ from gfm_plant.circuit import Shunt
 from gfm_plant.components import Machine
 from gfm_plant.grid import fault, line_breaker, phase_jump
 from gfm_plant.model import DELTA, V_DC
-from gfm_plant.names import TRIPS
+from gfm_plant.names import ADDRESSES, TRIPS
 
 pytestmark = pytest.mark.full  # compiles the plant for several converters
 
@@ -262,6 +262,28 @@ def test_a_load_that_is_off_draws_nothing_and_a_line_that_opens_no_current():
     k = plant.wiring.order.index("m")
     go(plant, u, 300)  # pole by pole
     assert plant.now["w"][0, k] == 0.0
+
+
+def test_what_faults_and_components_call_is_compiled_for_plants_that_have_them():
+    line = {"l": {"start": "bus", "end": "far", "L": 0.3, "R": 0.02}}
+    load = {
+        "constant_power": {"c": {"node": "bus", "P": 0.1}},
+        "capacitors": {"bank": {"node": "bus", "Q": 0.1}},
+    }
+    plain = make({"a": ({}, "bus")}, grid="far", lines=line)
+    fed = make({"a": ({}, "bus")}, grid="far", lines=line, **load)
+    assert fed.records.net is not None and go(plain, start(plain, 1.0, 0.1), 1) is None
+
+    def called(plant: Network) -> set[str]:
+        return {name for name in ADDRESSES if plant.net[0][name]}
+
+    assert called(plain) == {"step", "advance", "sample"}
+    assert called(fed) == {"step", "advance", "sample", "components"}
+    fault(plain, None, 0.01, node="bus")
+    assert called(plain) == {"step", "advance", "sample", "clear", "join"}
+    copied = plain.copy()
+    plain.restore(copied)
+    assert called(plain) == called(copied)
 
 
 def test_delays_of_different_length_cut_the_period():

@@ -34,6 +34,19 @@ def test_arrays_come_in_and_views_of_them_are_had(decorator):
     assert tick(x) == 1 + 2 + 4 + 5
 
 
+def test_another_number_is_no_other_type():
+    @compiled
+    def twice(k):
+        return 2 * k
+
+    @compiled
+    def several(k):
+        return twice(0) + twice(1) + twice(k)
+
+    assert several(3) == 8
+    assert len(twice.overloads) == 1
+
+
 def test_any_change_of_compiled_code_makes_numba_compile_again():
     """A compiled function contains its callees, so its cache is as old as the oldest of them."""
     from gfm_hil.engine.plant_ticks import plant_ticks

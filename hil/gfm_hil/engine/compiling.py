@@ -25,8 +25,7 @@ from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
-from gfm_plant.emulator import find_step
-from gfm_plant.going_on import find_address
+from gfm_plant.ways import find_ways
 from gfm_runtime.compiled import wheel_code
 
 
@@ -86,23 +85,23 @@ def compiled_benches(
         UserError: as ``make_benches``.
     """
     found: list[Bench] = []
+    first, second = _shares(scenario, roles, lambda: found)
     with Beside(scenario, [*roles], notice) as beside:
         sets = [Set(_START, lambda: found.extend(make_benches(scenario)))]
         if "plant" in roles:
-            sets.append(Set(_PERIOD, lambda: find_step(found[0].plant.typed)))
-        sets.append(Set("the loops", beside.wait))
-        compile_sets([*sets, *_loops(scenario, roles, lambda: found)], beside.begin)
+            sets.append(Set(_PERIOD, lambda: _find_ways(found[0])))
+        sets += [*first, Set("the loops", beside.wait), *second]
+        compile_sets(sets, beside.begin)
     return found
 
 
-def compile_loops_alone(scenario: Scenario, roles: Iterable[Role]) -> None:
-    """Compile the loops of a scenario, and how its plant goes on between two instants, without the
-    operating point. Arguments and errors as of ``compiled_benches``."""
+def compile_share(scenario: Scenario, roles: Iterable[Role]) -> None:
+    """Compile what the second process does of a scenario, without its operating point. Arguments
+    and errors as of ``compiled_benches``."""
     benches = _unstarted(scenario)
-    for one in _loops(scenario, roles, lambda: benches):
+    _, second = _shares(scenario, roles, lambda: benches)
+    for one in second:
         one.compile()
-    if "plant" in roles:
-        find_address(benches[0].plant.typed)
 
 
 def _unstarted(scenario: Scenario) -> list[Bench]:
@@ -111,21 +110,38 @@ def _unstarted(scenario: Scenario) -> list[Bench]:
     return [b for b in benches if scenario.converter in (None, b.scenario.converter)]
 
 
-def _loops(
+def _shares(
     scenario: Scenario, roles: Iterable[Role], found: Callable[[], list[Bench]]
-) -> list[Set]:
-    """What the ticks of a scenario call."""
+) -> tuple[list[Set], list[Set]]:
+    """What the ticks of a scenario call, in shares for two processes, of which the first compiles
+    the operating point and the plant's period besides."""
+    first, second = list[Set](), list[Set]()
     if scenario.in_process:
-        sets = [_both(found)]
+        second.append(_both(found))
     else:
-        sets = [_role(role, found) for role in roles]
+        second += [_role(role, found) for role in sorted(roles)]
+        if len(second) > 1:
+            first.append(second.pop())  # that of the plant
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
-        sets += [_link(link.type, link.options, scenario.carries) for link in links.values()]
+        second += [_link(link.type, link.options, scenario.carries) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
-            sets.append(_IMPAIRMENT)
+            second.append(_IMPAIRMENT)
         if scenario.mode == "realtime":
-            sets.append(_IDLE)
-    return sets
+            second.append(_IDLE)
+    # an operator may have anything happen, and in real time nobody waits until it is compiled
+    foreseen = any(event.opens_phases for event in scenario.events)
+    if "plant" in roles and (scenario.mode == "realtime" or foreseen):
+        second.append(Set(_EVENTS, lambda: [*map(_find_event_ways, found())]))
+    return first, second
+
+
+def _find_ways(bench: Bench) -> None:
+    find_ways(bench.plant.typed, bench.plant.wiring)
+
+
+def _find_event_ways(bench: Bench) -> None:
+    plant = bench.plant
+    find_ways(plant.typed, plant.wiring, ("clear", "join", "watch"), all_events=True)
 
 
 def everything() -> list[Set]:
@@ -137,21 +153,23 @@ def everything() -> list[Set]:
     def found() -> list[Bench]:
         return _unstarted(Scenario(title="warm-up", duration=1.0))
 
-    def between(dynamic: int) -> None:
+    def between(large: int) -> None:
         plant = found()[0].plant.copy()
-        plant.net["n_dynamic"] = dynamic
-        find_address(plant.typed)
+        for name in ("n_dynamic", "sparse", "connections"):
+            plant.net[name] = large
+        find_ways(plant.typed, plant.wiring)
 
     return [
-        Set(_PERIOD, lambda: find_step(found()[0].plant.typed)),
+        Set(_PERIOD, lambda: find_ways(found()[0].plant.typed, found()[0].plant.wiring, ("step",))),
         Set(_START, lambda: make_bench(Scenario(title="warm-up", duration=1.0))),
         *(_link(name, {}) for name in link_names()),
         _IMPAIRMENT,
         _IDLE,
         *(_role(role, found) for role in reversed(ROLES)),
         Set("the operating point of an inner stage", lambda: make_bench(limited), (_START,)),
-        Set("the plant between two instants", lambda: between(0)),
+        Set("the plant between two instants", lambda: between(0), (_PERIOD,)),
         Set("the components of networks", lambda: between(1), (_PERIOD,)),
+        Set(_EVENTS, lambda: _find_event_ways(found()[0])),
         _both(found),
     ]
 
@@ -178,6 +196,7 @@ def compile_external(
 
 _START = "the operating point"
 _PERIOD = "the plant's period"
+_EVENTS = "what faults and breakers call"
 _IDLE = Set("the thread that keeps a processor busy", prevent_idle.warm_up)
 _IMPAIRMENT = Set("a link's impairment", impaired.warm_up)
 

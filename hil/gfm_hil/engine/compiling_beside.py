@@ -61,8 +61,8 @@ class Beside:
 
 
 if __name__ == "__main__":
-    from gfm_hil.engine.compiling import compile_loops_alone
+    from gfm_hil.engine.compiling import compile_share
     from gfm_runtime.children import end_with_parent
 
     end_with_parent()
-    compile_loops_alone(*pickle.load(sys.stdin.buffer))
+    compile_share(*pickle.load(sys.stdin.buffer))

@@ -16,7 +16,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads scipy.signal, which takes as long as all the rest, when it is first used
+import scipy  # loads its parts when they are first used
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import Columns
@@ -179,13 +179,19 @@ def _thinned(x: Vector, stride: int) -> Vector:
 
 @cache
 def _filter(stride: int) -> Vector:
-    """Weights of a window's ticks in order, in rows of ``stride``; zeros fill the last one."""
+    """Weights of a window's ticks in order, in rows of ``stride``; zeros fill the last one.
+
+    They are ``minimum_phase(firwin(taps, 0.8 / stride), half=False)`` of ``scipy.signal``, whose
+    import takes half a second in every run.
+    """
     taps = _TAPS * stride + 1
-    least = scipy.signal.minimum_phase(
-        scipy.signal.firwin(taps, 0.8 / stride),
-        n_fft=scipy.fft.next_fast_len(32 * taps),
-        half=False,
-    )
+    n = scipy.fft.next_fast_len(32 * taps)
+    steep = np.sinc(0.8 / stride * (np.arange(taps) - (taps - 1) / 2)) * np.hamming(taps)
+    size = np.abs(np.fft.fft(steep / steep.sum(), n))
+    fold = np.zeros(n)  # the cepstrum of what is one-sided
+    fold[0], fold[1 : n // 2], fold[n // 2 : n // 2 + n % 2] = 1.0, 2.0, 1.0
+    cepstrum = np.fft.ifft(np.log(size + 1e-7 * size[size > 0].min())).real * fold
+    least = np.fft.ifft(np.exp(np.fft.fft(cepstrum))).real[:taps]
     return np.pad(least / least.sum(), (0, stride - 1)).reshape(_TAPS + 1, stride)
 
 

@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from pydantic import Field
 
+from gfm_plant.by_address import call_at
 from gfm_plant.components.bergeron_line import BergeronLine
 from gfm_plant.components.capacitor_bank import CapacitorBank
 from gfm_plant.components.constant_power import ConstantPowerLoad
@@ -21,7 +22,7 @@ from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
 from gfm_plant.parameters import Options
-from gfm_runtime.compiled import inlined_as
+from gfm_runtime.compiled import compiled, inlined, inlined_as
 
 
 class NetworkParts(Options):
@@ -121,7 +122,28 @@ def _link(hook: str, call: Callable[..., None], k: int, others: Callable[..., No
     return inlined_as(f"every_{hook}_{k}", link)
 
 
-every_at_rest, every_keep, every_go_back = _every("at_rest"), _every("keep"), _every("go_back")
+every_at_rest, every_flow = _every("at_rest"), _every("flow")
 every_begin, every_drive = _every("begin"), _every("drive")
-every_middle, every_end, every_tick = _every("middle"), _every("end"), _every("tick")
-every_flow = _every("flow")
+every_middle, every_end = _every("middle"), _every("end")
+_every_keep, _every_go_back, _every_tick = _every("keep"), _every("go_back"), _every("tick")
+
+KEEP, GO_BACK, TICK = range(3)
+"""What all components do around a sampling period, see ``Dynamic.hooks``."""
+
+
+@compiled
+def components_act(plant: Any, act: int, c: int) -> None:
+    """Have all components keep their states, go back to them, or end a period, in circuit c."""
+    if act == KEEP:
+        _every_keep(plant, c, 0)
+    elif act == GO_BACK:
+        _every_go_back(plant, c, 0)
+    else:
+        _every_tick(plant, c, 0)
+
+
+@inlined
+def act_of_components(plant: Any, act: int, c: int) -> None:
+    """``components_act``, which only a plant with components compiles."""
+    if plant.net[0].n_dynamic > 0:
+        call_at(plant.net[0].components, plant, act, c)

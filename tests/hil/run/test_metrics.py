@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,7 +13,7 @@ from gfm_hil.api.law import as_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.cycles import cycle_means
 from gfm_hil.run.metrics import METRICS, event_metrics
-from gfm_hil.run.modes import Acting, acting, fast_mode, free_from, swing
+from gfm_hil.run.modes import _TAPS, Acting, _filter, acting, fast_mode, free_from, swing
 from gfm_hil.scenario import check_scenario
 
 T_s, F_N = 1e-3, 50.0
@@ -203,6 +204,17 @@ def test_a_fast_mode_is_found_beside_a_larger_swing_without_aliasing(hertz, sigm
     assert found.damping == pytest.approx(-sigma / math.hypot(sigma, 2 * np.pi * hertz), abs=1e-5)
     assert swings.hz == pytest.approx(3.0, rel=1e-3)
     assert swings.damping == pytest.approx(3 / math.hypot(3, 6 * np.pi), abs=1e-3)
+
+
+@pytest.mark.parametrize("stride", [2, 10, 33])
+def test_the_low_pass_is_that_of_scipy(stride):
+    taps = _TAPS * stride + 1
+    steep = scipy.signal.firwin(taps, 0.8 / stride)
+    n = scipy.fft.next_fast_len(32 * taps)
+    least = scipy.signal.minimum_phase(steep, n_fft=n, half=False)
+    weights = _filter(stride).ravel()
+    assert weights[:taps] == pytest.approx(least / least.sum(), abs=1e-13)
+    assert not weights[taps:].any()
 
 
 def test_the_offset_of_the_line_is_no_swing():

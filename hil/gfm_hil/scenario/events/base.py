@@ -46,6 +46,7 @@ class Event(StrictSchema):
     """One event at its time; each kind adds ``type``, its fields and what it does."""
 
     side: ClassVar[Role]  # who carries it out
+    opens_phases: ClassVar[bool] = False  # whether the plant opens contacts for it, or checks them
     changes_law: ClassVar[bool] = False  # whether it replaces the law in force, or its gains
     if TYPE_CHECKING:
         type: str  # a Literal of each kind

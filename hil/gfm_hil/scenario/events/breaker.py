@@ -45,6 +45,8 @@ class SynchroCheck(StrictSchema):
 class Switch(PlantEvent):
     """A breaker: that of the grid, or one with a ``name``."""
 
+    opens_phases = True
+
     closed: bool = Field(description="false opens it")
     check: SynchroCheck | None = Field(
         None, description="closes once both sides agree, by a synchro-check; at once if none"

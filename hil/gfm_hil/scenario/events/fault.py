@@ -15,6 +15,8 @@ class Fault(PlantEvent):
     """A fault on a line, or at a node of a network, through ``R`` [p.u.]: three phases or one (LG)
     or two (LLG) to ground, or two to each other (LL)."""
 
+    opens_phases = True
+
     type: Literal["fault"] = Field(description="kind of event")
     position: float | None = Field(
         None,
