@@ -101,8 +101,8 @@ def test_a_period_by_strides_is_exact(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
-def test_two_cycles_are_exact(name):
-    worst, _ = error(400, *CASES[name])
+def test_a_cycle_is_exact(name):
+    worst, _ = error(200, *CASES[name])
     assert worst < 2e-12
 
 

@@ -196,7 +196,7 @@ def test_a_killed_benchmark_leaves_nothing_behind(line, tmp_path):
             while processes_with(mark) < 4 + len(os.sched_getaffinity(0)):
                 assert process.poll() is None and time.monotonic() < until
                 time.sleep(0.2)
-            time.sleep(5)
+            time.sleep(1)
         finally:
             process.kill()
     until = time.monotonic() + 60

@@ -13,7 +13,7 @@ from ...support.firmware import cc
 from .conftest import SOURCE
 
 TEST = """\
-title = "Three events from one start"
+title = "Two parts from one start"
 f_n = 50.0
 source = { document = "ours", clause = "1", revision = "1", known = "ours" }
 [scenario]
@@ -27,13 +27,8 @@ scenario = { events = [{ t = 0.2, type = "grid-phase-jump", degrees = 5.0 }] }
 name = "fault"
 scenario = { duration = 0.6, events = [
     { t = 0.21, type = "fault", position = 0.5, R = 0.2, duration = 0.1 },
+    { t = 0.4, type = "grid-frequency", f_hz = 49.9, rate = 1.0 },
 ] }
-[[parts]]
-name = "ramp"
-scenario = { events = [{ t = 0.2, type = "grid-frequency", f_hz = 49.9, rate = 1.0 }] }
-[[parts]]
-name = "other-power"
-scenario = { references = { P_ref = 0.3 } }
 [[criteria]]
 kind = "no_trip"
 clause = "rides through"
@@ -44,6 +39,11 @@ at = [0.2]
 signal = "p"
 low = 0.4
 high = 0.6
+"""
+OTHER_POWER = """
+[[parts]]
+name = "other-power"
+scenario = { references = { P_ref = 0.3 } }
 """
 CONVERTER = """\
 droop = 0.01
@@ -56,9 +56,11 @@ sensors = { noise_std = { p = 1e-3 } }
 """
 
 
-def conform(tmp_path: Path, model: str, settle_s: float, more: str = "") -> gfmhil.Conformity:
-    for name, text in (("test", TEST), ("converter", CONVERTER)):
-        (tmp_path / f"{name}.toml").write_text(text)
+def conform(
+    tmp_path: Path, model: str, settle_s: float, more: str = "", parts: str = ""
+) -> gfmhil.Conformity:
+    (tmp_path / "test.toml").write_text(TEST + parts)
+    (tmp_path / "converter.toml").write_text(CONVERTER)
     (tmp_path / "map.toml").write_text(f"settle_s = {settle_s}\n{more}")
     return gfmhil.conform(
         against=tmp_path / "test.toml", controller=model, converter=tmp_path / "converter.toml",
@@ -87,18 +89,18 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
 
 @pytest.mark.apt
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("settle_s", [0.0, 0.1])
+@pytest.mark.parametrize(("settle_s", "parts"), [(0.0, ""), (0.1, OTHER_POWER)])
 def test_runs_from_one_start_have_the_bits_of_whole_runs(
-    exported, settle_s, tmp_path, monkeypatch, shared
+    exported, settle_s, parts, tmp_path, monkeypatch, shared
 ):
     """Noise, a fault and a ramp of the grid; the part with another power has a run of its own."""
     model = exported("dll", "vsg-2", "none")
-    found = conform(tmp_path, model, settle_s)
+    found = conform(tmp_path, model, settle_s, parts=parts)
     assert shared == [(f"{round((0.2 + settle_s) * 1e4)} ticks", True)]
-    assert [part.status for part in found.parts] == ["completed"] * 4
-    assert len({part.recording for part in found.parts}) == 4
+    assert [part.status for part in found.parts] == ["completed"] * (3 if parts else 2)
+    assert len({part.recording for part in found.parts}) == len(found.parts)
     monkeypatch.setattr(execute, "share_starts", lambda jobs, *_: [*jobs])
-    assert told(conform(tmp_path, model, settle_s)) == told(found)
+    assert told(conform(tmp_path, model, settle_s, parts=parts)) == told(found)
 
 
 @pytest.mark.apt

@@ -120,7 +120,7 @@ def test_role_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
     plant.send_signal(signal.SIGSTOP)
     time.sleep(1.5)  # it may still send what it computed before the stop
     manager.lines()
-    time.sleep(3.0)
+    time.sleep(1.0)
     assert manager.lines() == []
     plant.send_signal(signal.SIGCONT)
     manager.wait_for("WATCHDOG=1")
