@@ -19,7 +19,7 @@ from gfm_runtime.kernel import state_dtype, step
 from gfm_runtime.states import BAD_U, BAD_Y, OK
 
 from ..support import firmware
-from ..support.firmware import MOST, SOME, STAGED, T_S, cc, exported
+from ..support.firmware import FEW_STAGED, MOST, SOME, STAGED, T_S, cc, exported
 from ..support.laws import LAWS, REF, wander
 
 pytestmark = [pytest.mark.compilers, pytest.mark.timeout(900)]
@@ -37,7 +37,7 @@ STRICT = [*firmware.STRICT, "-Wdouble-promotion", "-ffp-contract=off"]
 
 #: plain laws, and laws with inner stages; and of each kind those of which the code differs most
 KINDS = {"plain": LAWS, "staged": STAGED}
-FEW = {"plain": SOME, "staged": [n for n in STAGED if n.startswith("vsg-2") or n.endswith("angle")]}
+FEW = {"plain": SOME, "staged": FEW_STAGED}
 Folder = Callable[..., Path]
 
 
@@ -91,6 +91,7 @@ def test_every_law_has_the_kernels_bits(folder, kind, target, real, style, flags
     [
         pytest.param("host", "float32", "-O3 -march=haswell", marks=FUSES),
         pytest.param("host", "float64", "-O3 -march=haswell", marks=FUSES),
+        ("m4f", "float32", "-O2"),
     ],
 )
 def test_fused_multiply_add_is_found(tmp_path, capsys, target, real, flags):

@@ -27,7 +27,8 @@ from gfm_hil.cli import main
 from gfm_hil.cli.main import parser
 from gfm_runtime import law_names
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone]
+pytestmark = pytest.mark.processes
+alone = pytest.mark.alone  # what measures keeps all processors busy
 
 NONE = ("--peers", "none")
 KEYS = {
@@ -45,6 +46,7 @@ def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, An
     return dict(printed)
 
 
+@alone
 @pytest.mark.apt
 def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
     found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02", *NONE)
@@ -65,6 +67,7 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
     assert found["environment"]["cpus"] == len(os.sched_getaffinity(0))
 
 
+@alone
 @pytest.mark.apt
 def test_every_peer_answers_beside_its_limit(tmp_path, capsys):
     short = ("--seconds", "0.05", "--load", "idle", "--mode", "lockstep")
@@ -152,6 +155,7 @@ def test_agreement_is_told_where_the_rounds_can_tell(p99, verdict):
     assert f": {verdict}" in _agrees({"to_ours": {"p50": [1.0, 0.9, 1.1], "p99": p99}})
 
 
+@alone
 def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
     options = ("jitter", "--seconds", "0.02", "--policy", "other", "--load", "idle")
     rows = bench(tmp_path, capsys, *options)["jitter"]
@@ -169,6 +173,7 @@ def test_jitter_shows_every_way_to_wait(tmp_path, capsys):
         assert row["lost_pct"] == pytest.approx(100 * row["lost"] / row["ticks"], abs=1e-3)
 
 
+@alone
 def test_sweep_has_every_payload_rate_load_and_wait(tmp_path, capsys):
     short = ("--seconds", "0.02", "--policy", "other", "--links", "shm", *NONE)
     axes = (
@@ -203,6 +208,7 @@ def test_the_highest_rate_is_found_by_bisection(bears_to, found):
     assert rate is found or (rate == pytest.approx(found, rel=0.1) and rate <= found)
 
 
+@alone
 def test_loop_runs_the_product_over_a_link(tmp_path, capsys):
     loop = bench(
         tmp_path, capsys, "loop", "--links", "shm", "--laws", "mimo-gfm", "--seconds", "1",
@@ -222,6 +228,7 @@ def test_loop_runs_the_product_over_a_link(tmp_path, capsys):
         assert row["allocations_per_tick"] == 0
 
 
+@alone
 def test_loop_that_trips_is_not_timed(tmp_path, capsys):
     line = ["bench", "loop", "--laws", "dvoc", "--mode", "lockstep", "--rounds", "1"]
     line += ["--links", "shm", "--seconds", "0.1"]
@@ -229,6 +236,7 @@ def test_loop_that_trips_is_not_timed(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("gfmhil: dvoc: tripped or safe at tick ")
 
 
+@alone
 def test_without_a_compiler_the_links_are_measured_alone(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     found = bench(
@@ -248,6 +256,7 @@ def processes_with(mark: str) -> int:
     return found
 
 
+@alone
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     (
@@ -278,6 +287,7 @@ def test_ctrl_c_leaves_nothing_behind(kind, everyone, tmp_path):
     assert processes_with(mark) == 0
 
 
+@alone
 def test_a_killed_benchmark_leaves_no_cpu_load(tmp_path):
     """The load's processes are stopped when their parent is killed: SIGTERM would not end them."""
     mark = f"GFMHIL_TEST={uuid.uuid4()}"

@@ -19,9 +19,9 @@ from gfm_hil.cli import main
 from gfm_hil.scenario import write_scenario
 from gfm_runtime.children import guarded
 
-from .test_bench import bench, processes_with
+from .test_bench import alone, bench, processes_with
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone]
+pytestmark = pytest.mark.processes
 
 GFMHIL = [sys.executable, "-m", "gfm_hil"]
 SHORT = ("--seconds", "0.05", "--load", "idle")
@@ -40,6 +40,7 @@ def other_side(*line):
             process.terminate()
 
 
+@alone
 @pytest.mark.parametrize("link", ["tcp", "udp", "shm", "pty", "can"])
 def test_both_ways_over_every_link(link, tmp_path, capsys):
     place, port = uuid.uuid4().hex, free_port()
@@ -92,6 +93,7 @@ while True:
 """
 
 
+@alone
 def test_ways_that_differ_through_a_relay(tmp_path, capsys):
     """1 ms there and 0.2 ms back, 0.05 ms of jitter, 1 % lost."""
     near, far = free_port(), free_port()
@@ -112,6 +114,7 @@ def test_ways_that_differ_through_a_relay(tmp_path, capsys):
     assert row["lost_pct_95"] == pytest.approx([100 * exact.low, 100 * exact.high], abs=1e-3)
 
 
+@alone
 def test_a_program_of_docs_own_controller(tmp_path, capsys):
     endpoint = f"ipc://{tmp_path}/own"
     write_scenario(tmp_path, scenario_of())
@@ -124,6 +127,7 @@ def test_a_program_of_docs_own_controller(tmp_path, capsys):
     assert row["n"] == row["sent"] - row["lost"] > 0 and "clock" not in row
 
 
+@alone
 @pytest.mark.apt
 def test_a_controller_that_the_bench_starts(tmp_path, capsys):
     assert main(["firmware", "dll", "vsg-2", "--out", str(tmp_path / "law")]) == 0
@@ -174,6 +178,7 @@ def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
     assert "the plant runs another version of the signal table" in answerer
 
 
+@alone
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize(
     "line",

@@ -116,7 +116,7 @@ def test_over_links_a_run_is_that_in_process(link, tmp_path):
 
 def test_a_controller_that_is_killed_trips_its_converter_and_no_other(tmp_path):
     folder = tmp_path / "run"
-    with started(folder, content(duration=150.0, link=over("shm", 3.0))) as process:
+    with started(folder, content(duration=150.0, link=over("zmq", 3.0))) as process:
         os.kill(roles_of(folder / "B")["controller"], signal.SIGKILL)
         lost = wait_for(lambda: log_of_plant(folder / "B", "end"), process)
         before = int(lost[0]["tick"])
@@ -161,7 +161,7 @@ def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_pat
 
 def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path):
     folder = tmp_path / "run"
-    with started(folder, content(duration=150.0, events=[])) as process:
+    with started(folder, content(duration=150.0, link=over("zmq"), events=[])) as process:
         with pytest.raises(UserError, match=r"is of a network; name the folder of a converter"):
             Operator(folder)
         a, b = Operator(folder / "A"), Operator(folder / "B")

@@ -26,7 +26,7 @@ from gfm_hil.ports.port import BesideRun
 from ...support.modbus import SUNS
 from ...support.modbus_device import Bench
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone]
+pytestmark = pytest.mark.processes
 
 PATIENCE_S = 60.0
 READ = struct.pack(">BHH", 3, SUNS, 2)

@@ -113,7 +113,11 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+#: the slowest link: over shared memory a run ends with hundreds of thousands of ticks
+slowly = pytest.mark.parametrize("going", [("zmq", "{portable = true}")], indirect=True)
+
+
+@slowly
 def test_what_is_refused_changes_nothing(going):
     _, folder = going
     operator = Operator(folder)
@@ -126,7 +130,7 @@ def test_what_is_refused_changes_nothing(going):
     operator.close()
 
 
-@pytest.mark.parametrize("going", [("shm", "{}")], indirect=True)
+@slowly
 def test_the_command(going):
     process, folder = going
 

@@ -27,7 +27,7 @@ title = "collected"
 duration = 600.0
 ready_laws = ["vsg-2"]
 [link]
-type = "shm"
+options = { portable = true }  # slow: over shared memory it would end with millions of ticks
 peer_timeout_s = 30.0
 """
 

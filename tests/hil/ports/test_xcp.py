@@ -277,7 +277,7 @@ duration = 600.0
 after_trip = "wait"
 ready_laws = ["vsg-5"]
 [link]
-type = "shm"
+options = { portable = true }  # slow: over shared memory it would end with millions of ticks
 peer_timeout_s = 30.0
 """
 
