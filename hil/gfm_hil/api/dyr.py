@@ -5,8 +5,6 @@ machine, and the model's numbers. A model of the user's library has the name USR
 behind the machine, and then six integers before its numbers.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

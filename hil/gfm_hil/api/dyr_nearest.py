@@ -6,8 +6,6 @@ the relative error. All other numbers of a record (limits, windows, the PLL) are
 published cases: a law's core has none.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple

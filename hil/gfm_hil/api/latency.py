@@ -1,7 +1,5 @@
 """What was measured of latency: by a run in real time, or by the benchmark of the loop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A system is known by what it has (A, B, C, D; num and den; or zeros, poles and g
 neither package is needed here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any

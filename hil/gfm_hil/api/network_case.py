@@ -1,8 +1,6 @@
 """Published power-flow cases as networks: converters in place of some machines, at the operating
 point of the power flow."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections import Counter

@@ -1,7 +1,5 @@
 """Power-flow cases by pandapower: solved, and read as it hands them to PYPOWER."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A law's loop over one of its parameters: its poles, where it is stable, and on which grids."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

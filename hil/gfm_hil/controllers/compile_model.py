@@ -1,7 +1,5 @@
 """Compiles the C source of a real-code model of IEEE and CIGRE for Linux, as it is."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Sequence

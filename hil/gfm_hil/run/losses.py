@@ -7,8 +7,6 @@ step of the leg's voltage. A step up with a current out of the leg, or down with
 a switch on against a diode, which recovers: E_on + E_rr. The others turn a switch off: E_off.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -9,8 +9,6 @@ The value between two instants is a straight line (a current) or a constant (the
 Both are averaged exactly over equal cells; what the averaging takes from a line is known.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Certificates for converters: to which grids any number of them may be connected."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ what is left, whose order is that of the least AIC. The intervals are of the noi
 equation itself leaves shows as more after the jump than before it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

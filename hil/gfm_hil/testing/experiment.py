@@ -1,7 +1,5 @@
 """A test's assertions about an experiment; they explain how they fail and draw a figure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

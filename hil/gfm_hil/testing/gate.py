@@ -1,7 +1,5 @@
 """The conformity tests as a gate: a test of a user passes only if every clause does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

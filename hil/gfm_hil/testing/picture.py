@@ -1,7 +1,5 @@
 """The figure of a failed assertion: the signal with its limits, and other signals."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path

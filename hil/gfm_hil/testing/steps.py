@@ -4,8 +4,6 @@ The steps make a scenario that runs as a whole. So a test is exact: each step be
 every link and in real time too, and the scenario file repeats the test's run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ ASAM MCD-2 MC 1.7.1 defines the format. The entries come from the ELF file of a 
 (``gfm_runtime.firmware.elf``), or from the memory of an XCP slave.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

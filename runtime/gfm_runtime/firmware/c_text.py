@@ -11,8 +11,6 @@ A template holds keys, ``@KEY@``, and choices, each mark on a line of its own::
 A choice is made when the C code is written; ``@elif NAME@`` is possible too.
 """
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping

@@ -4,8 +4,6 @@ A target is a compiler and, for a bare processor, a machine of QEMU (system emul
 Under ``-icount`` QEMU's clock counts instructions, so their number is the same in every run.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

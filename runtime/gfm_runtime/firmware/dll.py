@@ -4,8 +4,6 @@ The model is the exported C code with one more source, ``model.c``. The simulati
 states, and may copy them between two calls; so there may be several instances.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterable

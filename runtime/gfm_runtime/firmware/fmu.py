@@ -5,8 +5,6 @@ and binaries of this machine and, where mingw is installed, of Windows. With FMI
 the A2L file of this machine's binary, and a first instance that lies where that file says.
 """
 
-from __future__ import annotations
-
 import io
 import platform
 import re

@@ -1,7 +1,5 @@
 """The folder that ``gfmhil firmware export`` writes: sources, golden vectors, self-test, report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from importlib.metadata import version

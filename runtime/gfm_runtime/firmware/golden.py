@@ -10,8 +10,6 @@ come from integers of PCG64, so they are the same on every machine. With an inne
 currents and voltages go with them.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable, Sequence

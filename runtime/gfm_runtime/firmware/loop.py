@@ -4,8 +4,6 @@ It waits for a tick's references and measurements in a pipe, steps the law, and 
 pipe what the law gives and what a run records of it. All words have the size of the law's numbers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

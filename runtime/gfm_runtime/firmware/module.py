@@ -7,8 +7,6 @@
   ``gfm.h`` and ``gfm.c``. A calibration tool may write such a record in RAM.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

@@ -4,8 +4,6 @@ report.json also holds each law's record as hexadecimal numbers. ``read_report``
 anew from them, so that ``gfmhil firmware check`` needs no law file.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -3,8 +3,6 @@
 It has the functions of a law, so that a model for EMT programs or an FMU takes it as one.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ In a law of its own the constants are numbers in the code; in the generic step t
 law's record. Variables that a tick leaves are members of an instance ``s``, the others of ``t``.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A recording as a run: checked, aligned to the first event of what was run, and resampled."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

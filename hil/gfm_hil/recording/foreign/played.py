@@ -1,7 +1,5 @@
 """The voltage of a recording as a course of the grid, which any law can be played against."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

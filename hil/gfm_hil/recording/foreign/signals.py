@@ -6,8 +6,6 @@ is what the angle of v turns in the cycle around a sample, over 2 pi times that 
 q, V and i follow likewise, and the frequency is that and the nominal one, in whose frame they rest.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """The load of a finite grid."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """A note that an operator leaves in the log of a run."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

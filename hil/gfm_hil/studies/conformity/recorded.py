@@ -1,7 +1,5 @@
 """A recording of hardware or of another simulator, judged as a run of the part of a test."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError

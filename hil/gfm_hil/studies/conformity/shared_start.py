@@ -6,8 +6,6 @@ it, and go on from its snapshot. A law begins at its operating point, in process
 start.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
