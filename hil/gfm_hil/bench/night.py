@@ -75,16 +75,14 @@ class Block:
 
 
 class Blocks:
-    """The file of a night.
+    """The file of a night. Raises UserError: there is no night to go on with, or it has other
+    settings.
 
     Args:
         folder: of the result.
         settings: what is measured; a night that goes on must have the same.
         about: what its page says besides, see ``night_of``.
         resume: go on with what is there.
-
-    Raises:
-        UserError: there is no night to go on with, or it has other settings.
     """
 
     def __init__(

@@ -83,7 +83,8 @@ def peer_of(
     to: str, name: str | None, options: dict[str, Any], ports: Path | None, ptp_us: float,
     place: Path,
 ) -> Contender:  # fmt: skip
-    """The contender that answers at an endpoint, or is the controller ``KIND:NAME``.
+    """The contender that answers at an endpoint, or is the controller ``KIND:NAME``. Raises
+    UserError: neither, or nothing can be reached there.
 
     Args:
         to: endpoint, or controller.
@@ -92,9 +93,6 @@ def peer_of(
         ports: map of the controller's ports.
         ptp_us: how far CLOCK_TAI of this machine may be off, 0: nobody says.
         place: folder for an endpoint of our own.
-
-    Raises:
-        UserError: neither, or nothing can be reached there.
     """
     more: dict[str, Any] = {"link": options, "ptp_us": ptp_us, "program": None, "inner": False}
     if ptp_us:
@@ -280,16 +278,14 @@ def _started(c: Contender) -> Callable[[], None]:
 def answer(
     endpoint: str, options: dict[str, Any], ptp_us: float, fifo: bool, say: Callable[[str], None]
 ) -> None:
-    """Answer one bench after another at an endpoint, until a signal comes.
+    """Answer one bench after another at an endpoint, until a signal comes. Raises UserError: the
+    endpoint cannot be used.
 
     Args:
         endpoint, options: of the link.
         ptp_us: as of ``peer_of``.
         fifo: ask for the priority of a run in real time.
         say: receives each line of progress.
-
-    Raises:
-        UserError: the endpoint cannot be used.
     """
     tai_ns = tai_offset(ptp_us) if ptp_us else 0
     with closing(datagram.UdpLink("controller", "udp://0.0.0.0:0")) as nobody:

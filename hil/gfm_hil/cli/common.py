@@ -140,15 +140,13 @@ def endpoints(options: argparse.Namespace) -> dict[str, str]:
 
 
 def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Scenario:
-    """The scenario with its overrides; ``more`` goes to ``load_scenario``.
+    """The scenario with its overrides; ``more`` goes to ``load_scenario``. Raises UserError: as
+    ``load_scenario``.
 
     Args:
         named: the command takes an endpoint for each converter, see ``endpoints``; the option
             --converter says which one it controls. That of other commands says which one gets
             the law and the inner stage.
-
-    Raises:
-        UserError: as ``load_scenario``.
     """
     gets = {} if named or "converter" not in options else {"converter": "--converter"}
     ends = endpoints(options)

@@ -110,14 +110,12 @@ class _Values:
 
 
 class DllController(MappedController):
-    """A controller in a shared library of Linux.
+    """A controller in a shared library of Linux. Raises UserError: it cannot be loaded, has not the
+    interface, or its ports do not fit.
 
     Args:
         path: of the library.
         ports, context: as for ``open_controller``.
-
-    Raises:
-        UserError: it cannot be loaded, has not the interface, or its ports do not fit.
     """
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:

@@ -51,14 +51,12 @@ class ExternalController:
     count = -1  # instructions of the law's step in the last tick; -1 where they are not counted
 
     def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
-        """Get ready for a run; only one that runs its laws has something to do.
+        """Get ready for a run; only one that runs its laws has something to do. Raises UserError: a
+        program for the laws cannot be built, or does not start.
 
         Args:
             controller: at rest, with the laws, in the precision ``real``.
             changed: further laws, discretised and packed, that may come into its spare places.
-
-        Raises:
-            UserError: a program for the laws cannot be built, or does not start.
         """
 
     def has(self, law: Retuned) -> bool:

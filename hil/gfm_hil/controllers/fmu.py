@@ -29,14 +29,12 @@ _UNPACKED, _DESCRIPTION = 1 << 29, 1 << 25  # bytes of all members, and of the o
 
 
 class FmuController(MappedController):
-    """An FMU with a library for this machine.
+    """An FMU with a library for this machine. Raises UserError: FMPy is missing, it cannot read the
+    file, or the ports do not fit.
 
     Args:
         path: of the .fmu.
         ports, context: as for ``open_controller``.
-
-    Raises:
-        UserError: FMPy is missing, it cannot read the file, or the ports do not fit.
     """
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:

@@ -33,17 +33,14 @@ T = TypeVar("T")
 
 
 def open_controller(text: str, ports: PortMap, context: BenchContext) -> ExternalController:
-    """The controller that ``text`` names.
+    """The controller that ``text`` names. Raises UserError: there is no such file, its ports do not
+    fit, or a signal came while its code kept us.
 
     Args:
         text: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` for a library that has the interface of
             ``gfmhil_controller.h``, or ``pil:TARGET`` for the run's own laws.
         ports: which signal each of its ports is.
         context: what it is connected to.
-
-    Raises:
-        UserError: there is no such file, its ports do not fit, or a signal came
-            while its code kept us.
     """
     if text.startswith(PIL):
         if ports != PortMap():

@@ -50,16 +50,13 @@ class _ControllerOutput(c.Structure):
 
 
 class LibraryController(ExternalController):
-    """A controller in a shared library.
+    """A controller in a shared library. Raises UserError: it cannot be loaded, has not the
+    interface or another version of it, refuses this bench, or the run does not carry the currents.
 
     Args:
         path: of the library.
         ports: of the map only ``step_s``, the time between two calls, s.
         context: what it is connected to.
-
-    Raises:
-        UserError: it cannot be loaded, has not the interface or another version of it, refuses
-            this bench, or the run does not carry the currents.
     """
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:

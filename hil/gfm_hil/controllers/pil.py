@@ -49,15 +49,12 @@ _SAID = dict(RESULTS.values())
 
 
 class PilController(ExternalController):
-    """The laws of a run on a target; a context in which its program runs.
+    """The laws of a run on a target; a context in which its program runs. Raises UserError: there
+    is no such target or firmware, or its tools are missing (the packages are named).
 
     Args:
         target: one of ``gfm_runtime.firmware.TARGETS``, or ``TARGET:FOLDER`` with a firmware that
             calls the laws, see ``loop.h``.
-
-    Raises:
-        UserError: there is no such target or firmware, or its tools are missing (the packages are
-            named).
     """
 
     has_laws = True

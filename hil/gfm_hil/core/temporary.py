@@ -51,15 +51,13 @@ def is_guarded(folder: os.stat_result) -> bool:
 
 
 def lock(handle: int, operation: int, patience_s: float = PATIENCE_S) -> None:
-    """Lock an open file or folder of our own user.
+    """Lock an open file or folder of our own user. Raises TimeoutError: that process keeps its lock
+    for longer.
 
     Args:
         handle: file descriptor.
         operation: ``fcntl.LOCK_SH`` or ``fcntl.LOCK_EX``.
         patience_s: how long to wait for another process's lock, s.
-
-    Raises:
-        TimeoutError: that process keeps its lock for longer.
     """
     give_up = time.monotonic() + patience_s
     while True:

@@ -20,7 +20,8 @@ _ANSWER_MS = 6000
 
 
 class Operator:
-    """Sends commands to one run in progress and reads its state.
+    """Sends commands to one run in progress and reads its state. Raises UserError: no run is in
+    progress there.
 
     Args:
         folder: the run folder.
@@ -28,9 +29,6 @@ class Operator:
 
     Attributes:
         run: all that it has recorded.
-
-    Raises:
-        UserError: no run is in progress there.
     """
 
     def __init__(self, folder: Path, through: str = "python") -> None:
@@ -44,7 +42,8 @@ class Operator:
         self._context.destroy(linger=0)
 
     def command(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
-        """Have the run carry out a scenario event, given without its time, at once.
+        """Have the run carry out a scenario event, given without its time, at once. Raises
+        UserError: the run refused it, with the reason; or the side is gone.
 
         Args:
             event: plain data, ``type`` and its fields.
@@ -52,9 +51,6 @@ class Operator:
 
         Returns:
             ``tick`` at which it was carried out, and its ``label``.
-
-        Raises:
-            UserError: the run refused it, with the reason; or the side is gone.
         """
         kind = event.get("type", "")
         if not isinstance(kind, str):

@@ -32,7 +32,7 @@ class _Peer:
 
 
 class Listener(socket.socket):
-    """A listening TCP socket, bound.
+    """A listening TCP socket, bound. Raises OSError: the address cannot be bound.
 
     Args:
         host, port: to listen at; the first address that the name stands for.
@@ -43,9 +43,6 @@ class Listener(socket.socket):
 
     Attributes:
         port: on which it listens.
-
-    Raises:
-        OSError: the address cannot be bound.
     """
 
     def __init__(self, host: str, port: int, limit: int, half_open_s: float, idle_s: float) -> None:

@@ -241,14 +241,12 @@ def check_number(option: str, number: int | None) -> None:
 def make_tls(
     words: str, certificate: Path, key: Path, clients: Path | None = None
 ) -> ssl.SSLContext:
-    """A server's TLS context, with its certificate and key.
+    """A server's TLS context, with its certificate and key. Raises UserError: a file cannot be
+    used.
 
     Args:
         words: the options, for an error.
         clients: authority that signed a certificate of each client; None: clients need none.
-
-    Raises:
-        UserError: a file cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -269,7 +267,8 @@ def companion(
     """Start ``gfmhil NAME`` for a run folder that does not exist yet.
 
     Its output goes to stderr, as stdout may carry JSON. It ends with this process, however that
-    ends.
+    ends. Raises UserError: the port is in use, does without a run, or the command ended; it has
+    printed why.
 
     Args:
         name: of the port.
@@ -279,9 +278,6 @@ def companion(
 
     Yields:
         The process if it stays when the run is over, else None.
-
-    Raises:
-        UserError: the port is in use, does without a run, or the command ended; it has printed why.
     """
     port = make_port(name)
     port.check_needs()

@@ -316,14 +316,11 @@ HERTZ = "f_hz"
 
 def describe(name: str, laws: list[str]) -> Described:
     """A column of signals.npz or timing.npz, by its name there, one of ``DERIVED``, or one of a
-    network.
+    network. Raises UserError: there is no such column.
 
     Args:
         name: of the column.
         laws: labels of the run's laws, in the order of the recording's indices.
-
-    Raises:
-        UserError: there is no such column.
     """
     row = TABLE.get(name) or DERIVED.get(name) or of_network(name)
     if row is None:

@@ -57,15 +57,13 @@ class Phase:
 
 def three_phase(columns: Columns, bases: Bases, si: bool = False) -> dict[str, ColumnLike]:
     """The phases of v, i and i_o as columns, shape (ticks,) each, by the names of ``DERIVED``.
+    Raises UserError: the recording lacks what this needs.
 
     Args:
         columns: of signals.npz.
         bases: of the converter.
         si: in V and A, names such as v_a_V, instead of in p.u. of the nominal peak value of a
             phase, sqrt(2/3) V_n and sqrt(2/3) S_n/V_n, so that p = 2/3 (v_a i_oa + ...).
-
-    Raises:
-        UserError: the recording lacks what this needs.
     """
     if missing := [name for name in NEEDS if name not in columns]:
         raise UserError(

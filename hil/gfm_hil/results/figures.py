@@ -571,16 +571,14 @@ def draw_waveforms(
     summary: dict[str, Any],
     window: tuple[float, float] | None = None,
 ) -> list[Axes]:
-    """Fill a figure with v_abc, i_abc of the bridge and i_abc of the line.
+    """Fill a figure with v_abc, i_abc of the bridge and i_abc of the line. Raises UserError: the
+    recording lacks what ``three_phase`` needs.
 
     Args:
         window: from when to when, s; that of the scenario if None, or the usual one.
 
     Returns:
         The panels; none if nothing was recorded in the window.
-
-    Raises:
-        UserError: the recording lacks what ``three_phase`` needs.
     """
     rows, waves = _waves(scenario, signals, summary, window)
     t = signals["t"][rows]
@@ -786,14 +784,12 @@ def _draw_named(
 
 @with_look
 def plot_waveforms(run: Run, start: float | None = None, stop: float | None = None) -> list[Axes]:
-    """Draw the three phases of the voltages and currents, as the report does.
+    """Draw the three phases of the voltages and currents, as the report does. Raises UserError:
+    only one of them is given, nothing was recorded between them, or the recording lacks what this
+    needs.
 
     Args:
         start, stop: from when to when, s; the window of the report if not given.
-
-    Raises:
-        UserError: only one of them is given, nothing was recorded between them, or the
-            recording lacks what this needs.
     """
     from matplotlib import pyplot
 

@@ -65,15 +65,13 @@ class LoopDelay:
 
 
 def loop_delay(run: Run, set_s: float, margin_s: float) -> LoopDelay:
-    """The delays of a run, compared with a margin.
+    """The delays of a run, compared with a margin. Raises UserError: the run lacks the plant's
+    times.
 
     Args:
         run: with its times, if it was in real time.
         set_s: the delay that the scenario sets between y[k] and u[k] acting, s.
         margin_s: the additional delay that the law tolerates, s.
-
-    Raises:
-        UserError: the run lacks the plant's times.
     """
     T_s = run.scenario.T_s
     set_us, T_s_us = 1e6 * set_s, 1e6 * T_s

@@ -65,14 +65,12 @@ def load_data_sheet(path: str | Path) -> DataSheet:
 
 
 def losses(between: BetweenTicks, sheet: DataSheet | str | Path) -> Losses:
-    """What devices with these values would have lost in a window.
+    """What devices with these values would have lost in a window. Raises UserError: one line a
+    mistake of the file.
 
     Args:
         between: the window; its drops, if the plant has any, are not counted again.
         sheet: of the devices, or the TOML file of it.
-
-    Raises:
-        UserError: one line a mistake of the file.
     """
     if not isinstance(sheet, DataSheet):
         sheet = load_data_sheet(sheet)

@@ -291,16 +291,14 @@ def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
 def merge_roles(first: Path, second: Path, folder: Path, report: Report | None = None) -> Run:
     """Put what the two sides of a run left, each in a folder of its own, into one run folder.
 
-    Rows end where the plant's recording does, as in a run whose sides were started together.
+    Rows end where the plant's recording does, as in a run whose sides were started together. Raises
+    UserError: a folder is not that of one side, they are not of the same run or of the same
+    converter, or ``folder`` is in use or cannot be written.
 
     Args:
         first, second: the finished folders of controller and plant, in any order; they stay.
         folder: new or empty.
         report: as for ``finish``.
-
-    Raises:
-        UserError: a folder is not that of one side, they are not of the same run or of the same
-            converter, or ``folder`` is in use or cannot be written.
     """
     roles: dict[Role, Run] = {}
     for run in (Run.load(first), Run.load(second)):

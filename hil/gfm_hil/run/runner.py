@@ -49,7 +49,8 @@ def run_scenario(
     report: Report | None = None,
     controller_command: Sequence[str] = (),
 ) -> Run:
-    """Run a scenario and leave a run folder.
+    """Run a scenario and leave a run folder. Raises UserError: the folder is in use, no operating
+    point, an endpoint that is occupied. The folder is then left as it was.
 
     Args:
         scenario: checked, from ``load_scenario``.
@@ -60,10 +61,6 @@ def run_scenario(
             does; None for a folder without them.
         controller_command: program and arguments of another controller instead of ours, for a
             link that is none of ``inproc``; see ``Processes``.
-
-    Raises:
-        UserError: the folder is in use, no operating point, an endpoint that is occupied. The
-            folder is then left as it was.
     """
     if scenario.parts:
         raise UserError(ONE_CONVERTER)
@@ -75,17 +72,15 @@ def controller_program(
     scenario: Scenario, controller: str | None, ports: str | Path | None, notice: Notice
 ) -> list[str]:
     """The ``controller_command`` of a run whose controller steps a model in place of the law, or
-    runs the laws on another processor; empty without one.
+    runs the laws on another processor; empty without one. Raises UserError: there is no such
+    controller or map, or the run is in process, has no operating point, or does not carry what it
+    measures.
 
     Args:
         scenario: of the run.
         controller: ``dll:FILE``, ``fmu:FILE``, ``c:FILE`` or ``pil:TARGET``.
         ports: file of the map of its ports.
         notice: as for ``run_scenario``.
-
-    Raises:
-        UserError: there is no such controller or map, or the run is in process, has no operating
-            point, or does not carry what it measures.
     """
     if controller is None:
         if ports is not None:
@@ -126,14 +121,12 @@ def run_network(
     report: Report | None = None,
     controller_commands: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> NetworkRun:
-    """Run a scenario with a network and leave a folder with a run folder for each converter.
+    """Run a scenario with a network and leave a folder with a run folder for each converter. Raises
+    UserError: the folder is in use, or there is no operating point.
 
     Args:
         scenario, folder, progress, notice, report: as for ``run_scenario``.
         controller_commands: by converter, as ``controller_command`` there.
-
-    Raises:
-        UserError: the folder is in use, or there is no operating point.
     """
     runs = _run(scenario, folder, progress, notice, report, controller_commands)
     return _network(scenario, runs, folder, report)
@@ -229,16 +222,14 @@ def run_side(
     external: ExternalController | None = None,
 ) -> Run | NetworkRun:
     """Run one side alone, whose peer another process or machine runs, and leave a run folder of
-    what it recorded, or one for each converter of a network.
+    what it recorded, or one for each converter of a network. Raises UserError: the folder is in
+    use, no operating point, an endpoint that is occupied.
 
     Args:
         role: the side.
         scenario, folder, notice, report: as for ``run_scenario``.
         endpoints: by converter, in place of the scenario's.
         external: computes u in place of the law.
-
-    Raises:
-        UserError: the folder is in use, no operating point, an endpoint that is occupied.
     """
 
     def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Ended:
@@ -296,16 +287,14 @@ def _run_here(
 
 
 def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> Run:
-    """Run a scenario in this process and leave nothing on the disk.
+    """Run a scenario in this process and leave nothing on the disk. Raises UserError: the scenario
+    has no operating point.
 
     Args:
         scenario: checked; its link and mode do not matter.
         kept: what to record into, the plant's and the controller's columns, at least
             ``summary.READ`` of them. The run's columns lie in there, so they are good until the
             next run in the same room. None: new room for all columns.
-
-    Raises:
-        UserError: the scenario has no operating point.
     """
     bench = make_bench(scenario)
     (run,) = _in_memory([bench], [kept] if kept else make_room([bench]))

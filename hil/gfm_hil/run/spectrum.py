@@ -63,14 +63,12 @@ class Spectrum:
 
 
 def spectrum(between: BetweenTicks, name: str) -> Spectrum:
-    """The spectrum of the first 10 cycles (at 60 Hz: 12) of a window.
+    """The spectrum of the first 10 cycles (at 60 Hz: 12) of a window. Raises UserError: the window
+    is too short, or has no such column.
 
     Args:
         between: the window.
         name: of one of its columns, or ``u_a`` … of a leg's voltage.
-
-    Raises:
-        UserError: the window is too short, or has no such column.
     """
     f_n = between.bases.omega_b / (2 * np.pi)
     cycles = round(_WINDOW * f_n)

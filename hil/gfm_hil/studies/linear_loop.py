@@ -132,15 +132,13 @@ def network_loop(
     laws: Mapping[str, BuiltLaw] = MappingProxyType({}),
     **changes: Any,
 ) -> NetworkLoop:
-    """The linear loop of a scenario with a network, as it is when the run starts.
+    """The linear loop of a scenario with a network, as it is when the run starts. Raises UserError:
+    one line a mistake; the scenario has no network; there is no operating point.
 
     Args:
         on: a scenario: its name, file or content, or a checked one.
         laws: by converter, other laws than the scenario's; they bring their own inner stage.
         changes: keys of the scenario with ``__`` for the dot, as for ``gfmhil.run``.
-
-    Raises:
-        UserError: one line a mistake; the scenario has no network; there is no operating point.
     """
     scenario = load_scenario(on, **changes)
     if scenario.network is None:

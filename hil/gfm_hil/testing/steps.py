@@ -61,7 +61,8 @@ def make_setting(
     link_wanted: str | None = None,
     **changed: Any,
 ) -> Setting:
-    """Read and check the setting of a test.
+    """Read and check the setting of a test. Raises UserError: one line per mistake. ``Unfit`` if
+    only ``link_wanted`` does not fit the test.
 
     Args:
         near: folder of the test, searched first for scenario and law files.
@@ -71,9 +72,6 @@ def make_setting(
         link_wanted: link of the command line; replaces the test's link.
         changed: any other key of a scenario by its path with ``__`` for the dot, for example
             ``references__P_ref=0.2`` or ``events=[]``.
-
-    Raises:
-        UserError: one line per mistake. ``Unfit`` if only ``link_wanted`` does not fit the test.
     """
     chosen = link or ("zmq" if controller_command else INPROC)
     if controller_command and chosen == INPROC:
@@ -129,10 +127,7 @@ class Steps:
 
     def start(self, scenario: str | None = None, **setting: Any) -> None:
         """Start a new experiment; the arguments are those of ``make_setting`` and of the marker.
-
-        Raises:
-            UserError: one line per mistake.
-        """
+        Raises UserError: one line per mistake."""
         __tracebackhide__ = True
         try:
             self._setting = make_setting(
@@ -322,11 +317,8 @@ class Steps:
 
     @property
     def result(self) -> Run:
-        """The run of all steps so far.
-
-        Raises:
-            UserError: there is nothing to run, or the run cannot be repeated.
-        """
+        """The run of all steps so far. Raises UserError: there is nothing to run, or the run cannot
+        be repeated."""
         setting, before = self.setting, self._run
         if before is not None and self._ran == self._tick:
             return before

@@ -60,7 +60,8 @@ def a2l_text(
     more: Iterable[str] = (),
     identifications: Sequence[tuple[int, str]] = (),
 ) -> str:
-    """The text of an A2L file.
+    """The text of an A2L file. Raises LawError: two entries of one name, or an address of more than
+    32 bits.
 
     Args:
         project: what its name ends in, and that of its only module.
@@ -70,9 +71,6 @@ def a2l_text(
         more: lines of the module, such as an IF_DATA block.
         identifications: texts in the memory by which a tool knows that the file is of this program,
             with their addresses. The first one becomes the EPK, of which there can be one only.
-
-    Raises:
-        LawError: two entries of one name, or an address of more than 32 bits.
     """
     methods: dict[str, list[str]] = {}
     kinds: set[str] = set()

@@ -77,11 +77,8 @@ def written(name: str, keys: Mapping[str, str], choices: Choices | None = None) 
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
-    """The text with every ``@KEY@`` replaced.
-
-    Raises:
-        KeyError: the text holds a key that ``values`` does not.
-    """
+    """The text with every ``@KEY@`` replaced. Raises KeyError: the text holds a key that ``values``
+    does not."""
     return re.sub(r"@([\w.-]+)@", lambda found: values[found[1]], text)
 
 
@@ -89,11 +86,8 @@ _MARK = re.compile(r" */\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
 
 
 def chosen(text: str, choices: Choices) -> str:
-    """The text with its choices made.
-
-    Raises:
-        KeyError: the text asks for a choice that ``choices`` does not hold.
-    """
+    """The text with its choices made. Raises KeyError: the text asks for a choice that ``choices``
+    does not hold."""
     out: list[str] = []
     taken: list[bool | None] = []  # of the open choices; None once another part was taken
     for line in text.splitlines(keepends=True):

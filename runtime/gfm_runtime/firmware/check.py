@@ -133,11 +133,8 @@ class Checked:
 
     @property
     def law_and_limits(self) -> tuple[int, int]:
-        """Fewest and most instructions of a step without the checks of its inputs.
-
-        Raises:
-            ValueError: the target counts no instructions.
-        """
+        """Fewest and most instructions of a step without the checks of its inputs. Raises
+        ValueError: the target counts no instructions."""
         if self.instructions is None or self.checks is None:
             raise ValueError(f"{self.name}: no instructions were counted")
         least, most = self.instructions
@@ -147,17 +144,15 @@ class Checked:
 def check(
     folder: Path, target: str, flags: str | None = None, ticks: int = CHECKED
 ) -> list[Checked]:
-    """Build, run and compare a folder that ``export`` wrote.
+    """Build, run and compare a folder that ``export`` wrote. Raises LawError: no such folder, a
+    missing tool (the apt package is named), a build that fails, or a program that does not end as
+    it should.
 
     Args:
         folder: with report.json and the sources.
         target: one of ``TARGETS``.
         flags: more for the compiler, e.g. ``"-O3"``, in place of the target's ``optimised``.
         ticks: golden rows of each law.
-
-    Raises:
-        LawError: no such folder, a missing tool (the apt package is named), a build that fails, or
-            a program that does not end as it should.
     """
     found, where = read_report(folder), need_tools(target)
     names = [m.prefix for m in found.modules]
@@ -194,11 +189,8 @@ def check(
 
 
 def need_tools(target: str) -> Target:
-    """A target of ``TARGETS`` whose compiler and machine are there.
-
-    Raises:
-        LawError: they are not (the apt packages are named).
-    """
+    """A target of ``TARGETS`` whose compiler and machine are there. Raises LawError: they are not
+    (the apt packages are named)."""
     where = TARGETS[target]
     for tool in (where.prefix + where.compiler, where.prefix + "size", *where.machine[:1]):
         if shutil.which(tool) is None:
@@ -216,7 +208,8 @@ def build(
     rest: Sequence[str],
     flags: str | None = None,
 ) -> None:
-    """Compile the modules ``names`` of a folder, and a program around them, to ``PROGRAM``.
+    """Compile the modules ``names`` of a folder, and a program around them, to ``PROGRAM``. Raises
+    LawError: it does not compile.
 
     Args:
         folder: has the modules' sources.
@@ -225,9 +218,6 @@ def build(
         names: of the modules, without an end.
         rest: the program's sources, and more for their compiler.
         flags: more for the compiler, in place of the target's ``optimised``.
-
-    Raises:
-        LawError: it does not compile.
     """
     compiler = [where.prefix + where.compiler, *FLAGS, *where.flags]
     compiler += shlex.split(where.optimised if flags is None else flags)
@@ -239,11 +229,7 @@ def build(
 
 
 def called(command: Sequence[str], at: Path) -> str:
-    """Run a program in a folder; what it says.
-
-    Raises:
-        LawError: it fails, or takes too long.
-    """
+    """Run a program in a folder; what it says. Raises LawError: it fails, or takes too long."""
     try:
         done = subprocess.run(
             command, cwd=at, capture_output=True, text=True, check=False, timeout=_TIMEOUT_S,
@@ -325,11 +311,8 @@ def prove(folder: Path) -> list[Proved]:
 
     It follows all values that variables can have, through an endless loop of calls in any order
     with any int32 as inputs: with 0 alarms no run of the code has undefined behaviour, and no
-    conversion loses bits.
-
-    Raises:
-        LawError: no such folder, a folder in a floating-point precision, no Frama-C (the apt
-            package is named), or an analysis that does not go through all of the code.
+    conversion loses bits. Raises LawError: no such folder, a folder in a floating-point precision,
+    no Frama-C (the apt package is named), or an analysis that does not go through all of the code.
     """
     found = read_report(folder)
     if not all(m.fixed for m in found.modules):

@@ -24,16 +24,13 @@ _INTERFACE = "IEEE_Cigre_DLLInterface.h"
 
 
 def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str, str]:
-    """The headers and sources of a model by file name.
+    """The headers and sources of a model by file name. Raises LawError: as ``make_modules``.
 
     Args:
         laws: the law, with its inner stage if it has one; or a scheduled one.
         T_s: sampling time, s.
         real: float32 or float64 inside; inputs and outputs are always real64.
         omega_b: base frequency of the converter, rad/s, for an inner stage.
-
-    Raises:
-        LawError: as ``make_modules``.
     """
     m, code = one_module(laws, T_s, real, omega_b)
     assert m.law is not None
@@ -72,11 +69,8 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
 
 
 def build_dll(folder: Path, name: str, files: Iterable[str]) -> Path:
-    """Compile by gcc the files of ``dll_sources`` in a folder; the shared library's path.
-
-    Raises:
-        LawError: as ``build_library``.
-    """
+    """Compile by gcc the files of ``dll_sources`` in a folder; the shared library's path. Raises
+    LawError: as ``build_library``."""
     library = folder / f"gfm_{identifier(name)}.so"
     build_library(folder, name, files, library.name, ["-fPIC"])
     return library
@@ -85,11 +79,8 @@ def build_dll(folder: Path, name: str, files: Iterable[str]) -> Path:
 def build_library(
     folder: Path, law: str, files: Iterable[str], out: str, flags: Iterable[str], compiler: str = ""
 ) -> None:
-    """Compile the C files in a folder to a shared library, by gcc if no compiler is named.
-
-    Raises:
-        LawError: there is no gcc (the apt package is named), or the compiler fails.
-    """
+    """Compile the C files in a folder to a shared library, by gcc if no compiler is named. Raises
+    LawError: there is no gcc (the apt package is named), or the compiler fails."""
     host = TARGETS["host"]
     if shutil.which(host.compiler) is None:
         why = f"{host.compiler} is not there; apt-get install {host.packages}"

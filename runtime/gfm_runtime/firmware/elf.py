@@ -127,11 +127,7 @@ def elf_a2l(path: Path) -> tuple[str, int, int]:
 
 def elf_entries(path: Path) -> tuple[list[Entry], bool, list[tuple[int, str]]]:
     """What can be measured and calibrated, by address; whether the program is big-endian; and the
-    addresses and texts of the laws' identifications.
-
-    Raises:
-        LawError, OSError: as ``elf_a2l``.
-    """
+    addresses and texts of the laws' identifications. Raises LawError, OSError: as ``elf_a2l``."""
     from elftools.common.exceptions import ELFError
     from elftools.elf.elffile import ELFFile
 
@@ -317,11 +313,7 @@ def _by_signal(
 
 
 def _kind(kind: _Type) -> str:
-    """ASAP2's name of a base type.
-
-    Raises:
-        KeyError: it has none, as a long double.
-    """
+    """ASAP2's name of a base type. Raises KeyError: it has none, as a long double."""
     encoding = kind.die.attributes["DW_AT_encoding"].value
     by_size = {4: _FLOATS, 5: _SIGNED, 6: _SIGNED}.get(encoding, _UNSIGNED)  # DW_ATE_float, signed
     return by_size[kind.size]

@@ -209,10 +209,8 @@ def make_sum(
 def powers(A: Matrix) -> tuple[Matrix, Matrix]:
     """Upper bounds of the sum over m of |A^m| and of its supremum, element by element.
 
-    Beyond M powers |A^(Mp+m)| <= |A^m| |A^M|^p bounds the rest.
-
-    Raises:
-        ValueError: the powers do not die away.
+    Beyond M powers |A^(Mp+m)| <= |A^m| |A^M|^p bounds the rest. Raises ValueError: the powers do
+    not die away.
     """
     n = len(A)
     stack, step = np.eye(n)[None], A.copy()
@@ -255,14 +253,11 @@ def sector(row: ClampedRow, feedback: Matrix | float = 0.0) -> tuple[Matrix, Mat
 
     The clamp passes 1 - theta of a change of raw, 0 <= theta <= 1: what the anti-windup and an
     omega_u that is fed back (``feedback``, its column of B) add to x is written as that for theta =
-    1/2 and a rest of at most half as much.
+    1/2 and a rest of at most half as much. Raises ValueError: the powers of A do not die away.
 
     Returns:
         A about the middle; bounds of the sum and of the supremum of |A^m|; and the gain of the loop
         through the rest, below 1 if the bound exists.
-
-    Raises:
-        ValueError: the powers of A do not die away.
     """
     A, c, W = row
     pull = A @ W
@@ -360,14 +355,12 @@ def _merged(*parts: Mapping[int, float]) -> dict[int, float]:
 
 
 def make_fixed(name: str, record: np.void) -> FixedLaw:
-    """A law in fixed point.
+    """A law in fixed point. Raises LawError: what fixed point does not cover, or ranges that it
+    cannot hold.
 
     Args:
         name: for messages.
         record: as ``gfm_runtime.kernel.pack_law`` gives it in float64.
-
-    Raises:
-        LawError: what fixed point does not cover, or ranges that it cannot hold.
     """
     where = f"law {name!r} in fixed point"
     law = _Builder(where, record).law()

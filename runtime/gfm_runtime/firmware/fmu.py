@@ -56,7 +56,8 @@ _OF_FMI_3 = ("<Output valueReference", "<InitialUnknown valueReference")
 
 
 def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float, xcp: bool = False) -> bytes:
-    """The FMU of a law, as the bytes of its file.
+    """The FMU of a law, as the bytes of its file. Raises LawError: as ``make_modules``; there is no
+    gcc or no FMPy (the package is named), or gcc fails.
 
     Args:
         laws: the law, with its inner stage if it has one; or a scheduled one.
@@ -66,10 +67,6 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float, xcp: bool
         omega_b: base frequency of the converter, rad/s, for an inner stage.
         xcp: with FMI-LS-XCP, the layered standard for measuring and calibrating by XCP; needs
             pyelftools.
-
-    Raises:
-        LawError: as ``make_modules``; there is no gcc or no FMPy (the package is named), or gcc
-            fails.
     """
     m, own = one_module(laws, T_s, real, omega_b)
     code, description = _sources(m, own, T_s, fmi, xcp)
@@ -205,11 +202,8 @@ def _files(tag: str, code: Mapping[str, str]) -> str:
 
 
 def _headers() -> Path:
-    """The folder of the C headers of FMI 2.0 and 3.0 that FMPy carries.
-
-    Raises:
-        LawError: FMPy is not installed.
-    """
+    """The folder of the C headers of FMI 2.0 and 3.0 that FMPy carries. Raises LawError: FMPy is
+    not installed."""
     spec = find_spec("fmpy")  # does not import it
     if spec is None or not spec.submodule_search_locations:
         raise LawError("an FMU", "takes the C headers of FMPy: pip install 'gfmhil[fmu]'")
@@ -238,11 +232,8 @@ def _refusals(fmi: Fmi, interface: str) -> str:
 
 
 def _binaries(m: Module, code: Mapping[str, str], fmi: Fmi, xcp: bool) -> dict[str, bytes]:
-    """The libraries by their place in the FMU, and the A2L file of this machine's.
-
-    Raises:
-        LawError: there is no gcc, or a compiler fails.
-    """
+    """The libraries by their place in the FMU, and the A2L file of this machine's. Raises LawError:
+    there is no gcc, or a compiler fails."""
     machine, flags = platform.machine(), [f"-I{_headers()}"]
     here = _HERE[fmi].get(machine, f"{machine}-linux")
     made: dict[str, tuple[str, ...]] = {f"{here}/{m.prefix}.so": ("", "-fPIC")}

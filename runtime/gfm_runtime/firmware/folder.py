@@ -44,7 +44,8 @@ def export(
     scheduled: Iterable[LawSet] = (),
     files: Mapping[str, LawFile] | None = None,
 ) -> dict[str, str]:
-    """The files of a firmware folder by name.
+    """The files of a firmware folder by name. Raises LawError: as ``make_modules``, and what fixed
+    point does not cover.
 
     Args:
         laws: the laws by name; a change between any two of them is bumpless.
@@ -54,9 +55,6 @@ def export(
         omega_b: base frequency of the converter, rad/s, for an inner stage.
         files: of the laws, for style ``tunable``.
         scheduled: laws whose stages, under the names of ``stage_names``, are among ``laws``.
-
-    Raises:
-        LawError: as ``make_modules``, and what fixed point does not cover.
     """
     fixed = real == FIXED
     if fixed and style != "unrolled":

@@ -46,7 +46,9 @@ class LoopProgram:
 def build_loop(
     modules: Sequence[Module], T_s: float, target: str, folder: Path, firmware: Path | None = None
 ) -> LoopProgram:
-    """Build the program of a target for a run's laws; law k of a request is ``modules[k]``.
+    """Build the program of a target for a run's laws; law k of a request is ``modules[k]``. Raises
+    LawError: laws without counts for a firmware, a law that C cannot hold, a missing tool (the apt
+    packages are named), or a build that fails.
 
     Args:
         modules: all with y and u of the same signals, in one precision.
@@ -54,10 +56,6 @@ def build_loop(
         target: one of ``gfm_runtime.firmware.TARGETS``.
         folder: empty.
         firmware: with C sources that have the functions of ``loop.h``, in place of the bare laws.
-
-    Raises:
-        LawError: laws without counts for a firmware, a law that C cannot hold, a missing tool (the
-            apt packages are named), or a build that fails.
     """
     where = need_tools(target)
     check_modules(modules)

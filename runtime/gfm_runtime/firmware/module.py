@@ -198,16 +198,14 @@ def make_modules(
     laws: Mapping[str, BuiltLaw], T_s: float, real: DTypeLike, omega_b: float = 100 * math.pi
 ) -> list[Module]:
     """The laws by name, discretised at T_s [s] and packed in float32 or float64, or in fixed point.
+    Raises LawError: a law that does not discretise, or that fixed point does not cover, and as
+    ``check_modules``.
 
     Args:
         laws: if one has an inner stage, all are made for y and u with its signals.
         T_s: sampling time, s.
         real: float32 or float64, or ``FIXED``.
         omega_b: base frequency of the converter, rad/s, for the inner stage.
-
-    Raises:
-        LawError: a law that does not discretise, or that fixed point does not cover, and as
-            ``check_modules``.
     """
     if real == FIXED:
         for name, law in laws.items():
@@ -234,14 +232,11 @@ def make_modules(
 
 
 def tunable(module: Module, file: LawFile, T_s: float) -> Module:
-    """The module with gains that can change while it runs.
+    """The module with gains that can change while it runs. Raises LawError: as ``GainChanges``.
 
     Args:
         file: of the module's law, whose own parameters have the values in force.
         T_s: sampling time, s.
-
-    Raises:
-        LawError: as ``GainChanges``.
     """
     if module.law is not None:
         file = file.model_copy(update={"parameters": dict(module.law.parameters)})
@@ -249,13 +244,9 @@ def tunable(module: Module, file: LawFile, T_s: float) -> Module:
 
 
 def check_modules(modules: Sequence[Module]) -> None:
-    """Refuse what C cannot hold.
-
-    Raises:
-        LawError: a number of states, an error map or a stage that the kernel does not know, a
-            constant that is not finite, a name without a letter, or two names that are the same
-            in C.
-    """
+    """Refuse what C cannot hold. Raises LawError: a number of states, an error map or a stage that
+    the kernel does not know, a constant that is not finite, a name without a letter, or two names
+    that are the same in C."""
     taken: dict[str, str] = {}
     for module in modules:
         where = f"law {module.name!r}"

@@ -83,11 +83,8 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
 
 
 def read_report(folder: Path) -> Exported:
-    """What ``report.json`` of a folder says.
-
-    Raises:
-        LawError: there is none, or it is not of this format.
-    """
+    """What ``report.json`` of a folder says. Raises LawError: there is none, or it is not of this
+    format."""
     path = folder / "report.json"
     try:
         text = read_regular(path, _MOST_BYTES).decode("utf-8")

@@ -32,11 +32,8 @@ def one_module(
     laws: LawSet, T_s: float, real: str, omega_b: float
 ) -> tuple[Module, dict[str, str]]:
     """A law or a scheduled one as what has its name, with its sources: in style tunable, or in
-    unrolled if it is scheduled or its form follows from its gains.
-
-    Raises:
-        LawError: as ``make_modules``.
-    """
+    unrolled if it is scheduled or its form follows from its gains. Raises LawError: as
+    ``make_modules``."""
     if laws.schedule and laws.laws[0].counts:
         why = "is scheduled, which has no interrupt from counts; use its stages, or --counts none"
         raise LawError(f"law {laws.name!r}", why)

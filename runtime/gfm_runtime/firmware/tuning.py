@@ -358,15 +358,13 @@ def _mode(d: Sequence[Any], s: Any, T: Sequence[float]) -> list[Any]:
 
 
 class GainChanges:
-    """What C needs to change a law's gains while it runs.
+    """What C needs to change a law's gains while it runs. Raises LawError: a law whose form follows
+    from its parameters' values, or that is scheduled.
 
     Args:
         file: the law's file; its parameters but the tied ones are the gains.
         record: the law as ``pack_law`` gives it, with the values of the file.
         T_s: sampling time, s.
-
-    Raises:
-        LawError: a law whose form follows from its parameters' values, or that is scheduled.
     """
 
     def __init__(self, file: LawFile, record: np.void, T_s: float) -> None:
@@ -452,11 +450,8 @@ class GainChanges:
 
     @np.errstate(all="ignore")
     def tuned(self, gains: Mapping[str, float]) -> np.void:
-        """The law's record with other gains, in the bits that C gives it.
-
-        Raises:
-            LawError: a gain that is out of its range, or gains that together give no law.
-        """
+        """The law's record with other gains, in the bits that C gives it. Raises LawError: a gain
+        that is out of its range, or gains that together give no law."""
         for name, value in gains.items():
             low, high = self.ranges[name]
             if not low <= value <= high:

@@ -59,7 +59,8 @@ _DAMAGE = (
 
 
 class CanLink:
-    """One end of the link; implements ``gfm_hil.links.Link``.
+    """One end of the link; implements ``gfm_hil.links.Link``. Raises UserError: the bus or the DBC
+    cannot be used.
 
     Args:
         role: which side's frames to send.
@@ -68,9 +69,6 @@ class CanLink:
 
     Attributes:
         every: ticks to an exchange of y and u.
-
-    Raises:
-        UserError: the bus or the DBC cannot be used.
     """
 
     def __init__(self, role: Role, endpoint: str, options: CanOptions) -> None:

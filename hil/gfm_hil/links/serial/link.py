@@ -31,18 +31,16 @@ _DEFAULT = SerialOptions()
 
 
 class SerialLink:
-    """One end of the link; implements ``gfm_hil.links.Link``.
+    """One end of the link; implements ``gfm_hil.links.Link``. Raises UserError: pyserial is
+    missing, or the device cannot be opened, is in use, or belongs to another user. If the
+    controller makes its pseudo terminal later, the plant's ``send``, ``receive`` and ``wait`` may
+    raise it too.
 
     Args:
         role: of a pseudo terminal the controller makes it, and the plant opens it.
         endpoint: ``serial://device`` or ``pty://path``, where the controller puts a symbolic link
             to its pseudo terminal.
         options: of the line.
-
-    Raises:
-        UserError: pyserial is missing, or the device cannot be opened, is in use, or belongs to
-            another user. If the controller makes its pseudo terminal later, the plant's ``send``,
-            ``receive`` and ``wait`` may raise it too.
     """
 
     def __init__(self, role: Role, endpoint: str, options: SerialOptions = _DEFAULT) -> None:

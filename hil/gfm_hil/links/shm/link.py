@@ -16,15 +16,13 @@ _FIRST_S, _LONGEST_S = 50e-6, 1e-3  # first and longest sleep of a wait
 
 
 class ShmLink:
-    """One end of the link; implements ``gfm_hil.links.Link``.
+    """One end of the link; implements ``gfm_hil.links.Link``. Raises UserError: the memory is in
+    use, or another user made it. If the controller starts later, the plant's ``send``, ``receive``
+    and ``wait`` may raise it too.
 
     Args:
         role: the controller creates the memory, the plant joins it; either may start first.
         endpoint: ``shm://name``.
-
-    Raises:
-        UserError: the memory is in use, or another user made it. If the controller starts later,
-            the plant's ``send``, ``receive`` and ``wait`` may raise it too.
     """
 
     port: Port

@@ -48,14 +48,12 @@ def write_keys(folder: Path, force: bool = False) -> list[Path]:
 
 
 class Curve:
-    """Encryption of one side's socket; at the controller also access control.
+    """Encryption of one side's socket; at the controller also access control. Raises UserError: a
+    key is missing or invalid.
 
     Args:
         socket: not yet bound or connected.
         role, folder: whose keys, and where they are.
-
-    Raises:
-        UserError: a key is missing or invalid.
     """
 
     def __init__(self, socket: zmq.Socket[bytes], role: Role, folder: Path) -> None:

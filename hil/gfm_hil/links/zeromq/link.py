@@ -61,7 +61,10 @@ def pair_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
 
 
 class ZmqLink:
-    """One end of the link; implements ``gfm_hil.links.Link``.
+    """One end of the link; implements ``gfm_hil.links.Link``. Raises UserError: the endpoint cannot
+    be bound, for example because it is in use; another user owns it or could take it over; keys are
+    missing. If the controller starts later, the plant's ``send``, ``receive`` and ``wait`` may
+    raise it too.
 
     Args:
         role: the controller binds, the plant connects; either may start first.
@@ -71,11 +74,6 @@ class ZmqLink:
     Attributes:
         port: calls libzmq directly on the same socket; None if the options leave the frames to
             pyzmq, or if no libzmq can be called (a warning says so).
-
-    Raises:
-        UserError: the endpoint cannot be bound, for example because it is in use; another user
-            owns it or could take it over; keys are missing. If the controller starts later, the
-            plant's ``send``, ``receive`` and ``wait`` may raise it too.
     """
 
     port: Port | None = None

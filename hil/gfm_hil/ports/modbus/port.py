@@ -326,10 +326,8 @@ class Connection(ServerRequestHandler):
 class Server(ModbusTcpServer):
     """pymodbus' server of devices at a host and port, with these connections.
 
-    ``tls`` is a context that requires a certificate from clients; None: plain TCP.
-
-    Raises:
-        OSError: the address cannot be bound.
+    ``tls`` is a context that requires a certificate from clients; None: plain TCP. Raises OSError:
+    the address cannot be bound.
     """
 
     def __init__(

@@ -132,15 +132,13 @@ class PictureRequest(BaseModel):
 
 
 class ScopePicture:
-    """A page's look at a recording.
+    """A page's look at a recording. Raises ValueError: a channel does not exist, or the trigger is
+    missing.
 
     Args:
         pyramid: of the recording.
         request: of the page.
         head: ticks done at the request.
-
-    Raises:
-        ValueError: a channel does not exist, or the trigger is missing.
     """
 
     def __init__(self, pyramid: Pyramid, request: PictureRequest, head: int) -> None:

@@ -40,7 +40,8 @@ METRICS = {
 
 
 class Follower:
-    """Reads what a run records from now on.
+    """Reads what a run records from now on. Raises UserError: it is not a run folder, or the run is
+    over.
 
     Args:
         folder: of the run.
@@ -49,9 +50,6 @@ class Follower:
     Attributes:
         run: all that it has recorded.
         over: nothing will be recorded any more.
-
-    Raises:
-        UserError: it is not a run folder, or the run is over.
     """
 
     def __init__(self, folder: Path, converter: str = "") -> None:
@@ -85,7 +83,7 @@ class Follower:
 
 
 class Publisher:
-    """Both sockets, bound; use as a context manager.
+    """Both sockets, bound; use as a context manager. Raises UserError: a port cannot be bound.
 
     Args:
         host: address to listen at.
@@ -93,9 +91,6 @@ class Publisher:
 
     Attributes:
         samples, blocks: the endpoints.
-
-    Raises:
-        UserError: a port cannot be bound.
     """
 
     def __init__(self, host: str, samples: int, blocks: int) -> None:

@@ -132,11 +132,7 @@ class _Request(WSGIRequestHandler):
 
 class _Server(ThreadingMixIn, WSGIServer):
     """A thread for each connection. Any number of them that ask nothing, or ask at once, leaves
-    room for another.
-
-    Raises:
-        OSError: the port cannot be bound.
-    """
+    room for another. Raises OSError: the port cannot be bound."""
 
     daemon_threads = True
     socket: Listener

@@ -174,15 +174,13 @@ class Memory:
         return whole[address - first : address - first + size]
 
     def write(self, address: int, data: bytes, by: Any) -> None:
-        """Write whole cells by one command to the run; it holds from one tick on.
+        """Write whole cells by one command to the run; it holds from one tick on. Raises Refusal:
+        no whole cells, what cannot be written, a wrong value, or the run refuses it.
 
         Args:
             address: of the first cell.
             data: of whole cells of one kind.
             by: who writes, see ``Operator.command``.
-
-        Raises:
-            Refusal: no whole cells, what cannot be written, a wrong value, or the run refuses it.
         """
         if not data or address % CELL or len(data) % CELL:
             raise Refusal(OUT_OF_RANGE, f"{address:#x}: numbers of {CELL} bytes are written whole")

@@ -104,14 +104,11 @@ class Udp(Transport):
 
 class CanFd(Transport):
     """A CAN FD bus of python-can: a frame is a packet, with zeros behind it up to the next length
-    that a frame can have.
+    that a frame can have. Raises UserError: identifiers that cannot be.
 
     Args:
         interface, channel: of python-can.
         ids: of the master's frames and of the slave's, 11 bits, as ``0x7f0,0x7f1``.
-
-    Raises:
-        UserError: identifiers that cannot be.
     """
 
     most = MOST_CAN

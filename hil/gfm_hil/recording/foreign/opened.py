@@ -38,16 +38,14 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
 
     p, q, V, i are those of the recording; the frequency of the converter is that of the voltage,
     and its current that of the line. The grid's frequency is recorded, or what the scenario
-    prescribes. Before the recording begins all are nan.
+    prescribes. Before the recording begins all are nan. Raises UserError: a file cannot be read, a
+    channel is missing, or the recording does not begin where the scenario does: base, unit, sign,
+    order of phases or time are wrong.
 
     Args:
         file: CSV, COMTRADE (its .cfg or .cff), Parquet, MF4 or MAT.
         map_file: what its channels are, see ``RecordingMap``.
         scenario: what was done; its first event is where the recording is aligned.
-
-    Raises:
-        UserError: a file cannot be read, a channel is missing, or the recording does not begin
-            where the scenario does: base, unit, sign, order of phases or time are wrong.
     """
     file, of = Path(file), read_recording_map(Path(map_file))
     f_n, T_s = nominal_frequency(scenario), scenario.T_s

@@ -22,17 +22,14 @@ def grid_profile(
 
     It begins with the recording. V_g and omega_g are those of v, or of the channels V and f (or
     f_grid). Of phases the angle is followed too: at each line it jumps by what omega_g, a mean over
-    a cycle, leaves of it.
+    a cycle, leaves of it. Raises UserError: a file cannot be read or written, a channel is missing,
+    V or f is beyond what a grid may have, or there are more lines than an event takes.
 
     Args:
         file, map: a recording, and what its channels are, as for ``load_run``.
         to: CSV file.
         f_n: nominal frequency, Hz.
         T_s: least time between lines, s: the sampling time of the scenario.
-
-    Raises:
-        UserError: a file cannot be read or written, a channel is missing, V or f is beyond what a
-            grid may have, or there are more lines than an event takes.
     """
     for name, value in ("f_n", f_n), ("T_s", T_s):
         if not (math.isfinite(value) and value > 0):

@@ -56,7 +56,8 @@ def check_format(name: str) -> None:
 def export_run(
     folder: Path, name: str, file: Path, phases: Literal["pu", "si"] | None = None
 ) -> list[Path]:
-    """Write a finished run to ``file`` in the format ``name``.
+    """Write a finished run to ``file`` in the format ``name``. Raises UserError: no run, no such
+    format, the recording lacks what the three phases need, or the file cannot be written.
 
     Args:
         phases: with the three phases of voltages and currents as further columns, in p.u. or in V
@@ -64,10 +65,6 @@ def export_run(
 
     Returns:
         What was written: the file and, of CAN frames, their DBC, of a .cfg its .dat.
-
-    Raises:
-        UserError: no run, no such format, the recording lacks what the three phases need, or the
-            file cannot be written.
     """
     check_format(name)
     run, form = Run.load(folder), FORMATS[name]

@@ -120,14 +120,12 @@ class Profile:
 
 
 def read_profile(file: str, f_n: float | None) -> Profile:
-    """Read and check a course.
+    """Read and check a course. Raises UserError: one line that names the file, and the line,
+    column, value and what is allowed.
 
     Args:
         file: path.
         f_n: nominal frequency, Hz; None leaves f_hz aside.
-
-    Raises:
-        UserError: one line that names the file, and the line, column, value and what is allowed.
     """
     t, columns = [], dict[str, list[float]]()
     try:

@@ -37,7 +37,8 @@ def load_campaign(
     changes: Mapping[str, Any] = MappingProxyType({}),
     tell: Tell = lambda done, of: None,
 ) -> Campaign:
-    """Read and check a campaign, its runs included.
+    """Read and check a campaign, its runs included. Raises UserError: one line a mistake, each with
+    its path, the value and what is allowed.
 
     Args:
         given: path or shipped name, or the content of a file. The stem of the file is the
@@ -45,9 +46,6 @@ def load_campaign(
         laws: in place of those of the file: law files by name.
         changes: keys of the file with other values.
         tell: told the checks done and how many there are, as they go on; there may be thousands.
-
-    Raises:
-        UserError: one line a mistake, each with its path, the value and what is allowed.
     """
     path, text, content = Path("campaign"), None, given
     if not isinstance(content, dict):

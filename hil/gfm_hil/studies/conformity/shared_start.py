@@ -73,15 +73,13 @@ def alike(scenario: Scenario) -> str:
 
 
 def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | None) -> Run:
-    """The run of a scenario after its first ``settle_s``, as a run of its own.
+    """The run of a scenario after its first ``settle_s``, as a run of its own. Raises UserError: it
+    did not last so long.
 
     Args:
         scenario: all of it, with the time to settle.
         run: of all of it, or of what follows the start.
         start: its first ticks, or None.
-
-    Raises:
-        UserError: it did not last so long.
     """
     first = round(settle_s / scenario.T_s)
     begin, after = (None, 0) if start is None else (Run.load(start.folder), start.ticks)
