@@ -17,17 +17,9 @@ from gfm_design.misses.tolerance import LatencyTolerance
 from gfm_design.misses.tolerance import latency_tolerance as _latency_tolerance
 from gfm_design.model.closed_loop import least_stable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
+from gfm_design.tuning import paper as search
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.paper import (
-    EVALUATIONS,
-    LATE,
-    PAPER_START,
-    PaperProblem,
-    starts_for,
-    tune_paper,
-    worst_channels,
-)
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
@@ -100,7 +92,7 @@ class Tuning:
     evaluations: int
     seconds: float
     seed: int
-    problem: PaperProblem
+    problem: search.PaperProblem
 
     @property
     def at_bounds(self) -> dict[str, float]:
@@ -172,7 +164,7 @@ def gamma(
     if on is not None:
         loop = law.closed_loop(on, converter=converter)
     else:
-        loop = law.closed_loop(LATE) if staged else law.closed_loop(ideal=True)
+        loop = law.closed_loop(search.LATE) if staged else law.closed_loop(ideal=True)
     if T_s is not None:
         loop = loop.sampled(T_s)
     return Gamma(law.name, loop.channels(_weights(weights)))
@@ -190,7 +182,7 @@ def tune(
     decay: float = 0.0,
     scr: Sequence[float] = (),
     seed: int = 0,
-    evaluations: int = EVALUATIONS,
+    evaluations: int = search.EVALUATIONS,
     starts: int | None = None,
     watch: Watch = SILENT,
 ) -> Tuning:
@@ -229,19 +221,19 @@ def tune(
         partial(loop_under, scenario=one, converter=converter)
         for one in ([] if scenario is None else at_short_circuit_ratios(scenario, scr))
     ]
-    paper = PAPER_START.get(law.name, {}) if scenario is None else {}
+    paper = search.PAPER_START.get(law.name, {}) if scenario is None else {}
     at = {n: v for n, v in paper.items() if only is None or n in only} | dict(start or {})
     try:
-        problem = PaperProblem(
+        problem = search.PaperProblem(
             law.file if scenario is None else law.staged(scenario, converter),
             free_gains(law.file, at, only), weights=_weights(weights),
             among=loops[0] if loops else None, decay=decay, others=tuple(loops[1:]),
         )  # fmt: skip
     except NoEquilibrium as none:
         raise UserError(str(none)) from None
-    starts = starts or starts_for(len(problem.gains))
+    starts = starts or search.starts_for(len(problem.gains))
     try:
-        found = tune_paper(
+        found = search.tune_paper(
             problem, seed, evaluations, starts,
             lambda done, best: watch.progress(done, evaluations * starts, f"γ {best:.4g}"),
         )  # fmt: skip
@@ -252,7 +244,7 @@ def tune(
     named = problem.law.named(found.values)
     tuned = law.with_gains(name or f"{law.name}-tuned", **named)
     each = (loop.channels(problem.weights) for loop in problem.all_loops(found.values))
-    channels = Gamma(tuned.name, worst_channels(each))
+    channels = Gamma(tuned.name, search.worst_channels(each))
     return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
 
 
@@ -265,7 +257,7 @@ def _check_search(evaluations: int, starts: int | None, seed: int, decay: float)
             raise UserError(f"{what} = {number}: must be finite and not negative")
 
 
-def _in_the_way(none: NotStabilised, problem: PaperProblem, converter: str | None) -> str:
+def _in_the_way(none: NotStabilised, problem: search.PaperProblem, converter: str | None) -> str:
     """Which mode is unstable, or too slow, where the search came closest."""
     loop = problem.closed_loop(none.values)
     where = "on the scenario" if converter is None else f"in the network of {converter}"

@@ -49,9 +49,8 @@ def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
 
 
 def sparse(counts: Counts) -> list[list[int]]:
-    """[bucket, count] of all non-empty buckets, for JSON."""
-    at = np.flatnonzero(counts)
-    return [[int(k), int(counts[k])] for k in at]
+    """[bucket, count] of all that are not empty, for JSON."""
+    return [[int(k), int(counts[k])] for k in np.flatnonzero(counts)]
 
 
 def dense(pairs: Sequence[Sequence[int]]) -> Counts:

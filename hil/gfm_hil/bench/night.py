@@ -201,15 +201,10 @@ class CellNight:
                 "beyond": beyond(self.counts), "measured_s": round(self.measured_s, 1),
                 "heat": {
                     "at": [at for at, _ in self._heat],
-                    "counts": [sparse_column(column) for _, column in self._heat],
+                    "counts": [sparse(column) for _, column in self._heat],
                 },
             },
         }  # fmt: skip
-
-
-def sparse_column(column: NDArray[np.int64]) -> list[list[int]]:
-    """[row, count] of a column of the heat map."""
-    return [[int(k), int(column[k])] for k in np.flatnonzero(column)]
 
 
 def night_of(folder: Path) -> dict[str, Any]:

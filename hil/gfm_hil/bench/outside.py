@@ -60,17 +60,8 @@ def _rtla(cpus: str, policy: Policy, period_us: int, ticks: int, to: Path) -> li
     shape = ["-b", str(_BUCKET_NS), "-E", str(min(_LONGEST_NS // _BUCKET_NS, 9999))]
     seconds = max(1, round(ticks * period_us * 1e-6))
     line = ["rtla", "timerlat", "hist", "--nano", "--no-irq", "-c", cpus, "-P", how, *shape]
-    return [
-        "sh",
-        "-c",
-        'exec "$@" >"$0"',
-        str(to),
-        *line,
-        "-p",
-        str(period_us),
-        "-d",
-        f"{seconds}s",
-    ]
+    line += ["-p", str(period_us), "-d", f"{seconds}s"]
+    return ["sh", "-c", 'exec "$@" >"$0"', str(to), *line]
 
 
 _Command = Callable[[str, Policy, int, int, Path], list[str]]

@@ -33,12 +33,7 @@ from gfm_hil.links import Link, link_kind, link_names
 from gfm_hil.links.base import LinkKind
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.links.pump import ported
-from gfm_hil.realtime.priority import (
-    ask_for_real_time,
-    leave_real_time,
-    own_processor,
-    restore_priority,
-)
+from gfm_hil.realtime import priority
 from gfm_hil.run.runner import controller_program
 from gfm_hil.scenario import Scenario, check_scenario, write_scenario
 from gfm_plant import plant_sample
@@ -265,7 +260,7 @@ def _started(c: Contender) -> Callable[[], None]:
     with Path(c.options["log"]).open("wb") as log:
         process = subprocess.Popen(
             guarded(c.options["program"], bounded=True), stdout=log, stderr=log,
-            start_new_session=True, preexec_fn=leave_real_time,
+            start_new_session=True, preexec_fn=priority.leave_real_time,
         )  # fmt: skip
 
     def close() -> None:
@@ -297,7 +292,7 @@ def answer(
     scenario = scenario.model_copy(update={"link": scenario.link.model_copy(update=patient)})
     with Interrupt() as interrupt:
         while not interrupt.came:
-            (ask_for_real_time if fifo else own_processor)("controller")
+            (priority.ask_for_real_time if fifo else priority.own_processor)("controller")
             link = open_end("controller", endpoint, options)
             try:
                 shake_hands(
@@ -334,7 +329,7 @@ def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) 
     getattr(link, "start", lambda: None)()
     thread = threading.Thread(target=work)
     thread.start()
-    restore_priority()
+    priority.restore_priority()
     while thread.is_alive():
         thread.join(_LOOK_S)
         stop[0] = interrupt.came

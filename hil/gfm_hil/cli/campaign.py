@@ -6,15 +6,7 @@ import sys
 from pathlib import Path
 
 from gfm_hil.api.studies import campaign
-from gfm_hil.cli.common import (
-    EXIT_INTERRUPTED,
-    EXIT_OTHERWISE,
-    add_open,
-    add_study_options,
-    new_folder,
-    show_page,
-    watching,
-)
+from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.realtime.priority import processors
 from gfm_hil.results.report import PAGE
@@ -33,8 +25,8 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--x", metavar="PATH", help="drawn path of the figure, or a sum a+b")
     command.add_argument("--y", metavar="PATH", help="the same; the first two drawn by default")
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
-    add_open(command)
-    add_study_options(command, "campaign.json")
+    common.add_open(command)
+    common.add_study_options(command, "campaign.json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -46,10 +38,10 @@ def call(options: argparse.Namespace) -> int:
     if options.only is not None:
         return _only(options)
     name, lost = Path(options.file).stem, ""
-    with watching(name, options.quiet, stoppable=True) as watch:
+    with common.watching(name, options.quiet, stoppable=True) as watch:
         try:
             found = campaign(
-                options.file, new_folder(options.out, name),
+                options.file, common.new_folder(options.out, name),
                 workers=processors() if options.workers is None else options.workers,
                 dask=options.dask, resume=options.resume, x=options.x, y=options.y, watch=watch,
             )  # fmt: skip
@@ -60,22 +52,22 @@ def call(options: argparse.Namespace) -> int:
     else:
         print_campaign(found)
     if found.folder is not None:
-        show_page(options, found.folder / PAGE)
+        common.show_page(options, found.folder / PAGE)
     if missing := found.summary["missing"]:
         again = f"go on with: gfmhil campaign {options.file} --out {found.folder} --resume"
         why = lost or "interrupted"
         print(f"gfmhil: {why}; {missing} runs are missing; {again}", file=sys.stderr)
-        return EXIT_OTHERWISE if lost else EXIT_INTERRUPTED
+        return common.EXIT_OTHERWISE if lost else common.EXIT_INTERRUPTED
     return 0
 
 
 def _only(options: argparse.Namespace) -> int:
     """One run of every law, in a worker: there its arithmetic is that of the campaign."""
-    with watching(Path(options.file).stem, options.quiet) as watch:
+    with common.watching(Path(options.file).stem, options.quiet) as watch:
         made = load_campaign(options.file, tell=checks_progress(watch))
     if not 0 <= options.only < made.file.runs:
         raise UserError(f"--only {options.only}: must lie in [0, {made.file.runs - 1}]")
-    folder = new_folder(options.out, f"{made.name}-{options.only}")
+    folder = common.new_folder(options.out, f"{made.name}-{options.only}")
     records = []
     with processes(1) as pool:
         for law in made.file.laws:

@@ -9,14 +9,16 @@ from rich.markup import escape
 
 from gfm_hil.api.plot import certificate as draw
 from gfm_hil.api.studies import certify
-from gfm_hil.cli.common import add_inner, watching
-from gfm_hil.cli.design.loop import save_figure
+from gfm_hil.cli.common import add_inner, numbers, two_numbers, watching
+from gfm_hil.cli.design.common import add_figure, save_figure
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.certificate import CertifiedLaws, Strength, counter_run, strength_of
+
+_RANGE = two_numbers("LOW:HIGH, e.g. 1.5:20")
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -25,13 +27,13 @@ def add(command: argparse.ArgumentParser) -> None:
         help="catalogue names or law files: any number of converters with each of them",
     )  # fmt: skip
     command.add_argument(
-        "--scr", metavar="LOW:HIGH", type=_range, default=(1.5, 20.0),
+        "--scr", metavar="LOW:HIGH", type=_RANGE, default=(1.5, 20.0),
         help="generalised short-circuit ratios of the class, at the filter capacitor "
         "(default: 1.5:20)",
     )  # fmt: skip
-    command.add_argument("--x-over-r", metavar="LOW:HIGH", type=_range, default=(3.0, 20.0),
+    command.add_argument("--x-over-r", metavar="LOW:HIGH", type=_RANGE, default=(3.0, 20.0),
                          help="of its lines (default: 3:20)")  # fmt: skip
-    command.add_argument("--power", metavar="LIST", type=_powers, default=(0.0, 0.5, 1.0),
+    command.add_argument("--power", metavar="LIST", type=numbers, default=[0.0, 0.5, 1.0],
                          help="P_ref of the operating points, p.u. (default: 0,0.5,1)")  # fmt: skip
     command.add_argument("--loads", action="store_true",
                          help="resistors and R-L loads may be at any node")  # fmt: skip
@@ -44,25 +46,9 @@ def add(command: argparse.ArgumentParser) -> None:
         "--network", action="append", default=[], metavar="SCENARIO",
         help="say whether this network belongs to the class; may be repeated",
     )  # fmt: skip
-    command.add_argument("-o", "--out", type=Path, metavar="FILE",
-                         help="figure: .png, .svg or .pdf")  # fmt: skip
+    add_figure(command)
     command.add_argument("--json", action="store_true", help="as JSON")
     command.add_argument("-q", "--quiet", action="store_true", help="no progress")
-
-
-def _range(text: str) -> tuple[float, float]:
-    low, _, high = text.partition(":")
-    try:
-        return float(low), float(high)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be LOW:HIGH, e.g. 1.5:20") from None
-
-
-def _powers(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(one) for one in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be numbers by commas, 0,0.5,1") from None
 
 
 def call(options: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ import re
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -117,13 +117,31 @@ def link_option(text: str) -> tuple[str, Any]:
         return key, value
 
 
+def two_numbers(form: str) -> Callable[[str], tuple[float, float]]:
+    """The type of an option that is two numbers of this form, such as ``LOW:HIGH, e.g. 1:20``."""
+
+    def read(text: str) -> tuple[float, float]:
+        try:
+            first, second = map(float, text.split(":"))
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r}: must be {form}") from None
+        return first, second
+
+    return read
+
+
 def window(text: str) -> list[float]:
     """FROM:TO in s, as [from, to]."""
+    return [*two_numbers("FROM:TO, two numbers in s")(text)]
+
+
+def numbers(text: str) -> list[float]:
+    """Numbers between commas."""
     try:
-        start, stop = map(float, text.split(":"))
+        return [float(one) for one in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be FROM:TO, two numbers in s") from None
-    return [start, stop]
+        why = f"{text!r}: must be numbers separated by commas, e.g. 1.5,3"
+        raise argparse.ArgumentTypeError(why) from None
 
 
 def endpoints(options: argparse.Namespace) -> dict[str, str]:

@@ -9,15 +9,7 @@ from typing import Any
 from rich.markup import escape
 
 from gfm_hil.api.studies import conform, judge_recording
-from gfm_hil.cli.common import (
-    add_inner,
-    add_map,
-    add_open,
-    add_study_options,
-    new_folder,
-    show_page,
-    watching,
-)
+from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.core.terminal import terminal
@@ -87,8 +79,8 @@ def add(command: argparse.ArgumentParser) -> None:
         "COMTRADE (.cfg, .cff), Parquet, MF4 or MAT",
     )  # fmt: skip
     command.add_argument("--part", metavar="NAME", help="with --recording: the part of the test")
-    add_map(command, "--controller, or the channels of --recording")
-    add_inner(command)
+    common.add_map(command, "--controller, or the channels of --recording")
+    common.add_inner(command)
     command.add_argument(
         "--against", action="extend", nargs="+", metavar="SET",
         help=f"{', '.join(shipped_sets())}, or paths of your own; all: the shipped ones (default)",
@@ -118,8 +110,8 @@ def add(command: argparse.ArgumentParser) -> None:
         "--list", nargs="?", const="tests", choices=("tests", "limits"),
         help="list the tests, or all limits with source and how each is known; run nothing",
     )  # fmt: skip
-    add_open(command)
-    add_study_options(command, "results.json")
+    common.add_open(command)
+    common.add_study_options(command, "results.json")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -142,9 +134,9 @@ def call(options: argparse.Namespace) -> int:
     if not options.law and options.controller is None and options.network is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
     laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
-    folder = new_folder(options.out, "conform")
+    folder = common.new_folder(options.out, "conform")
     began = time.monotonic()
-    with watching("conform", options.quiet, stoppable=True) as watch:
+    with common.watching("conform", options.quiet, stoppable=True) as watch:
         found = conform(
             laws, against, folder, inner=options.inner, converter=options.converter,
             controller=options.controller, ports=options.map,
@@ -155,7 +147,7 @@ def call(options: argparse.Namespace) -> int:
         print(json.dumps(found.plain(), indent=1))
     else:
         _print(found, time.monotonic() - began)
-    show_page(options, folder / PAGE)
+    common.show_page(options, folder / PAGE)
     return _EXIT[found.verdict]
 
 
@@ -170,9 +162,9 @@ def _recording(options: argparse.Namespace) -> int:
         raise UserError(
             "--against: name the one test that was recorded, such as ercot/2-phase-jump"
         )
-    folder = new_folder(options.out, "conform")
+    folder = common.new_folder(options.out, "conform")
     began = time.monotonic()
-    with watching("conform", options.quiet) as watch:
+    with common.watching("conform", options.quiet) as watch:
         found = judge_recording(
             options.recording, options.map, options.against[0], options.part, folder,
             converter=options.converter, figures=not options.no_figures, watch=watch,
@@ -183,7 +175,7 @@ def _recording(options: argparse.Namespace) -> int:
         for words in found.recordings.values():
             terminal().print(escape(words), highlight=False, soft_wrap=True)
         _print(found, time.monotonic() - began)
-    show_page(options, folder / PAGE)
+    common.show_page(options, folder / PAGE)
     return _EXIT[found.verdict]
 
 

@@ -16,30 +16,8 @@ from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
-from gfm_runtime import BuiltLaw, LawSet, law_file, law_names, load_law
-from gfm_runtime.firmware import (
-    CHECKED,
-    EVA,
-    FIXED,
-    FMI,
-    OPTIMISED,
-    REALS,
-    SHIPPED,
-    STYLES,
-    TARGETS,
-    Checked,
-    Proved,
-    build_dll,
-    check,
-    dll_sources,
-    elf_a2l,
-    export,
-    fmu,
-    golden,
-    make_modules,
-    prove,
-    stage_names,
-)
+from gfm_runtime import BuiltLaw, LawSet, firmware, law_file, law_names, load_law
+from gfm_runtime.firmware import CHECKED, EVA, FIXED, FMI, REALS, SHIPPED, STYLES, TARGETS
 from gfm_runtime.lawfile import LawFile
 
 ALL = "all"
@@ -113,9 +91,9 @@ def add(command: argparse.ArgumentParser) -> None:
     others = ", ".join(
         f"{target.optimised} on {name}"
         for name, target in TARGETS.items()
-        if target.optimised != OPTIMISED
+        if target.optimised != firmware.OPTIMISED
     )
-    proof.add_argument("--flags", help=f"for the compiler ({OPTIMISED}, {others})")
+    proof.add_argument("--flags", help=f"for the compiler ({firmware.OPTIMISED}, {others})")
     proof.add_argument(
         "--ticks", type=int, default=CHECKED, metavar="N", help=f"rows of each law ({CHECKED})"
     )
@@ -153,7 +131,7 @@ def call_export(options: argparse.Namespace) -> int:
         print(f"gfmhil: {names}: left out, since {which} does not cover schedules", file=sys.stderr)
         scheduled = []
     laws, omega_b = _laws(sets), _omega_b(options.f_n)
-    files = export(
+    files = firmware.export(
         laws, options.T_s, options.real, options.style, omega_b, scheduled,
         _files(options.laws) if options.style == "tunable" else None,
     )  # fmt: skip
@@ -175,11 +153,11 @@ def call_export(options: argparse.Namespace) -> int:
 
 def call_dll(options: argparse.Namespace) -> int:
     law = load_law(options.law, options.inner, options.counts)
-    files = dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
+    files = firmware.dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
     options.out.mkdir(parents=True, exist_ok=True)
     for file, text in files.items():
         write_text(options.out / file, text)
-    print(build_dll(options.out, law.name, files))
+    print(firmware.build_dll(options.out, law.name, files))
     return 0
 
 
@@ -197,7 +175,7 @@ def call_fmu(options: argparse.Namespace) -> int:
     omega_b = _omega_b(options.f_n)
     if options.xcp:
         need("elftools", "pyelftools", "firmware fmu --xcp", "calibration")
-    packed = fmu(law, options.T_s, options.real, options.fmi, omega_b, options.xcp)
+    packed = firmware.fmu(law, options.T_s, options.real, options.fmi, omega_b, options.xcp)
     with replacing(options.out) as part:
         part.write_bytes(packed)
     print(options.out)
@@ -206,7 +184,7 @@ def call_fmu(options: argparse.Namespace) -> int:
 
 def call_a2l(options: argparse.Namespace) -> int:
     need("elftools", "pyelftools", "firmware a2l", "calibration")
-    text, measured, calibrated = elf_a2l(options.elf)
+    text, measured, calibrated = firmware.elf_a2l(options.elf)
     write_text(options.out, text)
     print(f"{options.out}: {measured} measurements, {calibrated} characteristics")
     if not calibrated:
@@ -220,8 +198,8 @@ def call_a2l(options: argparse.Namespace) -> int:
 
 def call_golden(options: argparse.Namespace) -> int:
     laws, omega_b = _laws(_sets(options.laws, options.inner, options.counts)), _omega_b(options.f_n)
-    modules = make_modules(laws, options.T_s, options.real, omega_b)
-    text = golden(modules, _ticks(options.ticks)).csv()
+    modules = firmware.make_modules(laws, options.T_s, options.real, omega_b)
+    text = firmware.golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
         print(text, end="")
     else:
@@ -237,13 +215,13 @@ def call_include(_: argparse.Namespace) -> int:
 def call_check(options: argparse.Namespace) -> int:
     """Check a folder and print a table; 3 if a bit differs, or Frama-C has an alarm."""
     if options.target == EVA:
-        proofs = prove(options.folder)
+        proofs = firmware.prove(options.folder)
         if options.json:
             print(json.dumps([asdict(proof) for proof in proofs], indent=2))
         else:
             _print_proofs(proofs)
         return EXIT_OTHERWISE if any(proof.alarms for proof in proofs) else 0
-    results = check(options.folder, options.target, options.flags, _ticks(options.ticks))
+    results = firmware.check(options.folder, options.target, options.flags, _ticks(options.ticks))
     if options.json:
         print(json.dumps([asdict(result) for result in results], indent=2))
     else:
@@ -274,7 +252,7 @@ def _laws(sets: Sequence[LawSet]) -> dict[str, BuiltLaw]:
     """Laws by name; a scheduled law in its stages."""
     laws: dict[str, BuiltLaw] = {}
     for found in sets:
-        for label, law in zip(stage_names(found), found.laws, strict=True):
+        for label, law in zip(firmware.stage_names(found), found.laws, strict=True):
             if label in laws:
                 raise UserError(f"law {label!r}: is named twice")
             laws[label] = law
@@ -293,13 +271,13 @@ def _ticks(ticks: int) -> int:
     return ticks
 
 
-def _print_proofs(proofs: Sequence[Proved]) -> None:
+def _print_proofs(proofs: Sequence[firmware.Proved]) -> None:
     rows = [(p.name, p.functions, p.alarms, f"{p.seconds:g}") for p in proofs]
     table = Table(("law", "functions", "alarms", "seconds"), rows)
     terminal().print(table, highlight=False)
 
 
-def _print(results: Sequence[Checked]) -> None:
+def _print(results: Sequence[firmware.Checked]) -> None:
     heads = ("law", "rows", "words that differ", "instructions", "of these checks", "code [B]",
              "constants [B]", "state [B]", "stack [B]")  # fmt: skip
     rows = [

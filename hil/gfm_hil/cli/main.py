@@ -25,10 +25,7 @@ COMMANDS = {
     "recover": ("recover", "complete the folder of a run that a kill or a full disk cut off"),
     "merge": ("merge", "join the run folders of a controller and a plant started separately"),
     **{name: ("", entry.text) for name, entry in PORTS.items()},
-    "export": (
-        "export",
-        "write a finished run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF",
-    ),
+    "export": ("export", "write a run as MF4, CSV, MAT, Parquet, or its CAN frames as BLF"),
     "waveforms": (
         "waveforms",
         "show what a switched bridge does between the ticks of a run: ripple, spectrum, losses",
@@ -134,7 +131,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         top.print_help()
         return 0
     if not given[0].startswith("-") and given[0] not in COMMANDS:
-        return _refuse(_no_command(given[0]))
+        from gfm_hil.core.errors import UserError
+        from gfm_runtime.errors import allowed
+
+        return _refuse(UserError(f"{given[0]}: no command; {allowed(given[0], COMMANDS)}"))
     options, unknown = top.parse_known_args(given)
     if unknown:
         return _refuse(_unknown(options.parsed_by, unknown))
@@ -149,13 +149,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except Exception as problem:
         return _refuse(problem)
-
-
-def _no_command(word: str) -> Exception:
-    from gfm_hil.core.errors import UserError
-    from gfm_runtime.errors import allowed
-
-    return UserError(f"{word}: no command; {allowed(word, COMMANDS)}")
 
 
 def _unknown(parser: argparse.ArgumentParser, words: list[str]) -> Exception:

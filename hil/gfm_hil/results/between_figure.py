@@ -43,14 +43,8 @@ def draw_between(figure: Figure, between: BetweenTicks, title: str = "") -> list
     dress(axes[0], f"voltages of the legs against the middle of v_dc, each ±{b.V_dcref / 2:g} V")
     dress(axes[1], "currents of the bridge (thin) and of the line (thick) [A]")
     dress(axes[2], "v_dc [V]")
-    axes[1].legend(
-        fontsize=8,
-        frameon=False,
-        ncols=3,
-        loc="lower right",
-        bbox_to_anchor=(1, 1),
-        borderaxespad=0,
-    )
+    above = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0}
+    axes[1].legend(fontsize=8, frameon=False, ncols=3, **above)
     for a in axes[:3]:
         a.set_xlim(t[0], t[-1])
     axes[2].set_xlabel("t [s]", fontsize=9)

@@ -15,16 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle, Rectangle
 
 from gfm_hil.core.files import replacing
+from gfm_hil.results import single_line
 from gfm_hil.results.figures import as_svg, in_a_page
-from gfm_hil.results.single_line import (
-    Bar,
-    Line,
-    assign_lanes,
-    assign_rows,
-    bars_of,
-    collide,
-    converters_of,
-)
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_plant import Plant, load_converter
@@ -80,10 +72,10 @@ def fill_diagram(
         leads_to: fragment before the name of a converter: ``OF``, its chapter, or ``ONLY``, its
             curves among those of all.
     """
-    plants, laws, nodes = converters_of(scenario)
-    bars, lines = bars_of(scenario, nodes)
-    top = assign_rows(bars, lines)
-    if collide(bars, lines):
+    plants, laws, nodes = single_line.converters_of(scenario)
+    bars, lines = single_line.bars_of(scenario, nodes)
+    top = single_line.assign_rows(bars, lines)
+    if single_line.collide(bars, lines):
         return fill_narrow(figure, scenario, report, leads_to)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
     figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
@@ -139,9 +131,12 @@ def fill_narrow(
 ) -> Axes:
     """As ``fill_diagram`` for a narrow page: nodes below each other, lines on their left, and a
     converter's filter as text. A mesh with many lines beside each other needs a wider one."""
-    plants, laws, nodes = converters_of(scenario)
-    bars, lines = bars_of(scenario, nodes)
-    top, lanes = assign_rows(bars, lines, stacked=True), assign_lanes(bars, lines)
+    plants, laws, nodes = single_line.converters_of(scenario)
+    bars, lines = single_line.bars_of(scenario, nodes)
+    top, lanes = (
+        single_line.assign_rows(bars, lines, stacked=True),
+        single_line.assign_lanes(bars, lines),
+    )
     x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
     width, height = max(_NARROW, x + _WORDS), _STACKED_ROW * (top + 0.3)
     figure.set_size_inches(0.72 * width, 0.72 * height)
@@ -220,7 +215,7 @@ def _in_words(
     axes.text(x + 1.2, y, text, va="center", **_SMALL | {"color": _INK})
 
 
-def _url_of(line: Line, nodes: Mapping[str, str], report: str | None) -> str | None:
+def _url_of(line: single_line.Line, nodes: Mapping[str, str], report: str | None) -> str | None:
     """The curves of the converters at the ends of a line, if there are any in a report."""
     at_ends = [converter for converter, node in nodes.items() if node in line.ends]
     return f"{report}#{ONLY}{','.join(at_ends)}" if report is not None and at_ends else None
@@ -238,7 +233,7 @@ _MARKED: dict[str, Any] = {"fontsize": 7.5, "color": _RED}
 _SMALL: dict[str, Any] = {"fontsize": 7.5, "color": _GREY, "linespacing": 1.25}
 
 
-def _x_of(bar: Bar) -> float:
+def _x_of(bar: single_line.Bar) -> float:
     return _BARS + _COLUMN * bar.column
 
 

@@ -431,6 +431,23 @@ def draw_signals(
     return axes
 
 
+def _panel(
+    title: str,
+    t: ColumnLike,
+    columns: Mapping[str, ColumnLike],
+    events: Sequence[tuple[float, str]],
+    colours: Sequence[str],
+    most: int,
+    factor: float = 1.0,
+    bands: Sequence[tuple[float, float]] = (),
+) -> Panel:
+    """Columns by label, times ``factor``, over all of t [s], at ``most`` ticks."""
+    at = few_ticks([*columns.values()], most)
+    curves = {label: _at(x, at) * factor for label, x in columns.items()}
+    ends = 0.0, float(t[len(t) - 1 :][0])
+    return Panel(title, _at(t, at), curves, ends, events, colours=colours, bands=bands)
+
+
 def panels_of_run(
     scenario: Scenario, signals: Columns, summary: dict[str, Any], most: int = POINTS
 ) -> Iterator[Panel]:
@@ -440,12 +457,10 @@ def panels_of_run(
     limited = _limited(t, signals["limited"]) if "limited" in signals else []
     for title, named in panels:
         shown = TABLE[named[0][0]].shown(nominal_frequency(scenario))
-        at = few_ticks([signals[n] for n, _, _ in named], most)
-        curves = {label: _at(signals[n], at) * shown.factor for n, _, label in named}
-        yield Panel(
-            f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
-            _happened(summary), colours=[colour for _, colour, _ in named],
-            bands=limited if title == "currents" else (),
+        curves = {label: signals[n] for n, _, label in named}
+        yield _panel(
+            f"{title} [{shown.unit}]", t, curves, _happened(summary), [c for _, c, _ in named],
+            most, shown.factor, limited if title == "currents" else (),
         )  # fmt: skip
 
 
@@ -465,10 +480,7 @@ def panels_of_waves(
 
 
 def panels_of_all(
-    scenario: Scenario,
-    runs: Mapping[str, Columns],
-    events: Sequence[dict[str, Any]],
-    most: int = POINTS,
+    scenario: Scenario, runs: Mapping[str, Columns], events: Sequence[dict[str, Any]], most: int
 ) -> Iterator[Panel]:
     """The quantities ``SHARED`` of several runs for a page, a curve a run."""
     t = max((columns["t"] for columns in runs.values()), key=len)
@@ -476,19 +488,13 @@ def panels_of_all(
     colours = {run: COLOURS[k % len(COLOURS)] for k, run in enumerate(runs)}
     for title, name in SHARED:
         shown = TABLE[name].shown(nominal_frequency(scenario))
-        there = {run: columns for run, columns in runs.items() if name in columns}
-        if not there:
-            continue
-        each = {run: _Padded(columns[name], len(t)) for run, columns in there.items()}
-        at = few_ticks([*each.values()], most)
-        curves = {run: _at(column, at) * shown.factor for run, column in each.items()}
-        yield Panel(
-            f"{title} [{shown.unit}]", _at(t, at), curves, (0.0, float(t[len(t) - 1 :][0])),
-            happened, colours=[colours[run] for run in there],
-        )  # fmt: skip
+        curves = {run: _Padded(of[name], len(t)) for run, of in runs.items() if name in of}
+        if curves:
+            own = [colours[run] for run in curves]
+            yield _panel(f"{title} [{shown.unit}]", t, curves, happened, own, most, shown.factor)
 
 
-def panels_of_network(run: NetworkRun, most: int = POINTS) -> Iterator[Panel]:
+def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
     """What was recorded of a network's parts, for a page: P, Q and the size of the current of a few
     parts a panel, at the starts of lines, and the phases of the fault's current."""
     columns = next(iter(run.values())).columns
@@ -504,14 +510,10 @@ def panels_of_network(run: NetworkRun, most: int = POINTS) -> Iterator[Panel]:
     if f"{FAULT}.i_a" in there:
         phases = {f"i_{phase}": columns[f"{FAULT}.i_{phase}"] for phase in PHASES}
         each.append(("currents of the fault", phases))
-    t = columns["t"]
     happened = [(float(e["t"]), str(e["label"])) for e in run.events]
     for title, drawn in each:
-        at = few_ticks([*drawn.values()], most)
-        yield Panel(
-            f"{title} [p.u.]", _at(t, at), {name: _at(x, at) for name, x in drawn.items()},
-            (0.0, float(t[len(t) - 1 :][0])), happened, colours=COLOURS[: len(drawn)],
-        )  # fmt: skip
+        own = COLOURS[: len(drawn)]
+        yield _panel(f"{title} [p.u.]", columns["t"], drawn, happened, own, POINTS)
 
 
 class _Padded:
@@ -555,11 +557,8 @@ def _mark_run(
     """Mark events and trips from ``first`` to ``last``, s, and give the figure its title."""
     events = [e for e in summary["events"] if first <= e["t"] <= last]
     _mark(axes, events)
-    trips = [
-        {"t": x["t"], "label": reason_name(x["reason"])}
-        for x in summary.get("trips", [])
-        if first <= x["t"] <= last
-    ]
+    trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
+    trips = [x for x in trips if first <= x["t"] <= last]
     _mark(axes, trips, COLOURS[1], above=20 + 10 * min(3, len(events)))
     headline(figure, f"{scenario.title} — {controlled_by(summary)}")
 

@@ -138,7 +138,7 @@ def write_report(run: Run | NetworkRun) -> None:
         diagram = draw_diagram(folder, scenario, PAGE)
         write_together(
             folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
-            [*panels_of_network(run, POINTS)] if len(run.flows) > 1 else [],
+            [*panels_of_network(run)] if len(run.flows) > 1 else [],
         )  # fmt: skip
         return
     timing = draw_run(folder, scenario, run.columns, run.timing, run.summary)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_runtime import kernel
 from gfm_runtime.counts import COUNTS_NUMBERS, COUNTS_STATE, align, calibrate, measure, modulate
 from gfm_runtime.firmware import fixed
 from gfm_runtime.firmware.translate import (
@@ -28,14 +29,6 @@ from gfm_runtime.firmware.translate import (
     without_unread,
 )
 from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE, stage
-from gfm_runtime.kernel import (
-    advance,
-    advance_with_inner,
-    law_dtype,
-    look,
-    look_with_inner,
-    state_dtype,
-)
 from gfm_runtime.signals import N_ADC, N_LEGS, NU, NU_INNER, NY, NY_INNER, group
 from gfm_runtime.switchover import settle_into, settle_with_inner
 
@@ -83,7 +76,7 @@ def place(name: str, shape: tuple[int, ...], at: str) -> Expr | Array:
 
 
 def _state(real: np.dtype[Any], n: int) -> Struct:
-    of = state_dtype(real)
+    of = kernel.state_dtype(real)
     inside = {name: "stage" for name, *_ in INNER_STATE}
     inside |= {name: "counts" for name, *_ in COUNTS_STATE}
     fields = {}
@@ -118,7 +111,7 @@ class Tick:
         tuned: Mapping[str, Any] | None = None,
     ) -> None:
         self._n, own = n, record is not None
-        of = law_dtype(real)  # the constants as members of a record in C
+        of = kernel.law_dtype(real)  # the constants as members of a record in C
         fields = {name: place(name, of[name].shape, f"law->{name}") for name in of.names or ()}
         fields |= {name: number(1.0) for name in SHARED}
         if not stages:  # those of none
@@ -134,11 +127,11 @@ class Tick:
         u, trend = Array("u", (NU,)), Array("trend", (NU,))
         out = Array("out", (NU_INNER if stages else NU,))
         e = [Expr("var", (f"e[{k}]",)) for k in range(2)] if stages else []
-        self.look = translate.function(look, [*records, ref, y, u])
-        self.output, self.advance = self.look, translate.function(advance, records)
+        self.look = translate.function(kernel.look, [*records, ref, y, u])
+        self.output, self.advance = self.look, translate.function(kernel.advance, records)
         if stages:
-            self.output = translate.function(look_with_inner, [*records, ref, y, out])
-            self.advance = translate.function(advance_with_inner, records)
+            self.output = translate.function(kernel.look_with_inner, [*records, ref, y, out])
+            self.advance = translate.function(kernel.advance_with_inner, records)
         self.settle = translate.function(
             settle_with_inner if stages else settle_into, [*records, ref, y, u, trend, *e]
         )

@@ -49,6 +49,14 @@ FIELDS = ("error_parameters", "A", "B_r", "B_y", "C", "D_r", "D_y", "loop", "W",
 SETS = 3  #: sets of gains in golden rows
 
 
+def _both_ways(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
+    """The methods of an operator, for the number at its left and for that at its right."""
+    return (
+        lambda one, other: one.book.of(op, one, other),
+        lambda one, other: one.book.of(op, other, one),
+    )
+
+
 @dataclass(eq=False)
 class Recorded:
     """A number that remembers its operation and operands; ``near`` is its value beside the file's,
@@ -65,29 +73,10 @@ class Recorded:
     def __format__(self, spec: str) -> str:
         return format(self.near, spec)
 
-    def __add__(self, other: Any) -> Any:
-        return self.book.of("+", self, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return self.book.of("+", other, self)
-
-    def __sub__(self, other: Any) -> Any:
-        return self.book.of("-", self, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self.book.of("-", other, self)
-
-    def __mul__(self, other: Any) -> Any:
-        return self.book.of("*", self, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return self.book.of("*", other, self)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self.book.of("/", self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self.book.of("/", other, self)
+    __add__, __radd__ = _both_ways("+")
+    __sub__, __rsub__ = _both_ways("-")
+    __mul__, __rmul__ = _both_ways("*")
+    __truediv__, __rtruediv__ = _both_ways("/")
 
     def __neg__(self) -> Any:
         return self.book.of("neg", self)

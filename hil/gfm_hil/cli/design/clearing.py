@@ -3,14 +3,12 @@
 import argparse
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from gfm_hil.api.design import at_short_circuit_ratios
 from gfm_hil.api.plot import clearing_times
-from gfm_hil.cli.common import watching
-from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
-from gfm_hil.cli.design.loop import save_figure
+from gfm_hil.cli.common import numbers, watching
+from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
@@ -24,7 +22,7 @@ def add(kinds: Any) -> None:
     add_loop_options(command)
     command.set_defaults(scenario="deep_sag", call=call)
     command.add_argument(
-        "--scr", metavar="LIST", type=_ratios, default=[],
+        "--scr", metavar="LIST", type=numbers, default=[],
         help="short-circuit ratios by commas; that of the scenario by default",
     )  # fmt: skip
     command.add_argument(
@@ -37,16 +35,7 @@ def add(kinds: Any) -> None:
     command.add_argument(
         "--within", metavar="S", type=float, help="resolution; one tick by default"
     )
-    command.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
-    )
-
-
-def _ratios(text: str) -> list[float]:
-    try:
-        return [float(one) for one in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be numbers by commas, 1.5,3") from None
+    add_figure(command)
 
 
 def call(options: argparse.Namespace) -> int:

@@ -1,9 +1,12 @@
-"""What the design commands share: the options that choose a loop."""
+"""What the design commands share: the options that choose a loop, and the figure."""
 
 import argparse
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from gfm_hil.cli.common import OPTIONS, add_inner
+from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import Scenario, load_scenario
 
 
@@ -29,6 +32,28 @@ def add_loop_options(command: argparse.ArgumentParser) -> Any:
     add_converter_option(command)
     command.add_argument("--json", action="store_true", help="as JSON")
     return where
+
+
+def add_figure(command: argparse.ArgumentParser) -> None:
+    """The option that names the file of a figure."""
+    command.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
+    )
+
+
+def save_figure(path: Path, draw: Callable[[], object]) -> None:
+    """Save what ``draw`` draws in a figure of pyplot. Raises UserError: it cannot be saved."""
+    import matplotlib
+    from matplotlib import pyplot
+
+    matplotlib.use("Agg")
+    draw()
+    try:
+        pyplot.savefig(path, dpi=110)
+    except (OSError, ValueError) as problem:
+        raise UserError(f"--out {path}: {problem}") from None
+    finally:
+        pyplot.close()
 
 
 def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:

@@ -13,15 +13,7 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import WeightedChannel
 from gfm_design.tuning.paper import EVALUATIONS
-from gfm_hil.api.design import (
-    NotTuned,
-    Tuning,
-    channels_as_json,
-    gamma,
-    problem_name,
-    tune,
-    write_law,
-)  # fmt: skip
+from gfm_hil.api import design
 from gfm_hil.api.law import Law
 from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, watching
 from gfm_hil.cli.design.common import add_converter_option, chosen_scenario
@@ -52,7 +44,7 @@ def judged(file: LawFile, on: Scenario | None = None, converter: str | None = No
     """The name of a law, and which problem its gamma is that of if it is not the paper's."""
     if on is None and file.inner is None:
         return file.name
-    return f"{file.name}, {problem_name(file, on, converter)}"
+    return f"{file.name}, {design.problem_name(file, on, converter)}"
 
 
 def add_judged_on(command: argparse.ArgumentParser) -> None:
@@ -174,7 +166,7 @@ def _gamma(options: argparse.Namespace) -> int:
         law = law.with_gains(law.name, **given)
     try:
         T_s = T_S if options.discrete else None
-        channels = gamma(law, options.weights, T_s, on=on, converter=converter).channels
+        channels = design.gamma(law, options.weights, T_s, on=on, converter=converter).channels
     except Unstable as found:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(found)}))
@@ -182,7 +174,7 @@ def _gamma(options: argparse.Namespace) -> int:
             terminal().print(f"{law.name}: no gamma, {found}", highlight=False)
         return EXIT_OTHERWISE
     if options.json:
-        print(json.dumps({"law": law.name, **channels_as_json(channels)}, indent=2))
+        print(json.dumps({"law": law.name, **design.channels_as_json(channels)}, indent=2))
     else:
         print_channels(judged(law.file, on, converter), channels)
     return 0
@@ -228,7 +220,7 @@ def _tune(options: argparse.Namespace) -> int:
         raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
         found = _searched(law, on, options)
-    except NotTuned as none:
+    except design.NotTuned as none:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
         else:
@@ -237,7 +229,7 @@ def _tune(options: argparse.Namespace) -> int:
     named, channels = found.gains, found.gamma.channels
     result = {
         "law": law.name,
-        **channels_as_json(channels),
+        **design.channels_as_json(channels),
         "gamma_full_order": None,
         "gains": named,
         "at_bounds": found.at_bounds,
@@ -248,8 +240,8 @@ def _tune(options: argparse.Namespace) -> int:
     said = _bound(found, result) if options.full_order else ""
     if options.out:
         more = options.converter, options.weights, read_numbers(options.scr, "--scr")
-        problem = None if on is None else problem_name(law.file, on, *more)
-        write_law(Path(options.out), law.file, named, result, problem=problem)
+        problem = None if on is None else design.problem_name(law.file, on, *more)
+        design.write_law(Path(options.out), law.file, named, result, problem=problem)
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
@@ -265,10 +257,10 @@ def _tune(options: argparse.Namespace) -> int:
     return 0
 
 
-def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tuning:
+def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> design.Tuning:
     """The search, with a bar on stderr."""
     with watching(f"tuning {law.name}", options.quiet) as watch:
-        return tune(
+        return design.tune(
             law,
             start=read_gains(options.gains),
             only=None if options.only is None else options.only.split(","),
@@ -284,7 +276,7 @@ def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> Tun
         )
 
 
-def _bound(tuning: Tuning, result: dict[str, Any]) -> str:
+def _bound(tuning: design.Tuning, result: dict[str, Any]) -> str:
     """The full-order bound into the result; what to say of it."""
     try:
         found = tuning.bound()

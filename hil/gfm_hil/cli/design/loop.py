@@ -3,7 +3,6 @@
 import argparse
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
-from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
+from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
 from gfm_hil.cli.design.margins import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -50,9 +49,7 @@ def add(kinds: Any) -> None:
                 "--of", help="the input that steps; P_ref by default, in a network as A.P_ref"
             )
             command.add_argument("--seconds", type=_seconds, default=1.0, help="how long, s")
-        command.add_argument(
-            "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
-        )
+        add_figure(command)
         command.set_defaults(call=call, find=find, draw=draw)
 
 
@@ -92,21 +89,6 @@ def _seconds(text: str) -> float:
     if not 0.0 < value <= 1e4:
         raise argparse.ArgumentTypeError(f"{text!r}: must be a number in (0, 10000]")
     return value
-
-
-def save_figure(path: Path, draw: Callable[[], object]) -> None:
-    """Save what ``draw`` draws in a figure of pyplot. Raises UserError: it cannot be saved."""
-    import matplotlib
-    from matplotlib import pyplot
-
-    matplotlib.use("Agg")
-    draw()
-    try:
-        pyplot.savefig(path, dpi=110)
-    except (OSError, ValueError) as problem:
-        raise UserError(f"--out {path}: {problem}") from None
-    finally:
-        pyplot.close()
 
 
 def _at(options: argparse.Namespace) -> list[str]:

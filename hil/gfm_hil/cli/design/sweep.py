@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +10,8 @@ from gfm_hil.api.law import Law, as_law
 from gfm_hil.api.plot import root_locus, stability_map
 from gfm_hil.api.sweeps import POINTS, GainSweep, StabilityMap, sweep
 from gfm_hil.api.sweeps import stability_map as map_stability
-from gfm_hil.cli.common import watching
-from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
-from gfm_hil.cli.design.loop import save_figure
+from gfm_hil.cli.common import two_numbers, watching
+from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
@@ -21,6 +19,7 @@ from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario
 
 _ROWS = 9  # of the table
+_RANGE = two_numbers("LOW:HIGH, e.g. 1:20")
 
 
 def add(kinds: Any) -> None:
@@ -38,28 +37,18 @@ def add(kinds: Any) -> None:
             "gain", metavar="PARAMETER", help="of the law, as laws show lists them"
         )
         command.add_argument(
-            "--range", metavar="LOW:HIGH", type=_range, default=(None, None),
+            "--range", metavar="LOW:HIGH", type=_RANGE, default=(None, None),
             help="of the parameter; default: the law file's bounds, or a decade to both sides",
         )  # fmt: skip
         if call is _map:
             command.add_argument(
-                "--scr", metavar="LOW:HIGH", type=_range, default=(1.0, 20.0),
+                "--scr", metavar="LOW:HIGH", type=_RANGE, default=(1.0, 20.0),
                 help="short-circuit ratios (default: 1:20)",
             )  # fmt: skip
         command.add_argument("--points", type=int, default=points, help="values (%(default)s)")
         add_loop_options(command)
-        command.add_argument(
-            "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
-        )
+        add_figure(command)
         command.set_defaults(call=call)
-
-
-def _range(text: str) -> tuple[float, float]:
-    low, _, high = text.partition(":")
-    try:
-        return float(low), float(high)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: must be LOW:HIGH, e.g. 1:20") from None
 
 
 def _chosen(options: argparse.Namespace) -> tuple[Scenario, Law]:
@@ -81,7 +70,12 @@ def _sweep(options: argparse.Namespace) -> int:
     if options.out:
         save_figure(options.out, lambda: root_locus(found))
     if options.json:
-        print(json.dumps(_sweep_as_json(found, scenario), indent=2))
+        content = {
+            "law": found.law, "scenario": scenario.title, "parameter": found.gain,
+            "own": found.own, "stable": found.stable(), "values": found.values.tolist(),
+            "slowest": [mode and mode.plain() for mode in found.slowest()],
+        }  # fmt: skip
+        print(json.dumps(content, indent=2))
         return 0
     ranges = " and ".join(f"{low:.6g} to {high:.6g}" for low, high in found.stable())
     console = terminal(highlight=False)
@@ -108,14 +102,6 @@ def _sweep_table(found: GainSweep) -> Table:
         rows.append([float(found.values[k]), *cells])
     heads = [found.gain, "σ of the slowest mode [1/s]", "frequency [Hz]", "damping ratio"]
     return Table(heads, rows, text=0)
-
-
-def _sweep_as_json(found: GainSweep, scenario: Scenario) -> dict[str, Any]:
-    return {
-        "law": found.law, "scenario": scenario.title, "parameter": found.gain, "own": found.own,
-        "stable": found.stable(), "values": found.values.tolist(),
-        "slowest": [mode and mode.plain() for mode in found.slowest()],
-    }  # fmt: skip
 
 
 def _map(options: argparse.Namespace) -> int:

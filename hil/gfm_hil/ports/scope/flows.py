@@ -5,15 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gfm_hil.ports.scope.watched import WatchedRun
-from gfm_hil.results.single_line import (
-    Bar,
-    Lines,
-    assign_lanes,
-    assign_rows,
-    bars_of,
-    collide,
-    converters_of,
-)
+from gfm_hil.results import single_line
 from gfm_hil.scenario.events.breaker import GRID, switched
 from gfm_runtime.states import STATES
 
@@ -30,9 +22,9 @@ class Flows:
 
     def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
         self._runs = runs
-        _, laws, nodes = converters_of(self._scenario)
-        bars, lines = bars_of(self._scenario, nodes)
-        rows = assign_rows(bars, lines)
+        _, laws, nodes = single_line.converters_of(self._scenario)
+        bars, lines = single_line.bars_of(self._scenario, nodes)
+        rows = single_line.assign_rows(bars, lines)
         self._closed = dict.fromkeys(nodes, True) | {n: one.closed for n, one in lines.items()}
         network = self._scenario.network
         feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
@@ -54,7 +46,7 @@ class Flows:
                  "symbol": one.symbol}
                 for name, one in lines.items()
             ],
-            "mesh": collide(bars, lines), "stacked": _stacked(bars, lines),
+            "mesh": single_line.collide(bars, lines), "stacked": _stacked(bars, lines),
         }  # fmt: skip
 
     @property
@@ -84,10 +76,10 @@ class Flows:
         }
 
 
-def _stacked(bars: Mapping[str, Bar], lines: Lines) -> dict[str, Any]:
+def _stacked(bars: Mapping[str, single_line.Bar], lines: single_line.Lines) -> dict[str, Any]:
     """For a narrow page: the rows of each node, and the row and the lane of each line."""
-    rows = assign_rows(bars, lines, stacked=True)
-    lanes = assign_lanes(bars, lines)
+    rows = single_line.assign_rows(bars, lines, stacked=True)
+    lanes = single_line.assign_lanes(bars, lines)
     return {
         "rows": rows, "bars": {name: bar.rows for name, bar in bars.items()},
         "lines": {name: (one.row, lanes[name]) for name, one in lines.items()},

@@ -20,29 +20,24 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.port import Refusal
 from gfm_hil.recording.columns import describe, signals_of
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.c_text import identifier
-from gfm_runtime.lawfile import LawFile, build_law, tied
+from gfm_runtime.lawfile import build_law, tied
 from gfm_runtime.signals import SIGNALS, group, table_hash
 
 #: error codes
 OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
 CELL = 8  # bytes
-_EPK, _MEASURED, _REFERENCES, _LAW, _GAINS, _LAW_BYTES = (
-    0x800,
-    0x1000,
-    0x8000,
-    0x9000,
-    0x10000,
-    0x1000,
-)
+_EPK, _MEASURED, _REFERENCES, _LAW, _GAINS = 0x800, 0x1000, 0x8000, 0x9000, 0x10000
+_LAW_BYTES = 0x1000  # from the parameters of one law to those of the next
 _A_REFERENCE, _THE_LAW = "a reference", "the law"  # no law has such a name
 _RECORDED_S = 1.0  # how long a write waits until the recording has it
 #: the columns that are a signal of the table, with its range
@@ -54,16 +49,6 @@ _SIGNALS = {
     for s in SIGNALS
     if s.group in groups
 }  # fmt: skip
-
-
-class Controlled(Protocol):
-    """What the memory needs of an operator (``gfm_hil.ports.commands.Operator``)."""
-
-    def snapshot(self) -> dict[str, Any]:
-        """The newest recorded tick."""
-
-    def command(self, event: dict[str, Any], by: Any = None) -> dict[str, Any]:
-        """Carry out an event at once; its tick."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +78,7 @@ class Memory:
     """
 
     def __init__(
-        self, operator: Controlled, laws: Iterable[str], inner: int, recorded: Callable[[], int]
+        self, operator: Operator, laws: Iterable[str], inner: int, recorded: Callable[[], int]
     ) -> None:
         self._operator, self._recorded = operator, recorded
         self._laws = list(laws)
@@ -223,14 +208,11 @@ class Memory:
         if now.get("active") != kind:
             raise Refusal(ACCESS_DENIED, f"{kind}: is not the law in force")
         values = {n: v for n, v in given.items() if v != self._gain(kind, n, now)}
-        self._check_gains(self._files[kind], {**now["gains"], **values})
-        return {"type": "gains", "values": values} if values else None
-
-    def _check_gains(self, file: LawFile, changed: dict[str, float]) -> None:
         try:
-            build_law(file, tied(file, changed))
+            build_law(self._files[kind], tied(self._files[kind], {**now["gains"], **values}))
         except LawError as problem:
             raise Refusal(OUT_OF_RANGE, str(problem)) from None
+        return {"type": "gains", "values": values} if values else None
 
     def _at(self, address: int) -> _Number:
         cell = self._cells.get(address)

@@ -5,7 +5,6 @@ import contextlib
 import select
 import socket
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -34,41 +33,16 @@ _LARGEST = 2048  # bytes of a datagram
 _HIGHEST_ID = 0x7FF
 
 
-class Transport(ABC):
-    """Where a slave listens, once it is entered as a context."""
+class Udp:
+    """A UDP port at a host, open while in its context; port 0 is any."""
 
-    most: int  # bytes of a packet
-
-    @abstractmethod
-    def __enter__(self) -> Self:
-        """Listen; raises UserError if it cannot be opened."""
-
-    @abstractmethod
-    def __exit__(self, *_: object) -> None:
-        """Close it."""
-
-    @abstractmethod
-    def words(self) -> str:
-        """What it is, for people."""
-
-    @abstractmethod
-    def if_data(self) -> list[str]:
-        """The lines of the A2L file that tell a tool where to find it."""
-
-    @abstractmethod
-    def answer(self, slave: Slave, seconds: float) -> None:
-        """Let the slave answer what comes in that time; raises UserError if the bus is gone."""
-
-
-class Udp(Transport):
-    """A UDP port at a host; port 0 is any."""
-
-    most = MOST
+    most = MOST  # bytes of a packet
 
     def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
 
     def __enter__(self) -> Self:
+        """Listen. Raises UserError: it cannot be opened."""
         try:
             found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(*found[:3])
@@ -83,9 +57,11 @@ class Udp(Transport):
         self._socket.close()
 
     def words(self) -> str:
+        """What it is, for people."""
         return f"UDP {address(self._socket.getsockname())}"
 
     def if_data(self) -> list[str]:
+        """The lines of the A2L file that tell a tool where to find it."""
         return [
             "  /begin XCP_ON_UDP_IP",
             f'    0x0100 {self._port} ADDRESS "{self._host}"',
@@ -93,6 +69,7 @@ class Udp(Transport):
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
+        """Let the slave answer what comes in that time."""
         line, until = self._socket, time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0 and select.select([line], [], [], left)[0]:
             datagram, peer = line.recvfrom(_LARGEST)
@@ -102,9 +79,9 @@ class Udp(Transport):
                     line.sendto(said, peer)
 
 
-class CanFd(Transport):
-    """A CAN FD bus of python-can: a frame is a packet, with zeros behind it up to the next length
-    that a frame can have. Raises UserError: identifiers that cannot be.
+class CanFd:
+    """A CAN FD bus of python-can, used as ``Udp`` is; a frame is a packet, with zeros behind it up
+    to the next length that a frame can have. Raises UserError: identifiers that cannot be.
 
     Args:
         interface, channel: of python-can.
@@ -156,6 +133,7 @@ class CanFd(Transport):
         ]
 
     def answer(self, slave: Slave, seconds: float) -> None:
+        """As ``Udp.answer``. Raises UserError: the bus is gone."""
         bus, until = self._bus, time.monotonic() + seconds
         try:
             while (left := until - time.monotonic()) > 0 and (heard := bus.recv(left)) is not None:
@@ -175,7 +153,7 @@ class CanFd(Transport):
         )  # fmt: skip
 
 
-def packed(line: Transport, timeout_ms: int, commands: Sequence[str]) -> list[str]:
+def packed(line: Udp | CanFd, timeout_ms: int, commands: Sequence[str]) -> list[str]:
     """The A2L file's section on XCP: T1 and T2, ms, and the optional commands that there are."""
     return [
         "/begin IF_DATA XCP",
@@ -220,7 +198,7 @@ class XcpPort(OperatorPort):
 
     def check(self, options: argparse.Namespace) -> None:
         super().check(options)
-        self.line: Transport = Udp(options.host, options.port)
+        self.line: Udp | CanFd = Udp(options.host, options.port)
         if options.can is not None:
             self.line = CanFd(options.interface, options.can, options.ids)
 

@@ -9,26 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.controllers import (
-    FORMS,
-    PIL,
-    PortMap,
-    check_currents,
-    controller_file,
-    precision,
-    read_map,
-)
+from gfm_hil import controllers
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compile_external, compiled_benches
 from gfm_hil.recording.run import Run
-from gfm_hil.run.runner import (
-    Notice,
-    external_command,
-    run_in_memory,
-    run_network_in_memory,
-    run_scenario,
-)
+from gfm_hil.run import runner
 from gfm_hil.scenario import LinkSettings, Scenario, write_scenario
 from gfm_hil.studies.conformity.criteria import BY_KIND
 from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot_judge, judge, own_droop
@@ -56,20 +42,20 @@ class ControllerUnderTest:
     @property
     def command(self) -> list[str]:
         """The program that steps it."""
-        return external_command(self.model, self.ports)
+        return runner.external_command(self.model, self.ports)
 
     @property
-    def map(self) -> PortMap:
+    def map(self) -> controllers.PortMap:
         """The map of its ports."""
-        return read_map(self.ports)
+        return controllers.read_map(self.ports)
 
     @property
     def name(self) -> str:
         """What reports call it: its kind and the name of its file, or of its target. Raises
         UserError: there is no such file."""
-        if self.model.startswith(PIL):
+        if self.model.startswith(controllers.PIL):
             return self.model
-        kind, path = controller_file(self.model)
+        kind, path = controllers.controller_file(self.model)
         return f"{kind}:{path.name}"
 
 
@@ -161,14 +147,14 @@ def external_controller(model: str | None, ports: str | Path | None) -> Controll
         if ports is not None:
             raise UserError(f"map {ports}: is of a controller; name it too")
         return None
-    if model.startswith(PIL):
+    if model.startswith(controllers.PIL):
         if ports is not None:
             raise UserError(f"map {ports}: {model} has our signals, and takes no map")
-        precision(model)
+        controllers.precision(model)
         return ControllerUnderTest(model)
-    kind, path = controller_file(model, FORMS)
+    kind, path = controllers.controller_file(model, controllers.FORMS)
     file = None if ports is None else Path(ports).absolute()
-    read_map(file)
+    controllers.read_map(file)
     return ControllerUnderTest(f"{kind}:{path}", file)
 
 
@@ -195,7 +181,7 @@ def make_jobs(
     if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
         stage = law_file(start).inner if inner is None else named_inner(inner)
-        check_currents(external.name, stage is not None)
+        controllers.check_currents(external.name, stage is not None)
         each.append((external.name, start, external))
     declared = {file: declared_for(under, file) for _, file, _ in each}
     return [
@@ -295,7 +281,7 @@ def share_starts(
     return [replace(job, start=of.get(k)) for k, job in enumerate(jobs)]
 
 
-def compile_once(jobs: Sequence[Job], notice: Notice) -> None:
+def compile_once(jobs: Sequence[Job], notice: runner.Notice) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     seen = set[tuple[int, int, bool]]()
     for job in jobs:
@@ -413,14 +399,14 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
     if job.external is not None:
         folder = stack.enter_context(scratch.temporary("gfmhil-conform-")) / "run"
         if job.start is None:
-            run = run_scenario(scenario, folder, controller_command=job.external.command)
+            run = runner.run_scenario(scenario, folder, controller_command=job.external.command)
         else:
             run = job.start.go_on(scenario, folder)
         if run.status == "interrupted":
             raise KeyboardInterrupt
         return judged(scenario, run, job.external.map.settle_s, job.start), {}
     if scenario.network is None:
-        return run_in_memory(scenario), {}
-    runs = run_network_in_memory(scenario)
+        return runner.run_in_memory(scenario), {}
+    runs = runner.run_network_in_memory(scenario)
     name = job.judged or scenario.converters[0]
     return runs[name], {other: run for other, run in runs.items() if other != name}
