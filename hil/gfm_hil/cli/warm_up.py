@@ -51,12 +51,9 @@ def call(options: argparse.Namespace) -> int:
 def _compile_everything(
     notice: Callable[[str], None], under_way: Callable[[str], None]
 ) -> tuple[int, int]:
-    """Compile what any run may call, several sets at a time, and those first that others need.
-    Raises WorkerLost: a process died.
-
-    Returns:
-        How many sets of functions there are, and how many numba had to compile.
-    """
+    """Compile what any run may call, several sets at a time, and those first that others need;
+    returns how many sets there are, and how many numba had to compile. Raises WorkerLost: a process
+    died."""
     from concurrent.futures import FIRST_COMPLETED, Future, wait
     from concurrent.futures.process import BrokenProcessPool
 

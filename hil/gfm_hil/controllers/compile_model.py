@@ -14,21 +14,16 @@ _MAIN = re.compile(r"^\s*(int|void)\s+main\s*\(", re.MULTILINE)
 
 
 def compile_model(sources: Sequence[Path], include: Sequence[Path], library: Path) -> list[Path]:
-    """Compile C files, and those of folders that have no ``main``, to a shared library.
+    """Compile C files, and those of folders that have no ``main``, to a shared library; returns the
+    files that were compiled.
 
-    What they take from ``windows.h`` is that of ``controllers/windows``.
+    What they take from ``windows.h`` is that of ``controllers/windows``. Raises UserError: there is
+    no such folder, source or compiler. Raises LawError: the compiler fails; with its first error.
 
     Args:
         sources: files and folders.
         include: folders of further headers.
         library: what is written.
-
-    Returns:
-        the files that were compiled.
-
-    Raises:
-        UserError: there is no such folder, source or compiler.
-        LawError: the compiler fails; with its first error.
     """
     for folder in include:
         if not folder.is_dir():

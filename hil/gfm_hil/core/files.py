@@ -57,16 +57,13 @@ def _refused(path: Path) -> Iterator[None]:
 
 
 def read_json(path: Path, model: type[BaseModel], most: int = SMALL) -> dict[str, Any]:
-    """The content of a JSON file of a run folder.
+    """The content of a JSON file of a run folder. Raises FileNotFoundError: it is not there. Raises
+    UserError: one line: as ``open_file``, or it is no JSON or not what it must be.
 
     Args:
         path: of the file.
         model: what it must be.
         most: how many bytes it may have.
-
-    Raises:
-        FileNotFoundError: it is not there.
-        UserError: one line: as ``open_file``, or it is no JSON or not what it must be.
     """
     data = read_file(path, most)
     check_values(path, data)

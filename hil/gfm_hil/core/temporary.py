@@ -80,13 +80,9 @@ def make(prefix: str, where: Path) -> tuple[Path, int]:
 
 
 def hold(place: Path) -> int:
-    """Use a folder that another process of our user has made.
-
-    Raises:
-        FileNotFoundError: it is gone.
-        PermissionError: it belongs to another user, or is open to others.
-        TimeoutError: a process that removes unused folders keeps it locked.
-    """
+    """Use a folder that another process of our user has made. Raises FileNotFoundError: it is gone.
+    Raises PermissionError: it belongs to another user, or is open to others. Raises TimeoutError: a
+    process that removes unused folders keeps it locked."""
     handle = os.open(place, _FOLDER)
     try:
         if not is_private(os.fstat(handle)):

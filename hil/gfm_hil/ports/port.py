@@ -146,11 +146,8 @@ def recorded(folder: Path) -> bool:
 
 
 class OperatorPort(ABC):
-    """A way into a run, as a command of its own and as an option of ``gfmhil run``.
-
-    Args:
-        name: in the registry.
-    """
+    """A way into a run, as a command of its own and as an option of ``gfmhil run``; ``name`` is
+    that in the registry."""
 
     text = ""  # what the command does, for its help, if the registry does not say all of it
     risk: str  # what may happen at an address that others reach

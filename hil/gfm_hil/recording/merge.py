@@ -39,12 +39,10 @@ def _recorded(file: Path, ticks: int) -> int:
 def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     """Write signals.npz and timing.npz from the parts, which stay.
 
-    Rows end where the plant's recording does (where it is missing, the controller's). Each part
-    is read once; memory is that of a few blocks of rows.
-
-    Raises:
-        OSError: a file cannot be written; it is then not there.
-        UserError: a part is damaged, or ``parts`` is a link to anything but a recording.
+    Rows end where the plant's recording does (where it is missing, the controller's). Each part is
+    read once; memory is that of a few blocks of rows. Raises OSError: a file cannot be written; it
+    is then not there. Raises UserError: a part is damaged, or ``parts`` is a link to anything but a
+    recording.
     """
     parts = {role: part for role in ROLES if (part := RolePart.read(folder, role)) is not None}
     place = place_of(folder) or folder

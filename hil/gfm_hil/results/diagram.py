@@ -39,8 +39,8 @@ def draw_diagram(
     """Draw the diagram into network.svg of a run folder; returns it as elements of a page, one for
     wide screens and one for narrow ones.
 
-    Args:
-        report, leads_to: as for ``fill_diagram``; the links of the elements are within their page.
+    ``report`` and ``leads_to`` are as for ``fill_diagram``; the links of the elements are within
+    their page.
     """
     elements = []
     for width, fill in (("wide", fill_diagram), ("narrow", fill_narrow)):

@@ -77,7 +77,9 @@ def finish(
     report: Report | None = None,
     outside: Outcome | None = None,
 ) -> Run:
-    """Turn the parts that the sides left in ``folder`` into the files of a run.
+    """Turn the parts that the sides left in ``folder`` into the files of a run. Raises Unfinished:
+    a file cannot be written; ``recover`` completes the folder. Raises KeyboardInterrupt: SIGINT,
+    SIGTERM or SIGHUP came; the message says the same.
 
     Args:
         scenario, folder: of the run.
@@ -85,10 +87,6 @@ def finish(
         wall_s: how long it took.
         report: draws the figures and writes report.html; None for a folder without them.
         outside: how it ended as seen from outside the sides, which may not have lived to say.
-
-    Raises:
-        Unfinished: a file cannot be written; ``recover`` completes the folder.
-        KeyboardInterrupt: SIGINT, SIGTERM or SIGHUP came; the message says the same.
     """
     ended = _Ended(wall_s=wall_s, figures=report is not None, outside=outside)
     with _kept(folder):
@@ -102,12 +100,9 @@ def recover(folder: Path, report: Report | None = None) -> Run:
     ``report`` as for ``finish``; it is not called for a run that was to have none.
 
     What lies in the folder may be anything: no link in it is followed, and nothing is removed or
-    written elsewhere than there and in the run's own folder in memory.
-
-    Raises:
-        UserError: it is no run folder, the run is still going on, its recording is gone, or a file
-            is none of a run.
-        Unfinished: a file cannot be written.
+    written elsewhere than there and in the run's own folder in memory. Raises UserError: it is no
+    run folder, the run is still going on, its recording is gone, or a file is none of a run. Raises
+    Unfinished: a file cannot be written.
     """
     if not (folder / "scenario.toml").is_file():
         raise UserError(f"{folder}: is not a run folder (scenario.toml is missing)")

@@ -112,12 +112,9 @@ class _Type:
 
 
 def elf_a2l(path: Path) -> tuple[str, int, int]:
-    """The A2L text of a firmware; how many measurements and characteristics it has.
-
-    Raises:
-        LawError: it is no linked ELF file, has no debug information, or no exported law.
-        OSError: it cannot be opened, is no regular file or is too large.
-    """
+    """The A2L text of a firmware; how many measurements and characteristics it has. Raises
+    LawError: it is no linked ELF file, has no debug information, or no exported law. Raises
+    OSError: it cannot be opened, is no regular file or is too large."""
     entries, big_endian, identifications = elf_entries(path)
     about = f"laws of gfmhil in {path.name}"
     calibrated = sum(entry.calibrated for entry in entries)

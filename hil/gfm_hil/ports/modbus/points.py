@@ -123,9 +123,7 @@ class PointGroup(ABC):
     """Points that clients write together, because only together they say what is wanted."""
 
     writable: tuple[str, ...]  # paths of the points that clients may write
-    layout: Mapping[
-        int, Mapping[str, Any]
-    ] = {}  # its own models, by number, as ``Measures.models``
+    layout: Mapping[int, Mapping[str, Any]] = {}  # its own models, as ``Measures.models``
 
     @abstractmethod
     def plan(self, written: Written, run: RunState, now: float) -> Effect:
@@ -466,11 +464,8 @@ _SHORTEST_MS, _LONGEST_MS = 100, 3_600_000  # of HbTms
 
 
 class Heartbeat(PointGroup):
-    """The client's heartbeat: once a client has written it, it must keep changing.
-
-    Args:
-        timeout_ms: how long it may stay the same; 0: for ever.
-    """
+    """The client's heartbeat: once a client has written it, it must keep changing, and stay the
+    same for no longer than ``timeout_ms``; 0: for ever."""
 
     writable = ("715.ControllerHb", f"{VENDOR}.HbTms")
 
@@ -545,11 +540,8 @@ class Operation(PointGroup):
 
 
 class Direct(PointGroup):
-    """Points that act at once: references and droops.
-
-    Args:
-        points: by path, the name of the reference or droop, and its 1 p.u. in the point's unit.
-    """
+    """Points that act at once: by path, the name of a reference or a droop, and its 1 p.u. in the
+    point's unit."""
 
     def __init__(self, gains: LawDroops, points: Mapping[str, tuple[str, float]]) -> None:
         self._gains, self._points, self.writable = gains, points, tuple(points)

@@ -13,12 +13,8 @@ _SHOWN = ("p", "q", "V", "omega_u")  # p.u.; the pyramid has omega_u as a freque
 
 
 class Flows:
-    """The diagram of a network and its newest tick. Raises LawError: a law cannot be read; the
-    diagram has the titles of all.
-
-    Args:
-        runs: of its converters, by name.
-    """
+    """The diagram of a network and its newest tick, from the runs of its converters by name. Raises
+    LawError: a law cannot be read; the diagram has the titles of all."""
 
     def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
         self._runs = runs

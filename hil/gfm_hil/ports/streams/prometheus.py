@@ -34,11 +34,7 @@ _Values = tuple[str, Iterable[tuple[str, float]]]  # of a metric by name, by wha
 
 class RunCollector(Collector):
     """The metrics of a run, of a network with the label ``converter``; for scrapes in any thread.
-
-    Attributes:
-        followers: of the run, or of each converter; none before the run begins: there is nothing to
-            collect.
-    """
+    It has the followers of the run, or of each converter; none before the run begins."""
 
     def __init__(self, followers: Sequence[Follower] = ()) -> None:
         self.followers = followers

@@ -119,12 +119,9 @@ def run_campaign(
     y: str | None,
     watch: Watch = SILENT,
 ) -> CampaignResult:
-    """As ``gfmhil.campaign``, with law files by name.
-
-    Raises:
-        UserError: one line a mistake; the folder is in use.
-        WorkerLost: a worker died, or a run raised an error; its ``result`` has all others.
-    """
+    """As ``gfmhil.campaign``, with law files by name. Raises UserError: one line a mistake; the
+    folder is in use. Raises WorkerLost: a worker died, or a run raised an error; its ``result`` has
+    all others."""
     check_workers(workers)
     if resume and folder is None:
         raise UserError("resume: goes with the folder to go on with (--out)")

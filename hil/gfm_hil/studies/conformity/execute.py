@@ -213,13 +213,9 @@ def declared_for(under: UnderTest, law: str) -> UnderTest:
 
 
 def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]:
-    """What becomes of all jobs; 1 worker runs all in this process.
-
-    Raises:
-        UserError: so many workers cannot be.
-        WorkerLost: a worker died, or a run raised an error.
-        KeyboardInterrupt: the watch stopped it before its end.
-    """
+    """What becomes of all jobs; 1 worker runs all in this process. Raises UserError: so many
+    workers cannot be. Raises WorkerLost: a worker died, or a run raised an error. Raises
+    KeyboardInterrupt: the watch stopped it before its end."""
     found: list[PartResult] = []
 
     def keep(one: PartResult) -> None:
