@@ -120,11 +120,7 @@ def conform(
         KeyboardInterrupt: the watch stopped it.
     """
     check_workers(workers)
-    over = None if network is None else NetworkUnderTest.load(network, judged)
-    if over is None and judged is not None:
-        raise UserError(f"--judged {judged}: is of a --network, and none is given")
-    if over is not None and controller is not None:
-        raise UserError(f"--controller {controller}: is one controller; a network has several")
+    over = _network(network, judged, controller)
     given = [law] if isinstance(law, str | Path | Law) else list(law)
     external = external_controller(controller, ports)
     if not given and over is not None:
@@ -132,9 +128,7 @@ def conform(
     if not given and external is None:
         raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
-    place = None if folder is None else Path(folder)
-    if place is not None:
-        check_empty(place)
+    place = _new_place(folder)
     cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
     if over is not None:
         under = under.model_copy(update={"plant": over.plant})
@@ -156,8 +150,36 @@ def conform(
     made = Conformity(
         names, inner, under, cases, found, place, hashes, digests, droops, network=words
     )
-    if place is not None:
-        made.write(place, watch.notice)
+    return _written(made, watch)
+
+
+def _network(
+    network: str | Path | None, judged: str | None, controller: str | None
+) -> NetworkUnderTest | None:
+    """The network over which tests are laid, if there is one. Raises UserError: what goes with
+    none, or not with one."""
+    if network is None:
+        if judged is not None:
+            raise UserError(f"--judged {judged}: is of a --network, and none is given")
+        return None
+    over = NetworkUnderTest.load(network, judged)
+    if controller is not None:
+        raise UserError(f"--controller {controller}: is one controller; a network has several")
+    return over
+
+
+def _new_place(folder: str | Path | None) -> Path | None:
+    """The folder of a report. Raises UserError: it holds something."""
+    if folder is None:
+        return None
+    check_empty(Path(folder))
+    return Path(folder)
+
+
+def _written(made: Conformity, watch: Watch) -> Conformity:
+    """What the tests showed, with its report in its folder if it has one."""
+    if made.folder is not None:
+        made.write(made.folder, watch.notice)
     return made
 
 
@@ -188,10 +210,7 @@ def judge_recording(
         UserError: one line a mistake, before anything is judged: a file cannot be read, a channel
             is missing, or the recording does not begin where the test does.
     """
-    file, map_file = Path(file), Path(map_file)
-    place = None if folder is None else Path(folder)
-    if place is not None:
-        check_empty(place)
+    file, map_file, place = Path(file), Path(map_file), _new_place(folder)
     cases, under = load_cases([str(against)]), load_under_test(converter)
     if len(cases) > 1:
         raise UserError(f"--against {against}: a recording is of one test: {[c.id for c in cases]}")
@@ -208,9 +227,7 @@ def judge_recording(
         [name], None, under, cases, [found], place, hashes, droops={name: under.droop},
         recordings={name: words},
     )  # fmt: skip
-    if place is not None:
-        made.write(place, watch.notice)
-    return made
+    return _written(made, watch)
 
 
 def scan(
