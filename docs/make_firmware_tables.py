@@ -14,7 +14,7 @@ from _ext.outputs import command
 
 from gfm_hil.core.files import write_text
 from gfm_runtime import law_names, load_law
-from gfm_runtime.firmware import FIXED, SHIPPED, TARGETS, Checked, check, export, stage_names
+from gfm_runtime.firmware import FIXED, SHIPPED, TARGETS, CheckResult, check, export, stage_names
 from gfm_runtime.firmware.report import DEAD_BUS, deviation_text
 from gfm_runtime.inner_file import inner_names
 from gfm_runtime.signals import U_NAMES
@@ -52,12 +52,14 @@ def main() -> None:
     write_text(TABLES / "firmware_stages.md", _stages(stages))
 
 
-def _measured(folder: Path, laws: str, target: str, real: str, style: str) -> dict[str, Checked]:
+def _measured(
+    folder: Path, laws: str, target: str, real: str, style: str
+) -> dict[str, CheckResult]:
     command(f"gfmhil firmware export {laws} --real {real} --style {style} -o {folder}")
     return {found.name: found for found in check(folder, target)}
 
 
-def _table(results: list[dict[str, Checked]]) -> str:
+def _table(results: list[dict[str, CheckResult]]) -> str:
     heads, units = ["law"], ["---"]
     for (target, real, style), _ in zip(MEASURED, results, strict=True):
         heads += [f"{target} {real}, {style}: instructions", "code [B]"]
@@ -86,7 +88,7 @@ def _table(results: list[dict[str, Checked]]) -> str:
     )
 
 
-def _fixed(folder: Path, in_float32: dict[str, Checked]) -> str:
+def _fixed(folder: Path, in_float32: dict[str, CheckResult]) -> str:
     """What the laws cost in fixed point, and how far they get from float64 at most."""
     laws = {
         name: law
@@ -119,7 +121,7 @@ def _version(target: str) -> str:
     return f"{said.stdout.splitlines()[0]}, `{TARGETS[target].optimised}`"
 
 
-def _stages(results: dict[str, list[Checked]]) -> str:
+def _stages(results: dict[str, list[CheckResult]]) -> str:
     heads = (f"{STAGED} with", "on", "instructions", "code [B]", "constants [B]", "state [B]",
              "stack [B]")  # fmt: skip
     lines = ["| " + " | ".join(heads) + " |", "| --- | --- " + "| ---: " * 5 + "|"]

@@ -28,7 +28,7 @@ def limits() -> str:
     in which way."""
     rows = sets.all_limits(sets.load_cases(["all"]))
     cells = [[str(x).replace("|", "\\|") for x in row.values()] for row in rows]
-    return f"{sets.counted(rows)}\n\n{markdown([*rows[0]], cells)}"
+    return f"{sets.count_limits(rows)}\n\n{markdown([*rows[0]], cells)}"
 
 
 def keys() -> str:

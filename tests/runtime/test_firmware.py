@@ -17,7 +17,7 @@ from gfm_runtime import BuiltLaw, LawError, LawSet, get_law, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
-from gfm_runtime.firmware.c_text import chosen, literal, plain
+from gfm_runtime.firmware.c_text import choose_parts, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
 from gfm_runtime.firmware.module import BAD_REF, fields, sources
 from gfm_runtime.firmware.report import read_report
@@ -288,7 +288,7 @@ int g(void);
     ],
 )  # fmt: skip
 def test_a_choice_is_made(one, two, three, calls):
-    made = chosen(CHOICE, {"one": one, "two": two, "three": three})
+    made = choose_parts(CHOICE, {"one": one, "two": two, "three": three})
     body = "".join(f"    {name}();\n" for name in calls)
     assert made == f"int f(void)\n{{\n{body}}}\n" + "int g(void);\n" * two
 

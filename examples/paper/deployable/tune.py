@@ -20,8 +20,8 @@ from gfm_hil.cli.design.gains import (
     add_law_options,
     channels_as_json,
     chosen_law,
-    judged,
     print_channels,
+    problem_title,
     read_gains,
 )
 from gfm_hil.core.errors import UserError
@@ -74,7 +74,8 @@ def call(options: argparse.Namespace) -> int:
     named = tied(file, dict(zip([g.name for g in gains], values, strict=True)))
     result = channels_as_json(channels) | {"seed": options.seed, "seconds": found.seconds}
     _write(Path(options.out), file, named, result | {"source": source}, box, demands)
-    print_channels(judged(file.model_copy(update={"name": Path(options.out).stem})), channels)
+    renamed = file.model_copy(update={"name": Path(options.out).stem})
+    print_channels(problem_title(renamed), channels)
     return 0
 
 

@@ -78,10 +78,10 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
     phase.axhline(-180.0, color=GREY, lw=0.8)
     _tick_degrees(phase)
-    return _finish([gain, phase], f"{_named(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
+    return _finish([gain, phase], f"{_title(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
 
 
-def _named(loop: ClosedLoop) -> str:
+def _title(loop: ClosedLoop) -> str:
     """The law, and the scenario if it is known."""
     return f"{title_of(loop)}, {loop.where}" if loop.where else title_of(loop)
 
@@ -129,7 +129,7 @@ def nyquist(loop: ClosedLoop, *at: str) -> Axes:
     """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
     ``bode``."""
     loci = {name: L for name, _, L in _gains(loop, at)}
-    return complex_plane(f"{_named(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
+    return complex_plane(f"{_title(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
 
 
 @with_look
@@ -154,7 +154,7 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
             t, each = loop.step_response(of, seconds)
             curves = [(each[one], colours[one], one) for one in loop.names]
         else:
-            title = f"{_named(loop)}: {title}"
+            title = f"{_title(loop)}: {title}"
             t, y = loop.step_response(of, seconds)
             curves = [(y, COLOURS[0], "")]
     except ValueError as problem:
@@ -191,7 +191,7 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
         ):
             some = poles[here]
             axes.plot(some.real, some.imag / (2 * np.pi), marker, color=colour, ms=5)
-        title = f"{_named(loop)}: poles, stable where σ < 0"
+        title = f"{_title(loop)}: poles, stable where σ < 0"
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
@@ -321,7 +321,7 @@ def impedance(loop: ClosedLoop) -> list[Axes]:
         _curve(size, hz, np.abs(Z[:, i, j]), k, name)
         _curve(phase, hz, _degrees(Z[:, i, j]), k, name)
     size.set_yscale("log")
-    title = f"{_named(loop)}: output impedance at the capacitor, dq"
+    title = f"{_title(loop)}: output impedance at the capacitor, dq"
     _tick_degrees(phase)
     return _finish([size, phase], title, "|Z| [p.u.]", "∠Z [°]")
 

@@ -91,7 +91,7 @@ def _silent(*_: object) -> None:
     """Neither progress nor notices."""
 
 
-def _explained(run: Run | NetworkRun) -> None:
+def _explain_and_report(run: Run | NetworkRun) -> None:
     """The figures and the report of a run; if it did not last because its linear loop is unstable,
     its summary says so."""
     if isinstance(run, Run) and run.status not in ("completed", "interrupted"):
@@ -146,17 +146,17 @@ def run(
     if folder is not None:
         if isinstance(law, Law):
             raise UserError(f"law = {law.name!r}: save it first, as the folder names its file")
-        checked = _checked(scenario, {**changes, "law": law})
+        checked = _load(scenario, {**changes, "law": law})
         command = runner.controller_program(checked, controller, ports, notice)
-        report = _explained if figures else None
+        report = _explain_and_report if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
         raise UserError("controller, ports: take a folder")
     with law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
-        made = runner.run_in_memory(_checked(scenario, changes, in_process=True))
-    return _named(made, law) if isinstance(law, Law) else made
+        made = runner.run_in_memory(_load(scenario, changes, in_process=True))
+    return _with_name(made, law) if isinstance(law, Law) else made
 
 
 def run_network(
@@ -179,7 +179,7 @@ def run_network(
     Raises:
         UserError: one line a mistake; it has no network; or no operating point.
     """
-    checked = _checked(scenario, changes, in_process=folder is None)
+    checked = _load(scenario, changes, in_process=folder is None)
     if checked.network is None:
         raise UserError("network: the scenario has none; use gfmhil.run")
     for name in (*controllers, *ports):
@@ -202,7 +202,7 @@ def run_network(
     return runner.run_network(checked, Path(folder), progress, notice, report, commands)
 
 
-def _checked(
+def _load(
     scenario: str | Path | Scenario | dict[str, Any],
     changes: dict[str, Any],
     in_process: bool = False,
@@ -217,7 +217,7 @@ def _checked(
     return load_scenario(scenario, in_process=in_process, **changes)
 
 
-def _named(made: Run, law: Law) -> Run:
+def _with_name(made: Run, law: Law) -> Run:
     """The run of a ``Law``: its name in place of its temporary file, and its text."""
     scenario = made.scenario.model_copy(update={"law": law.name})
     return replace(made, scenario=scenario, law_text=law.to_toml())
@@ -245,7 +245,7 @@ def load_run(
         return Run.load(folder)
     if map is None or scenario is None:
         raise UserError(f"{folder}: a recording takes both, its map and the scenario")
-    return open_recording(folder, map, _checked(scenario, {}, in_process=True))
+    return open_recording(folder, map, _load(scenario, {}, in_process=True))
 
 
 def recover(folder: str | Path) -> Run | NetworkRun:
@@ -363,7 +363,7 @@ def compare(
     if recording is not None or map is not None:
         if recording is None or map is None:
             raise UserError("recording, map: give both or none")
-        done = _checked(scenario, changes, in_process=True)
+        done = _load(scenario, changes, in_process=True)
         if done.network is not None:
             raise UserError("recording: is of one converter, the scenario has a network")
         beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}
@@ -382,7 +382,7 @@ def compare(
                 runner.run_network_in_memory(one) if one.parts else runner.run_in_memory(one)
             )
             if isinstance(law, Law):
-                runs |= {n: _named(r, law) for n, r in runs.items() if converter in (None, n)}
+                runs |= {n: _with_name(r, law) for n, r in runs.items() if converter in (None, n)}
             made[name] = runs
     return _comparison(made, beside)
 
@@ -434,7 +434,7 @@ def _compare_in(
             watch.progress(len(made) * one.ticks + ticks, len(scenarios) * one.ticks, said)
 
         start = runner.run_network if one.parts else runner.run_scenario
-        whole = start(one, folder / name, tell, watch.notice, _explained)
+        whole = start(one, folder / name, tell, watch.notice, _explain_and_report)
         made[name] = _of_converters(whole)
         if whole.status == "interrupted":
             break

@@ -150,7 +150,7 @@ def conform(
     made = Conformity(
         names, inner, under, cases, found, place, hashes, digests, droops, network=words
     )
-    return _written(made, watch)
+    return _write_report(made, watch)
 
 
 def _network(
@@ -176,7 +176,7 @@ def _new_place(folder: str | Path | None) -> Path | None:
     return Path(folder)
 
 
-def _written(made: Conformity, watch: Watch) -> Conformity:
+def _write_report(made: Conformity, watch: Watch) -> Conformity:
     """What the tests showed, with its report in its folder if it has one."""
     if made.folder is not None:
         made.write(made.folder, watch.notice)
@@ -227,7 +227,7 @@ def judge_recording(
         [name], None, under, cases, [found], place, hashes, droops={name: under.droop},
         recordings={name: words},
     )  # fmt: skip
-    return _written(made, watch)
+    return _write_report(made, watch)
 
 
 def scan(

@@ -41,7 +41,7 @@ from gfm_hil.recording.recorder import record_command, record_controller, record
 from gfm_hil.run.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.run.stalls import ProcessorWatch, loops_of
-from gfm_hil.run.taken import Taken
+from gfm_hil.run.taken import ProcessorTime
 from gfm_hil.scenario import INPROC, Scenario, check_scenario, load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled
@@ -73,7 +73,7 @@ class _Run:
     timing: dict[str, Times]
     scheduling: list[str]  # of the two sides
     early: str  # why it ended early; empty if it did not
-    taken: Taken | None  # who had the processors
+    taken: ProcessorTime | None  # who had the processors
     processors: list[int]  # of the two sides
     late: Times | None = None  # of the bare loop, (2, ticks), ns
 

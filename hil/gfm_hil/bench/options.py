@@ -68,7 +68,7 @@ def measurements(options: Namespace) -> list[Measurement]:
     given = {k: v for k, v in vars(options).items() if v is not None}
 
     def part(kind: str, **changes: Any) -> Measurement:
-        checked = _checked(kind, given | changes)
+        checked = _check(kind, given | changes)
         return partial(import_module(f"{__package__}.{kind}").measure, checked)
 
     if options.kind in KINDS:
@@ -84,7 +84,7 @@ def measurements(options: Namespace) -> list[Measurement]:
     ]
 
 
-def _checked(kind: str, options: dict[str, Any]) -> BenchOptions:
+def _check(kind: str, options: dict[str, Any]) -> BenchOptions:
     of = options.get
     links = _split(
         "--links", of("links", "" if "to" in options else ",".join(link_names())) or None

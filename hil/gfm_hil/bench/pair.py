@@ -103,7 +103,7 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     stop = np.memmap(path, np.int64, "r+")
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:  # both start now and inherit this: only the parent handles Ctrl-C
-        started = [pool.submit(_started) for pool in pools.values()]
+        started = [pool.submit(_ready) for pool in pools.values()]
     finally:
         signal.signal(signal.SIGINT, handler)
     try:
@@ -143,7 +143,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _started() -> None:
+def _ready() -> None:
     """The first task: it is done once ``_set_up`` is done."""
 
 

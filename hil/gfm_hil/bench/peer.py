@@ -247,14 +247,14 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     """The plant's end calls; the controller's end is elsewhere, or is started here."""
     nothing: Callable[..., Any] = lambda *_: None  # noqa: E731
     if role == "controller":
-        close = _started(c) if c.options["program"] else nothing
+        close = _start(c) if c.options["program"] else nothing
         return PingPong(nothing, nothing, close, True)
     caller = _Caller(c)
     compiled = caller.link is caller._good
     return PingPong(caller.ping, nothing, caller.close, compiled, lambda: caller.sides)
 
 
-def _started(c: Contender) -> Callable[[], None]:
+def _start(c: Contender) -> Callable[[], None]:
     """Start the controller of a contender on our processor, as the other side's spins; returns what
     ends it."""
     with Path(c.options["log"]).open("wb") as log:

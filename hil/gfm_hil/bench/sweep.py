@@ -73,7 +73,7 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             return took, sum(after[s][0] - before[s][0] for s in after) / lasted
 
         def missed(cell: _Cell, khz: float) -> float | None:
-            return _missed(one_round(cell, khz, options.seconds)[0], khz)
+            return _missed_pct(one_round(cell, khz, options.seconds)[0], khz)
 
         for cell in cells:
             one_round(cell, options.rates[0], _FIRST_S)
@@ -121,7 +121,7 @@ def _open(
     return cells
 
 
-def _missed(took: Times, khz: float) -> float | None:
+def _missed_pct(took: Times, khz: float) -> float | None:
     """Share of messages whose answer came after the next deadline, %; None without answers."""
     return 100 * float(np.mean(took > 1e6 / khz)) if len(took) else None
 
@@ -155,7 +155,7 @@ def _keys(cell: _Cell) -> dict[str, Any]:
 
 
 def _row(cell: _Cell, khz: float, rounds: list[tuple[Times, float]]) -> dict[str, Any]:
-    shares = [share for took, _ in rounds if (share := _missed(took, khz)) is not None]
+    shares = [share for took, _ in rounds if (share := _missed_pct(took, khz)) is not None]
     figures = summary([took for took, _ in rounds])
     del figures["histogram"]
     return _keys(cell) | {

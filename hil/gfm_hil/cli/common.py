@@ -24,7 +24,7 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.processes import Progress as TellProgress
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.report import as_expected, events_table, inner_stages, staged
+from gfm_hil.results.report import as_expected, events_table, has_stages, inner_stages
 from gfm_hil.results.table import shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
@@ -268,7 +268,7 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
         console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
     if why:
         console.print(escape(why), highlight=False, soft_wrap=True)
-    stage = f" · inner stage {inner_stages(summary)}" if staged(summary) else ""
+    stage = f" · inner stage {inner_stages(summary)}" if has_stages(summary) else ""
     console.print(escape(controlled_by(summary) + stage), highlight=False)
     console.print(
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "

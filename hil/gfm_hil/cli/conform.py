@@ -19,7 +19,14 @@ from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.execute import PartResult
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import ALL, Case, all_limits, counted, load_cases, shipped_sets
+from gfm_hil.studies.conformity.sets import (
+    ALL,
+    Case,
+    all_limits,
+    count_limits,
+    load_cases,
+    shipped_sets,
+)
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     CONSISTENT,
@@ -125,7 +132,7 @@ def call(options: argparse.Namespace) -> int:
             heads = [*rows[0]]
             terminal().print(Table(heads, [[*row.values()] for row in rows], text=None))
             if options.list == "limits":
-                print(counted(rows))
+                print(count_limits(rows))
         return 0
     if options.recording is not None:
         return _recording(options)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner
 from gfm_hil.controllers.compile_model import compile_model
-from gfm_hil.controllers.dll import described
+from gfm_hil.controllers.dll import describe_model
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import replacing, write_text
 from gfm_hil.core.terminal import terminal
@@ -163,7 +163,7 @@ def call_dll(options: argparse.Namespace) -> int:
 
 def call_compile(options: argparse.Namespace) -> int:
     used = compile_model(options.sources, options.include, options.out)
-    told, rows = described(options.out)
+    told, rows = describe_model(options.out)
     print(f"{options.out}: {', '.join(x.name for x in used)}", told, sep="\n")
     heads = ("in a map", "width, default", "unit", "description")
     terminal().print(Table(heads, rows, text=None), highlight=False)
@@ -271,13 +271,13 @@ def _ticks(ticks: int) -> int:
     return ticks
 
 
-def _print_proofs(proofs: Sequence[firmware.Proved]) -> None:
+def _print_proofs(proofs: Sequence[firmware.ProofResult]) -> None:
     rows = [(p.name, p.functions, p.alarms, f"{p.seconds:g}") for p in proofs]
     table = Table(("law", "functions", "alarms", "seconds"), rows)
     terminal().print(table, highlight=False)
 
 
-def _print(results: Sequence[firmware.Checked]) -> None:
+def _print(results: Sequence[firmware.CheckResult]) -> None:
     heads = ("law", "rows", "words that differ", "instructions", "of these checks", "code [B]",
              "constants [B]", "state [B]", "stack [B]")  # fmt: skip
     rows = [

@@ -36,7 +36,7 @@ def call(options: argparse.Namespace) -> int:
     )
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
-    given = _given(scenario, common.endpoints(options))
+    given = _match_endpoints(scenario, common.endpoints(options))
     if options.model is not None and role == "plant":
         raise UserError("--model: the plant has no model; start the controller with it")
     external = None
@@ -80,7 +80,7 @@ def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:
     return scenario.each[converter]
 
 
-def _given(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:
+def _match_endpoints(scenario: Scenario, named: dict[str, str]) -> dict[str, str]:
     """The endpoint of each converter that has one by --endpoint. Raises UserError: one is missing,
     or is that of no converter."""
     known = scenario.parts or [scenario.converter or ""]

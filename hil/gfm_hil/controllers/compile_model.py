@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
-from gfm_runtime.firmware.check import called
+from gfm_runtime.firmware.check import run_tool
 
 _WINDOWS = Path(__file__).parent / "windows"
 _MAIN = re.compile(r"^\s*(int|void)\s+main\s*\(", re.MULTILINE)
@@ -52,5 +52,5 @@ def compile_model(sources: Sequence[Path], include: Sequence[Path], library: Pat
             "windows.h",
         ]
         command += ["-o", str(part.absolute()), *(str(x.absolute()) for x in used), "-lm"]
-        called(command, used[0].parent)
+        run_tool(command, used[0].parent)
     return used

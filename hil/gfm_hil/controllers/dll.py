@@ -120,7 +120,7 @@ class DllController(MappedController):
 
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
-        self._of, info = _opened(path)
+        self._of, info = _open(path)
         self.name = run_name("dll", _text(info.ModelName) or path.stem)
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
@@ -205,7 +205,7 @@ class DllController(MappedController):
             raise ControllerError(f"{self.name}: {name} failed: {said}")
 
 
-def _opened(path: Path) -> tuple[c.CDLL, _Info]:
+def _open(path: Path) -> tuple[c.CDLL, _Info]:
     """The library and what its model says of itself; raises as ``DllController``."""
     try:
         library = c.CDLL(str(path.absolute()))
@@ -227,10 +227,10 @@ def _opened(path: Path) -> tuple[c.CDLL, _Info]:
     return library, info
 
 
-def described(path: Path) -> tuple[str, list[tuple[str, str, str, str]]]:
+def describe_model(path: Path) -> tuple[str, list[tuple[str, str, str, str]]]:
     """A model in a sentence, and its ports and parameters: name as in a map, width or default,
     unit, description. Raises UserError: as ``DllController``."""
-    _, info = _opened(path)
+    _, info = _open(path)
     rows = []
     for kind, ports, count in (
         ("inputs", info.InputPortsInfo, info.NumInputPorts),

@@ -66,7 +66,7 @@ class LibraryController(ExternalController):
                 " ports are fixed"
             )
         check_currents(f"c:{path.name}", context.inner)
-        self._of = _loaded(path)
+        self._of = _load(path)
         said = self._of.gfmhil_name()
         self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
         self._context, self._counts = context, context.inner == COUNTS
@@ -166,7 +166,7 @@ def _check_step(of: c.CDLL, path: Path, counts: bool) -> None:
         raise UserError(f"{path}: has no function gfmhil_step; see gfmhil_controller.h{other}")
 
 
-def _loaded(path: Path) -> c.CDLL:
+def _load(path: Path) -> c.CDLL:
     try:
         of = c.CDLL(str(path))
     except OSError as problem:

@@ -247,15 +247,15 @@ class PilController(ExternalController):
         while len(into):
             while self._starts and not self._starts.poll(_LOOK_S * 1e3):
                 if self._process.poll() is not None:
-                    raise self._ended()
+                    raise self._ending()
                 if time.monotonic() > self._give_up:
                     raise self._problem(f"has not answered for {_START_S:g} s")
             got = os.readv(self._from, [into])
             if not got:
-                raise self._ended()
+                raise self._ending()
             into = into[got:]
 
-    def _ended(self) -> ControllerError:
+    def _ending(self) -> ControllerError:
         """How the program has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)

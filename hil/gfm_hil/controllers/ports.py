@@ -38,7 +38,7 @@ _PREFIXES = {"": 1.0, "k": 1e3, "M": 1e6}
 _SI = {"S_n": "W var VA", "V_n": "V", "V_dcref": "V", "S_n/V_dcref": "A"}
 
 
-class Scaled(StrictSchema):
+class ScaledSignal(StrictSchema):
     """A signal and its scale."""
 
     signal: str  # by its name in the signal table
@@ -46,7 +46,7 @@ class Scaled(StrictSchema):
     unit: str | None = None  # of the port, in place of the scale
 
 
-_Asked = str | float | Scaled
+_Asked = str | float | ScaledSignal
 
 
 class PortMap(StrictSchema):
@@ -54,7 +54,7 @@ class PortMap(StrictSchema):
 
     # by port, a signal of the references or measurements, or a constant
     inputs: dict[str, _Asked] = Field({})
-    outputs: dict[str, str | Scaled] = Field({})  # by port, a signal of u
+    outputs: dict[str, str | ScaledSignal] = Field({})  # by port, a signal of u
     fixed: dict[str, float] = Field({})  # by signal of u that no port gives, its value, p.u.
     parameters: dict[str, float] = Field({})  # by parameter of the controller, its value
     # by output that is read when the controller starts, what inputs has
@@ -224,12 +224,12 @@ def _columns(rows: list[tuple[int, int, float]]) -> _Wires:
     return np.array(first, np.int64), np.array(second, np.int64), np.array(scales, np.float64)
 
 
-def _of(asked: str | Scaled) -> Scaled:
-    return Scaled(signal=asked) if isinstance(asked, str) else asked
+def _of(asked: str | ScaledSignal) -> ScaledSignal:
+    return ScaledSignal(signal=asked) if isinstance(asked, str) else asked
 
 
 def _place(
-    where: str, asked: str | Scaled, known: Sequence[str], bases: Bases
+    where: str, asked: str | ScaledSignal, known: Sequence[str], bases: Bases
 ) -> tuple[int, float]:
     """Where a signal is among the known ones, and its port's value at 1 p.u."""
     wanted = _of(asked)

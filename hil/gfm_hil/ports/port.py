@@ -97,7 +97,7 @@ class BesideRun:
     def wait(self, commands: bool = True) -> None:
         """With ``--wait`` wait until the run records or, if it needs them, takes ``commands``.
         Raises KeyboardInterrupt: the port is to end."""
-        there = running_roles if commands else recorded
+        there = running_roles if commands else has_recording
         while self._patient and not all(map(there, self.places.values())):
             if self.interrupted:
                 raise KeyboardInterrupt
@@ -137,11 +137,11 @@ class BesideRun:
         asyncio.run(until())
 
 
-def recorded(folder: Path) -> bool:
+def has_recording(folder: Path) -> bool:
     """Whether there is a recording: of a run that has begun to record, or of a finished one; of a
     network those of all converters."""
     if converters := converters_of(folder):
-        return all(recorded(folder / name) for name in converters)
+        return all(has_recording(folder / name) for name in converters)
     return (folder / "signals.npz").is_file() or begun(folder)
 
 

@@ -110,7 +110,7 @@ def pieces(column: ColumnLike, first: int, last: int) -> Iterator[Any]:
     return (column[a : min(a + PIECE, last)] for a in range(first, last, PIECE))
 
 
-class Shown(NamedTuple):
+class DisplayUnit(NamedTuple):
     """How to display a column: symbol, unit, and the factor for recorded values."""
 
     symbol: str
@@ -119,7 +119,7 @@ class Shown(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Described:
+class ColumnInfo:
     """One row of the table."""
 
     name: str  # of the column in the run folder
@@ -134,16 +134,16 @@ class Described:
         """``quantity`` and ``origin`` in one line."""
         return f"{self.quantity}, {self.origin}" if self.origin else self.quantity
 
-    def shown(self, f_n: float) -> Shown:
+    def shown(self, f_n: float) -> DisplayUnit:
         """A frequency in Hz (``f_n`` is nominal), an angle in degrees, the rest as recorded."""
         signal = self.name
         if self.name not in CONTROLLER_INNER and "." not in self.name:  # their names have no prefix
             signal = self.name.partition("_")[2] or self.name
         if self.unit == "p.u. (omega_n)":
-            return Shown("f_g" if signal == "omega_g" else "f", "Hz", f_n)
+            return DisplayUnit("f_g" if signal == "omega_g" else "f", "Hz", f_n)
         if self.unit == "rad":
-            return Shown("δ", "°", math.degrees(1.0))
-        return Shown(signal, self.unit.partition(" (")[0], 1.0)
+            return DisplayUnit("δ", "°", math.degrees(1.0))
+        return DisplayUnit(signal, self.unit.partition(" (")[0], 1.0)
 
 
 _SENSOR, _COMMAND, _REFERENCE, _TRUE = (
@@ -161,18 +161,18 @@ _TIMES = {
 }
 
 
-def _signals(prefix: str, groups: tuple[str, ...], origin: str) -> list[Described]:
+def _signals(prefix: str, groups: tuple[str, ...], origin: str) -> list[ColumnInfo]:
     """The rows of the signal table's groups, as columns with a prefix."""
     return [
-        Described(f"{prefix}_{s.name}", s.symbol, f"{s.unit} ({s.base})", s.description, origin)
+        ColumnInfo(f"{prefix}_{s.name}", s.symbol, f"{s.unit} ({s.base})", s.description, origin)
         for s in SIGNALS
         if s.group in groups
     ]
 
 
-def _time(role: Role, name: str) -> Described:
+def _time(role: Role, name: str) -> ColumnInfo:
     clock = "" if name == "stall" else f"CLOCK_MONOTONIC of the {role}, -1: never; "
-    return Described(f"{role}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
+    return ColumnInfo(f"{role}_{name}", "", "ns", f"{clock}{_TIMES[name]}")
 
 
 #: letter, base and meaning; both parts of each are recorded, see `gfm_plant.TRUTH`
@@ -181,36 +181,36 @@ _SPACE_VECTORS = (
 )  # fmt: skip
 
 
-def _table() -> dict[str, Described]:
+def _table() -> dict[str, ColumnInfo]:
     rows = [
-        Described("tick", "k", "", "number of the tick"),
-        Described("t", "t", "s", "time of the run, tick × T_s"),
+        ColumnInfo("tick", "k", "", "number of the tick"),
+        ColumnInfo("t", "t", "s", "time of the run, tick × T_s"),
         *_signals("y", ("y",), _SENSOR),
         *_signals("u", ("u",), _COMMAND),
         *_signals("true", ("y", "d"), _TRUE),
-        Described(
+        ColumnInfo(
             "true_i", r"\lvert i_{dq} \rvert", "p.u. (S_n/V_n)",
             "magnitude of the current of L_f", _TRUE,
         ),
-        Described(
+        ColumnInfo(
             "true_delta", r"\delta", "rad",
             "angle of the converter's frame ahead of the grid's", _TRUE,
         ),
-        Described("true_i_dc", "i_{dc}", "p.u. (S_n/V_dcref)", "current of the DC source", _TRUE),
+        ColumnInfo("true_i_dc", "i_{dc}", "p.u. (S_n/V_dcref)", "current of the DC source", _TRUE),
         *(
-            Described(
+            ColumnInfo(
                 f"true_{n}_{part}", rf"\{sign} {n}", base,
                 f"space vector of the {what}, {axis} in the frame that turns at omega_n", _TRUE,
             )
             for n, base, what in _SPACE_VECTORS
             for part, sign, axis in (("re", "Re", "real part"), ("im", "Im", "imaginary part"))
         ),
-        Described(
+        ColumnInfo(
             "true_trip", "", "", "what has tripped", _TRUE, tuple(TRIP_REASONS.items())
         ),
         *_signals("ref", ("ref",), _REFERENCE),
         *(
-            Described(
+            ColumnInfo(
                 f"true_{n}", f"{n[0]}_c", f"p.u. ({base})", f"{what} at the connection point", _TRUE
             )
             for n, base, what in zip(
@@ -218,28 +218,28 @@ def _table() -> dict[str, Described]:
                 strict=True,
             )
         ),
-        Described("true_soc", "SoC", "p.u. (energy_s)", "state of charge of the battery", _TRUE),
-        Described("law", "", "", "law in force"),  # index into `laws` of signals.npz
-        Described("state", "", "", "state of the controller", "", tuple(enumerate(STATES))),
-        Described(
+        ColumnInfo("true_soc", "SoC", "p.u. (energy_s)", "state of charge of the battery", _TRUE),
+        ColumnInfo("law", "", "", "law in force"),  # index into `laws` of signals.npz
+        ColumnInfo("state", "", "", "state of the controller", "", tuple(enumerate(STATES))),
+        ColumnInfo(
             "X_est", "X_{est}", "p.u. (Z_b)", "grid reactance as a scheduled law estimates it"
         ),
         *_signals("y", ("y_inner",), _SENSOR),
         *_signals("u", ("u_inner",), _COMMAND),
-        Described("E_law", "E_u", "p.u. (V_n)", "voltage that the law asks for"),
+        ColumnInfo("E_law", "E_u", "p.u. (V_n)", "voltage that the law asks for"),
         *(
-            Described(f"i_ref_{a}", f"i^*_{a}", "p.u. (S_n/V_n)",
+            ColumnInfo(f"i_ref_{a}", f"i^*_{a}", "p.u. (S_n/V_n)",
                       f"current that the inner stage asks for, {a}")
             for a in "dq"
         ),
-        Described("limited", "", "", "whether the inner stage limits the current", "",
+        ColumnInfo("limited", "", "", "whether the inner stage limits the current", "",
                   ((0, "no"), (1, "yes"))),
         *_signals("y", ("adc",), "at the sample"),
         *_signals("u", ("compare",), _COMMAND),
         *_signals("m", ("y", "y_inner"), "as the law measures it"),
         *(_time(role, name) for role, times in TIMES_OF.items() for name in times),
-        Described(ACTS, "", "", "tick whose u the D/A gets, -1: that of the start"),
-        Described(INSTRUCTIONS, "", "", "instructions of a step on a processor in the loop"),
+        ColumnInfo(ACTS, "", "", "tick whose u the D/A gets, -1: that of the start"),
+        ColumnInfo(INSTRUCTIONS, "", "", "instructions of a step on a processor in the loop"),
     ]  # fmt: skip
     found = {row.name: row for row in rows}
     times = [f"{role}_{name}" for role in TIMES_OF for name in kept_of(role)]
@@ -259,14 +259,14 @@ def wave(name: str, phase: str, si: bool) -> str:
     return f"{name}{'' if name == 'i_o' else '_'}{phase}{f'_{WAVES[name]}' if si else ''}"
 
 
-def _derived() -> dict[str, Described]:
+def _derived() -> dict[str, ColumnInfo]:
     meanings = {
         "v": ("p.u. (sqrt(2/3) V_n)", "voltage of C_f"),
         "i": ("p.u. (sqrt(2/3) S_n/V_n)", "current of L_f"),
         "i_o": ("p.u. (sqrt(2/3) S_n/V_n)", "current of the line, towards the grid"),
     }
     rows = [
-        Described(
+        ColumnInfo(
             wave(name, phase, si),
             f"{name}{phase}" if name == "i_o" else f"{name}_{phase}",
             WAVES[name] if si else base,
@@ -301,20 +301,20 @@ with the bases of the first converter, and meaning by what follows the name of t
 """
 
 
-def of_network(name: str) -> Described | None:
+def of_network(name: str) -> ColumnInfo | None:
     """A column of a network, by its name."""
     part, _, what = name.rpartition(".")
     if not part or what not in _FLOWS:
         return None
     symbol, unit, quantity = _FLOWS[what]
-    return Described(name, symbol, unit, f"{quantity} of {part}", _TRUE)
+    return ColumnInfo(name, symbol, unit, f"{quantity} of {part}", _TRUE)
 
 
 HERTZ = "f_hz"
 """The converter's frequency in Hz, which is derived: true_omega_u times the nominal frequency."""
 
 
-def describe(name: str, laws: list[str]) -> Described:
+def describe(name: str, laws: list[str]) -> ColumnInfo:
     """A column of signals.npz or timing.npz, by its name there, one of ``DERIVED``, or one of a
     network. Raises UserError: there is no such column.
 

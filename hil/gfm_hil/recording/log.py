@@ -41,13 +41,13 @@ class Outcome:
     tick: int
 
 
-class _Said(BaseModel):
+class _FileContent(BaseModel):
     """What a file of a run says; keys without a type here may hold anything."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
 
-class _Line(_Said):
+class _Line(_FileContent):
     """A line of the log."""
 
     tick: Tick
@@ -75,24 +75,24 @@ _NEEDS = {
 _LOGS = tuple(f"events_{side}.jsonl" for side in (*ROLES, "both"))
 
 
-class _EventEntry(_Said):
+class _EventEntry(_FileContent):
     t: FiniteFloat
     tick: Tick
     type: str
     label: str
 
 
-class _TripEntry(_Said):
+class _TripEntry(_FileContent):
     t: FiniteFloat
     tick: Tick
     reason: str
 
 
-class _Written(_Said):
+class _Versioned(_FileContent):
     version: str = "0.1"  # the first one did not say it
 
 
-class Summary(_Said):
+class Summary(_FileContent):
     """What summary.json must be, as far as anything relies on it."""
 
     title: str
@@ -175,7 +175,7 @@ def read_summary(folder: Path, ticks: int) -> dict[str, Any]:
 
 def written_by(folder: Path) -> str:
     """The version of gfmhil that wrote a run's folder. Raises as ``read_summary``."""
-    said = read_json(folder / "summary.json", _Written, most_bytes(0))
+    said = read_json(folder / "summary.json", _Versioned, most_bytes(0))
     return str(said.get("version", "0.1"))
 
 

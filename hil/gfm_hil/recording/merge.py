@@ -27,7 +27,7 @@ def _blocks(rows: int) -> Iterator[tuple[int, int]]:
     return ((first, min(first + BLOCK, rows)) for first in range(0, rows, BLOCK))
 
 
-def _recorded(file: Path, ticks: int) -> int:
+def _last_recorded(file: Path, ticks: int) -> int:
     """Ticks up to the last one that was recorded."""
     for first, last in reversed([*_blocks(ticks)]):
         rows = np.flatnonzero(~np.isnan(_rows(file, first, last)[NY]))  # written last by a plant
@@ -47,7 +47,7 @@ def merge(folder: Path, T_s: float, laws: list[str]) -> None:
     parts = {role: part for role in ROLES if (part := RolePart.read(folder, role)) is not None}
     place = place_of(folder) or folder
     files = {role: place / f"{role}_signals.npy" for role in parts}
-    counts = {role: _recorded(files[role], len(part.signals)) for role, part in parts.items()}
+    counts = {role: _last_recorded(files[role], len(part.signals)) for role, part in parts.items()}
     done = counts.get("plant") or counts.get("controller", 0)
     columns = {role: recorded_in(role, part.signals.shape[1]) for role, part in parts.items()}
     names = parts["plant"].names if "plant" in parts else ()

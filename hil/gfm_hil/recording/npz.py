@@ -72,7 +72,7 @@ def write_npz(path: Path, tables: Iterable[ColumnGroup]) -> None:
             with contextlib.ExitStack() as stack:
                 spool = partial(tempfile.SpooledTemporaryFile, _SPOOL, dir=str(path.parent))
                 packed = [
-                    _Packed(stack.enter_context(spool()), name, kind, table.rows)
+                    _PackedColumn(stack.enter_context(spool()), name, kind, table.rows)
                     for name, kind in table.columns.items()
                 ]
                 step = _step(table.rows)
@@ -84,7 +84,7 @@ def write_npz(path: Path, tables: Iterable[ColumnGroup]) -> None:
                     column.move(archive, file, step)
 
 
-class _Packed:
+class _PackedColumn:
     """A column while its table is read: compressed, in a file without a name if it is long."""
 
     def __init__(self, spool: IO[bytes], name: str, kind: np.dtype[Any], rows: int) -> None:

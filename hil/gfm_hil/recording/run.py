@@ -25,8 +25,8 @@ from gfm_hil.recording.columns import (
     PLANT_COLUMNS,
     PLANT_INNER,
     TIMES_OF,
+    ColumnInfo,
     Columns,
-    Described,
     describe,
     pieces,
 )
@@ -202,7 +202,7 @@ class Run:
         return {**self.columns, **self.timing}
 
     @property
-    def described(self) -> list[Described]:
+    def described(self) -> list[ColumnInfo]:
         """What each column of ``recorded`` is, in its order.
 
         Raises:

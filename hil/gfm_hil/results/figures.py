@@ -204,7 +204,7 @@ class Magnitude:
         return np.hypot(self._d[rows], self._q[rows])
 
 
-def _limited(t: ColumnLike, x: ColumnLike) -> list[tuple[float, float]]:
+def _limited_spans(t: ColumnLike, x: ColumnLike) -> list[tuple[float, float]]:
     """From when to when, s, a column of 0 and 1 is 1; read piece by piece."""
     changes, before = [], False
     for first, part in zip(range(0, len(x), PIECE), pieces(x, 0, len(x)), strict=True):
@@ -219,7 +219,7 @@ def _limited(t: ColumnLike, x: ColumnLike) -> list[tuple[float, float]]:
 
 def _shade(axes: Axes, t: ColumnLike, x: ColumnLike) -> None:
     """Shade the times at which a column of 0 and 1 is 1; one artist."""
-    spans = [(a, b - a) for a, b in _limited(t, x)]
+    spans = [(a, b - a) for a, b in _limited_spans(t, x)]
     if spans:
         shade = axes.broken_barh(
             spans, (0, 1), transform=axes.get_xaxis_transform(), color=COLOURS[4], alpha=0.3, lw=0,
@@ -454,12 +454,12 @@ def panels_of_run(
     """The ``quantities`` of a run for a page in which a reader can zoom, ``most`` points each."""
     panels, signals = quantities(scenario, signals)
     t = signals["t"]
-    limited = _limited(t, signals["limited"]) if "limited" in signals else []
+    limited = _limited_spans(t, signals["limited"]) if "limited" in signals else []
     for title, named in panels:
         shown = TABLE[named[0][0]].shown(nominal_frequency(scenario))
         curves = {label: signals[n] for n, _, label in named}
         yield _panel(
-            f"{title} [{shown.unit}]", t, curves, _happened(summary), [c for _, c, _ in named],
+            f"{title} [{shown.unit}]", t, curves, _marks_of(summary), [c for _, c, _ in named],
             most, shown.factor, limited if title == "currents" else (),
         )  # fmt: skip
 
@@ -473,7 +473,7 @@ def panels_of_waves(
     if not len(t):
         return
     ends = float(t[0]), float(t[-1])
-    events = [(at, label) for at, label in _happened(summary) if ends[0] <= at <= ends[1]]
+    events = [(at, label) for at, label in _marks_of(summary) if ends[0] <= at <= ends[1]]
     for title, phases in waves:
         curves = {name: np.asarray(x[rows], dtype=float) for name, x in phases.items()}
         yield Panel(title, np.asarray(t, dtype=float), curves, ends, events, colours=COLOURS[:3])
@@ -488,7 +488,7 @@ def panels_of_all(
     colours = {run: COLOURS[k % len(COLOURS)] for k, run in enumerate(runs)}
     for title, name in SHARED:
         shown = TABLE[name].shown(nominal_frequency(scenario))
-        curves = {run: _Padded(of[name], len(t)) for run, of in runs.items() if name in of}
+        curves = {run: _PaddedColumn(of[name], len(t)) for run, of in runs.items() if name in of}
         if curves:
             own = [colours[run] for run in curves]
             yield _panel(f"{title} [{shown.unit}]", t, curves, happened, own, most, shown.factor)
@@ -516,7 +516,7 @@ def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
         yield _panel(f"{title} [p.u.]", columns["t"], drawn, happened, own, POINTS)
 
 
-class _Padded:
+class _PaddedColumn:
     """A column of a run that may have ended before the others, NaN up to their end."""
 
     def __init__(self, column: ColumnLike, ticks: int) -> None:
@@ -531,7 +531,7 @@ class _Padded:
         return np.pad(known, (0, last - first - len(known)), constant_values=np.nan)
 
 
-def _happened(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
+def _marks_of(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
     """Events and trips of a run by their time, s."""
     events = [(float(e["t"]), str(e["label"])) for e in summary["events"]]
     trips = [(float(x["t"]), reason_name(x["reason"])) for x in summary.get("trips", [])]

@@ -79,7 +79,7 @@ def finite(value: Any) -> Any:
     return value
 
 
-def staged(summary: Mapping[str, Any]) -> bool:
+def has_stages(summary: Mapping[str, Any]) -> bool:
     """Whether laws of ours with an inner stage controlled the run."""
     return "inner" in summary and bool(summary["laws"])
 
@@ -232,7 +232,7 @@ def _write_page(
 def _facts(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """What the report says of a run before its figures."""
     yield "controlled by", controlled_by(summary)
-    if staged(summary):
+    if has_stages(summary):
         yield "inner stage", inner_stages(summary)
     yield "link, mode", f"{summary['link']}, {summary['mode']}"
     T_us = summary["T_s"] * 1e6

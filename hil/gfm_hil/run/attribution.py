@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.realtime.clock import AHEAD_NS
-from gfm_hil.run.taken import Taken, nobody
+from gfm_hil.run.taken import ProcessorTime, nobody
 
 CAUSES = ("own work", "link", "late wake-up", "stalled host")
 _OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))
@@ -42,7 +42,7 @@ def missed_ticks(timing: Timing) -> Times:
     return np.flatnonzero(timing["plant_received"] < 0)
 
 
-class Attributed(NamedTuple):
+class Attribution(NamedTuple):
     """The cause of each missed tick; arrays of the shape of ``missed_ticks``."""
 
     causes: Times  # index into ``CAUSES``
@@ -50,9 +50,9 @@ class Attributed(NamedTuple):
 
 
 def attribute(
-    timing: Timing, T_ns: int, events: Iterable[int] = (), taken: Taken | None = None,
+    timing: Timing, T_ns: int, events: Iterable[int] = (), taken: ProcessorTime | None = None,
     processors: Collection[int] = (),
-) -> Attributed:  # fmt: skip
+) -> Attribution:  # fmt: skip
     """Find the cause of each missed tick of a run in real time.
 
     Args:
@@ -85,7 +85,7 @@ def attribute(
             if causes[n] in (_WAKE, _STALL):
                 names[n:end] = [who] * (end - n)
         causes[n:end] = causes[n]
-    return Attributed(causes, names)
+    return Attribution(causes, names)
 
 
 def _by_clocks(timing: Timing, T_ns: int, missed: Times) -> tuple[Times, float]:

@@ -189,7 +189,7 @@ def between_ticks(
         raise UserError(f"controller = {run.summary['controller']!r}: only runs of a law repeat")
     bench = make_bench(scenario)
     what = scenario.ticks, bench.inner, bench.options
-    plant, controller = Kept("plant", *what, only=_SAME), Kept("controller", *what, only=())
+    plant, controller = (Kept("plant", *what, only=_SAME), Kept("controller", *what, only=()))
     watcher = _Watcher(bench, first, last, max(1, math.ceil(T_s / step - 1e-9)))
     timeline = TimelineInMemory(bench)
     timelines: list[TimelineInMemory] = [timeline, watcher]  # type: ignore[list-item]
@@ -199,10 +199,10 @@ def between_ticks(
     for name, x in plant.named(min(done, last)).items():
         if len(x) < last or not np.array_equal(x, run.columns[name][:last]):
             raise UserError(f"{where}: {name} differs when the run is repeated in lockstep")
-    return _joined(watcher.pieces, bench, bases(scenario), T_s, step)
+    return _join(watcher.pieces, bench, bases(scenario), T_s, step)
 
 
-def _joined(
+def _join(
     pieces: list[tuple[NDArray[np.float64], NDArray[np.int64]]],
     bench: Bench, b: Bases, T_s: float, step: float,
 ) -> BetweenTicks:  # fmt: skip

@@ -18,7 +18,7 @@ from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.recording.columns import bytes_per_tick
 from gfm_hil.run.stalls import ProcessorWatch
-from gfm_hil.run.taken import Taken
+from gfm_hil.run.taken import ProcessorTime
 
 Level = Literal["green", "yellow", "red"]
 Facts = dict[str, Any]
@@ -68,7 +68,7 @@ def interrupt_counts(root: Path) -> dict[tuple[str, int], int]:
 
 
 def _busiest(
-    taken: Taken | None, before: dict[tuple[str, int], int], now: dict[tuple[str, int], int]
+    taken: ProcessorTime | None, before: dict[tuple[str, int], int], now: dict[tuple[str, int], int]
 ) -> dict[str, Any] | None:
     """The device that took most time of a processor, or without a trace the one that interrupted
     most often; None if none did."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.run.taken import STOPPED, UNREAD, WAITS, Taken, collected
+from gfm_hil.run.taken import STOPPED, UNREAD, WAITS, ProcessorTime, collect
 from gfm_runtime.compiled import cached, compiled
 
 _PREFIX = "gfmhil-"  # of our instances, before the number of the process
@@ -207,7 +207,7 @@ class KernelTrace:
         self._write("tracing_on", "1")
         self._reader.start()
 
-    def stop(self) -> Taken:
+    def stop(self) -> ProcessorTime:
         """End the trace; returns what it shows."""
         self._write("tracing_on", "0")
         self._end.set()
@@ -215,7 +215,7 @@ class KernelTrace:
         for file in self._files.values():
             os.close(file)
         self._guard.communicate()
-        return collected("trace", sorted(self._found, key=lambda row: row[1]))
+        return collect("trace", sorted(self._found, key=lambda row: row[1]))
 
     def _set_up(self) -> None:
         """Choose clock, processors and events, and learn the numbers of these."""

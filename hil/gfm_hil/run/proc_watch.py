@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from gfm_hil.run.taken import STOPPED, Taken, collected, nobody
+from gfm_hil.run.taken import STOPPED, ProcessorTime, collect, nobody
 
 _BETWEEN_S = 0.1  # readings
 _LEAST_NS = 20_000  # of waiting between two readings
@@ -36,11 +36,11 @@ class ProcWatch:
         self._reader = threading.Thread(target=self._follow, daemon=True)
         self._reader.start()
 
-    def stop(self) -> Taken:
+    def stop(self) -> ProcessorTime:
         """End it; returns what it shows."""
         self._end.set()
         self._reader.join()
-        return collected("proc", self._found, why=self._why)
+        return collect("proc", self._found, why=self._why)
 
     def _follow(self) -> None:
         loops = set(self._loops.values())

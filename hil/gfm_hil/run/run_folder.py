@@ -88,7 +88,7 @@ def finish(
         report: draws the figures and writes report.html; None for a folder without them.
         outside: how it ended as seen from outside the sides, which may not have lived to say.
     """
-    ended = _Ended(wall_s=wall_s, figures=report is not None, outside=outside)
+    ended = _EndRecord(wall_s=wall_s, figures=report is not None, outside=outside)
     with _kept(folder):
         write_text(folder / _ENDED, ended.model_dump_json())
         return _complete(scenario, folder, laws, wall_s, report, outside)
@@ -119,14 +119,14 @@ def recover(folder: Path, report: Report | None = None) -> Run:
         scenario = load_scenario(str(folder / "scenario.toml"))
         laws = make_bench(scenario).controller.labels
         try:
-            ended = _Ended(**read_json(folder / _ENDED, _Ended))
+            ended = _EndRecord(**read_json(folder / _ENDED, _EndRecord))
         except FileNotFoundError:  # it was cut off while it ran
-            ended = _Ended(wall_s=_lasted(folder))
+            ended = _EndRecord(wall_s=_duration(folder))
         report = report if ended.figures else None
         return _complete(scenario, folder, laws, ended.wall_s, report, ended.outside)
 
 
-class _Ended(BaseModel):
+class _EndRecord(BaseModel):
     """What ``ended.json`` says."""
 
     wall_s: FiniteFloat
@@ -207,7 +207,7 @@ def _kept(folder: Path) -> Iterator[None]:
         ) from None
 
 
-def _lasted(folder: Path) -> float:
+def _duration(folder: Path) -> float:
     """How long a run lasted whose end nobody saw: from its start to what was written last, s."""
     place = place_of(folder)
     files = [*folder.iterdir(), *(place.iterdir() if place is not None else ())]
@@ -326,9 +326,9 @@ def merge_roles(first: Path, second: Path, folder: Path, report: Report | None =
         write_text(folder / "events.jsonl", "".join(json.dumps(e) + "\n" for e in log))
         own = {k: v for k, v in controller.columns.items() if k not in ("tick", "t")}
         laws = ColumnGroup.of(laws=np.array(controller.laws))
-        tables = [_padded(plant.columns, done, np.nan), _padded(own, done, np.nan), laws]
+        tables = [_pad(plant.columns, done, np.nan), _pad(own, done, np.nan), laws]
         write_npz(folder / "signals.npz", tables)
-        times = [_padded(run.timing, done, -1) for run in (plant, controller)]
+        times = [_pad(run.timing, done, -1) for run in (plant, controller)]
         write_npz(folder / "timing.npz", times)
         signals, timing, labels = read_recording(folder)
         wall_s = plant.summary["wall_s"]
@@ -350,7 +350,7 @@ def _link_end(role: Role, summary: dict[str, Any]) -> dict[str, Any]:
     return {key: summary[key][role] for key in keys if role in summary.get(key, {})}
 
 
-def _padded(columns: Columns, rows: int, missing: float) -> ColumnGroup:
+def _pad(columns: Columns, rows: int, missing: float) -> ColumnGroup:
     """Columns of one side, cut or filled up with ``missing`` to ``rows``."""
 
     def read(first: int, last: int) -> Iterator[NDArray[Any]]:

@@ -142,7 +142,7 @@ def _run(
 ) -> dict[str, Run]:
     """Run both sides of each converter, and complete their run folders."""
 
-    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Ended:
+    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Outcomes:
         try:
             with Interrupt() as interrupt:
                 try:
@@ -165,21 +165,21 @@ def _run(
 
     ours = len(controller_commands) < max(1, len(scenario.parts))
     roles: Sequence[Role] = ROLES if ours else ("plant",)
-    return _recorded(scenario, folder, roles, notice, report, work)
+    return _record(scenario, folder, roles, notice, report, work)
 
 
 #: when the first tick ran (``time.monotonic``), and by converter how its run ended as seen from
 #: outside the sides
-_Ended = tuple[float, Mapping[str, Outcome]]
+_Outcomes = tuple[float, Mapping[str, Outcome]]
 
 
-def _recorded(
+def _record(
     scenario: Scenario,
     folder: Path,
     roles: Sequence[Role],
     notice: Notice,
     report: Report | None,
-    work: Callable[[Sequence[Bench], Mapping[str, Path]], _Ended],
+    work: Callable[[Sequence[Bench], Mapping[str, Path]], _Outcomes],
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
@@ -232,12 +232,12 @@ def run_side(
         external: computes u in place of the law.
     """
 
-    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Ended:
+    def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Outcomes:
         began = time.monotonic()
         run_role(role, scenario, folder, endpoints, notice, external)
         return began, {}
 
-    runs = _recorded(scenario, folder, (role,), notice, report, work)
+    runs = _record(scenario, folder, (role,), notice, report, work)
     return _network(scenario, runs, folder, report) if scenario.parts else runs[""]
 
 

@@ -12,7 +12,7 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.kernel_trace import KernelTrace, tracefs
 from gfm_hil.run.proc_watch import ProcWatch
-from gfm_hil.run.taken import Taken
+from gfm_hil.run.taken import ProcessorTime
 
 LEAST_NS = 5_000  # shorter times make no tick late
 
@@ -27,7 +27,7 @@ class ProcessorWatch:
 
     def __init__(self) -> None:
         self.loops: Mapping[int, int] = {}
-        self.taken: Taken | None = None
+        self.taken: ProcessorTime | None = None
         self._by: KernelTrace | ProcWatch | None = None
 
     def __enter__(self) -> ProcessorWatch:

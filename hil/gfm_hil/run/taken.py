@@ -19,7 +19,7 @@ _MOST = 0.5  # of a stall, that a name must explain
 
 
 @dataclass(frozen=True)
-class Taken:
+class ProcessorTime:
     """Who had the processors, and when."""
 
     # "trace": the kernel's trace, so that begin and end are exact; "proc": two readings of /proc,
@@ -58,10 +58,10 @@ def nobody(method: Method) -> str:
     return "the host" if virtual_machine() != "no" else "firmware"
 
 
-def collected(
+def collect(
     method: Method, rows: Iterable[tuple[int, int, int, int, str]], why: str = ""
-) -> Taken:
+) -> ProcessorTime:
     """From rows with names in place of their numbers."""
     names: dict[str, int] = {}
     listed = [(*row[:4], names.setdefault(row[4], len(names))) for row in rows]
-    return Taken(method, why, np.array(listed, ROWS), [*names])
+    return ProcessorTime(method, why, np.array(listed, ROWS), [*names])

@@ -140,7 +140,7 @@ def certify_laws(
         for scr in scrs:
             for x_over_r in dict.fromkeys(grids.x_over_r):
                 one = on_grid(scenario, law, scr, x_over_r, P)
-                name, loop, unstable = _tried(one)
+                name, loop, unstable = _try_loop(one)
                 names[name] = None
                 if unstable is not None or loop is None:
                     return CertifiedLaws(tuple(names), tuple(powers), grids, None, unstable)
@@ -210,7 +210,7 @@ def strength_of(scenario: Scenario) -> Strength:
     return Strength(float(strengths[0]), stiffest, (min(ratios), max(ratios)), loads)
 
 
-def _tried(scenario: Scenario) -> tuple[str, ClosedLoop | None, UnstableGrid | None]:
+def _try_loop(scenario: Scenario) -> tuple[str, ClosedLoop | None, UnstableGrid | None]:
     """The name of the law, and its loop if that is stable."""
     grid, P = scenario.plant.grid, scenario.references.P_ref
     name = initial_law(scenario)[0].law.name

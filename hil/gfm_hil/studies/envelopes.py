@@ -209,7 +209,7 @@ def rocof(
             least = np.where(after, np.maximum(least, least[last]), least)
         else:
             most = np.where(after, np.minimum(most, most[last]), most)
-    return _delayed(rule, t, P_0, tunnel, P_0 + each[0], least, most)
+    return _delay_envelope(rule, t, P_0, tunnel, P_0 + each[0], least, most)
 
 
 def scr_jump(
@@ -251,10 +251,10 @@ def scr_jump(
     smallest = np.where(t <= _HALF_S, np.min(half, axis=0) - _HALF_LEAST, smallest)
     one, other = P_0 + sign * np.max(most, axis=0), P_0 + sign * smallest
     limits = np.minimum(one, other), np.maximum(one, other)
-    return _delayed(rule, t, P_0, tunnel, P_0 + each[0], *limits)
+    return _delay_envelope(rule, t, P_0, tunnel, P_0 + each[0], *limits)
 
 
-def _delayed(
+def _delay_envelope(
     rule: Tolerance, t: Vector, P_0: float, tunnel: float, expected: Vector, low: Vector, up: Vector
 ) -> Envelope:
     """An envelope that is late, and before that around the power before."""

@@ -234,7 +234,7 @@ class FrequencyScan:
 
         folder = Path(folder)
         check_empty(folder)
-        content = self.summary() | {"grids": [self._judged(*grid) for grid in grids]}
+        content = self.summary() | {"grids": [self._judge(*grid) for grid in grids]}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with (folder / "admittance.csv").open("w", encoding="utf-8", newline="") as file:
@@ -260,7 +260,7 @@ class FrequencyScan:
         yield [*columns]
         yield from np.column_stack([*columns.values()]).tolist()
 
-    def _judged(self, scr: float, x_over_r: float) -> dict[str, Any]:
+    def _judge(self, scr: float, x_over_r: float) -> dict[str, Any]:
         found = self.stability(scr, x_over_r)
         return {
             "scr": scr,
@@ -370,7 +370,7 @@ def measure_admittance(
             )
         settle_s *= 2.0
     hz = np.concatenate([band.hz for band in plan])
-    return _found(name, scenario, hz, amplitude, settle_s, settled, sides, Y_of)
+    return _make_scan(name, scenario, hz, amplitude, settle_s, settled, sides, Y_of)
 
 
 def _check(scenario: Scenario, external: bool) -> None:
@@ -730,7 +730,7 @@ def _through_dac(signals: Any, name: str, par: Any) -> Vector:
     return np.asarray(lo + lsb * np.floor((value - lo) / lsb + 0.5) if lsb > 0.0 else value)
 
 
-def _found(
+def _make_scan(
     name: str,
     scenario: Scenario,
     hz: Vector,

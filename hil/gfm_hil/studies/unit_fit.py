@@ -68,7 +68,7 @@ class UnitFit:
 
 
 @dataclass(frozen=True)
-class _Recorded:
+class _JumpRecord:
     """The power around a phase jump, as means over a cycle."""
 
     radians: float  # of the jump
@@ -167,7 +167,7 @@ def measure_unit(start: Scenario, degrees: float = 0.5, seconds: float = 4.0) ->
     return Unit(fit.D, fit.H, fit.X_eff)
 
 
-def _around_jump(run: Run) -> _Recorded:
+def _around_jump(run: Run) -> _JumpRecord:
     """The power of a run around its phase jump; raises as ``fit_run``."""
     scenario, T_s = run.scenario, run.scenario.T_s
     events = scenario.sorted_events()
@@ -200,7 +200,7 @@ def _around_jump(run: Run) -> _Recorded:
     starts = (skip - 0.5) * T_s - 0.5 * window + width * T_s * np.arange(len(after))
     smooth = [width * T_s, *filter(None, [window])]
     radians = math.radians(events[0].degrees)
-    return _Recorded(radians, omega_b, X_grid, before, after, starts, smooth, lag)
+    return _JumpRecord(radians, omega_b, X_grid, before, after, starts, smooth, lag)
 
 
 def _half_widths(rest: Vector, J: Vector) -> Callable[..., float]:

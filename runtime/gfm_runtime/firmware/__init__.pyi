@@ -1,5 +1,5 @@
 from .a2l import Entry, a2l_text, unit_of
-from .check import EVA, OPTIMISED, TARGETS, Checked, Proved, check, need_tools, prove
+from .check import EVA, OPTIMISED, TARGETS, CheckResult, ProofResult, check, need_tools, prove
 from .dll import build_dll, dll_sources
 from .elf import elf_a2l, elf_entries
 from .fixed import FIXED
@@ -25,12 +25,12 @@ __all__ = [
     "TARGETS",
     "TICK",
     "TO",
-    "Checked",
+    "CheckResult",
     "Entry",
     "Golden",
     "LoopProgram",
     "Module",
-    "Proved",
+    "ProofResult",
     "Style",
     "a2l_text",
     "build_dll",

@@ -49,7 +49,7 @@ def plain(text: str) -> str:
     return one_line.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").rstrip("\\")
 
 
-def wrapped(line: str, width: int = 100) -> list[str]:
+def wrap_line(line: str, width: int = 100) -> list[str]:
     """A line of C; a long one goes on, indented, after an operator or a comma."""
     out, indent = [], line[: len(line) - len(line.lstrip())]
     while len(line) > width:
@@ -71,12 +71,12 @@ def template(name: str) -> str:
     return TEMPLATES.joinpath(name).read_text(encoding="utf-8")
 
 
-def written(name: str, keys: Mapping[str, str], choices: Choices | None = None) -> str:
+def render(name: str, keys: Mapping[str, str], choices: Choices | None = None) -> str:
     """A template with its choices made and its keys replaced; errors as of those."""
-    return filled(chosen(template(name), choices or {}), keys)
+    return fill_keys(choose_parts(template(name), choices or {}), keys)
 
 
-def filled(text: str, values: Mapping[str, str]) -> str:
+def fill_keys(text: str, values: Mapping[str, str]) -> str:
     """The text with every ``@KEY@`` replaced. Raises KeyError: the text holds a key that ``values``
     does not."""
     return re.sub(r"@([\w.-]+)@", lambda found: values[found[1]], text)
@@ -85,7 +85,7 @@ def filled(text: str, values: Mapping[str, str]) -> str:
 _MARK = re.compile(r" */\* @(if|elif|else|end)(?: (\w+))?@ \*/\n")
 
 
-def chosen(text: str, choices: Choices) -> str:
+def choose_parts(text: str, choices: Choices) -> str:
     """The text with its choices made. Raises KeyError: the text asks for a choice that ``choices``
     does not hold."""
     out: list[str] = []

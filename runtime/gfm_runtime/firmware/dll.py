@@ -13,8 +13,8 @@ import numpy as np
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import Choices, identifier, plain, written
-from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, called
+from gfm_runtime.firmware.c_text import Choices, identifier, plain, render
+from gfm_runtime.firmware.check import FLAGS, OPTIMISED, TARGETS, run_tool
 from gfm_runtime.firmware.module import RESULT_TEXT, keys_of
 from gfm_runtime.firmware.schedule import one_module
 from gfm_runtime.firmware.tuning import GainChanges
@@ -60,11 +60,11 @@ def dll_sources(laws: LawSet, T_s: float, real: str, omega_b: float) -> dict[str
         "U_START": ", ".join(repr(s.default) + "f" * single for s in u),
         "E_IN_USE": ", &u[2]" * m.stages,
     }
-    keys["FIRST"] = written("first.c", keys, choices)
+    keys["FIRST"] = render("first.c", keys, choices)
     return {
         **code,
-        _INTERFACE: written(_INTERFACE, keys),
-        "model.c": written("model.c", keys, choices),
+        _INTERFACE: render(_INTERFACE, keys),
+        "model.c": render("model.c", keys, choices),
     }
 
 
@@ -87,7 +87,7 @@ def build_library(
         raise LawError(f"law {law!r}", why)
     own = [file for file in files if file.endswith(".c")]
     command = [compiler or host.compiler, *FLAGS, OPTIMISED, *flags, "-shared"]
-    called([*command, "-fvisibility=hidden", *own, "-o", out, *host.link], folder)
+    run_tool([*command, "-fvisibility=hidden", *own, "-o", out, *host.link], folder)
 
 
 def _string(text: str) -> str:

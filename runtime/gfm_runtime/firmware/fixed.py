@@ -300,7 +300,7 @@ G_MOST = 60.0  # p.u.; where p/V^2 and q/V^2 of dvoc saturate
 QUOTIENT = 31  # exponent of p/V on the way to p/V^2
 
 
-def _mapped() -> dict[int, dict[int, Number]]:
+def _mapped_numbers() -> dict[int, dict[int, Number]]:
     """By error map, the numbers of the columns that it changes."""
     (low, high), most_y = REFS[0].span, YS[0].span[1]
     energies = {
@@ -316,7 +316,7 @@ def _mapped() -> dict[int, dict[int, Number]]:
     return {LINEAR: {}, DC_ENERGY: energies, DVOC: ratios, HYBRID_ANGLE: sine}
 
 
-_MAPPED = _mapped()
+_MAPPED = _mapped_numbers()
 
 
 class Ratio(NamedTuple):
@@ -346,7 +346,7 @@ def _row_of(values: Matrix, place: int, leave: int = -1) -> dict[int, float]:
     return {place + j: float(v) for j, v in enumerate(values) if j != leave and v != 0.0}
 
 
-def _merged(*parts: Mapping[int, float]) -> dict[int, float]:
+def _merge(*parts: Mapping[int, float]) -> dict[int, float]:
     out: dict[int, float] = {}
     for part in parts:
         for place, c in part.items():
@@ -474,7 +474,7 @@ class _Builder:
         """u_i before its limits; and the numbers of the row's offset, states and excess."""
         f, gain = self.f, self.loop if i == OMEGA - 1 else 1.0
         own = [int(k) for k in np.flatnonzero(self.rows == i)]
-        on_d = _merged(
+        on_d = _merge(
             _row_of(gain * f["D_u0"][i], REF),
             _row_of(gain * f["D_r"][i], self.r),
             _row_of(gain * f["D_y"][i], self.m, OMEGA),
@@ -488,7 +488,7 @@ class _Builder:
         row = ClampedRow(self.A[np.ix_(own, own)], gain * f["C"][i, own], f["W"][own, i])
         self._state_numbers(i, own, row, (d[0] - room, d[1] + room))
         on_x = {X + k: float(gain * f["C"][i, k]) for k in own}
-        on_raw = _merged({OFFSET + i: 1.0}, on_x, on_d)
+        on_raw = _merge({OFFSET + i: 1.0}, on_x, on_d)
         total = make_sum(on_raw, self.seen, start, beside=most(US[i].span))
         raw, (low, high) = span_of(on_raw, self.seen, start), self.limited[U + i].span
         self.numbers[EXCESS + i] = number(
@@ -498,7 +498,7 @@ class _Builder:
 
     def _state_numbers(self, i: int, own: Sequence[int], row: ClampedRow, d: Span) -> None:
         """The numbers of the states of row i; d is what the inputs add to its output."""
-        forced = [span_of(self._forced(k), self.seen) for k in own]
+        forced = [span_of(self._input_terms(k), self.seen) for k in own]
         first = [span_of(*self._settling(k)) for k in own]
         for k, span in zip(own, _ranges(row, d, forced, first, self.f, i), strict=True):
             if span is None:
@@ -509,10 +509,10 @@ class _Builder:
                 )
             self.numbers[X + k] = number(f"s->x[{k}]", *span)
 
-    def _forced(self, k: int) -> dict[int, float]:
+    def _input_terms(self, k: int) -> dict[int, float]:
         """What the inputs add to the next x_k."""
         f = self.f
-        return _merged(
+        return _merge(
             _row_of(f["B_r"][k], self.r),
             _row_of(f["B_y"][k], self.m, OMEGA),
             {U + OMEGA - 1: float(f["B_y"][k, OMEGA])},
@@ -522,13 +522,13 @@ class _Builder:
         """The increment of x_k."""
         pull = float((self.A @ self.f["W"][: self.n])[k, int(self.rows[k])])
         own = {X + j: float(self.A[k, j] - (j == k)) for j in range(self.n)}
-        meant = _merged(own, {EXCESS + int(self.rows[k]): pull}, self._forced(k))
+        meant = _merge(own, {EXCESS + int(self.rows[k]): pull}, self._input_terms(k))
         return make_sum(meant, self.seen, most_e=self.numbers[X + k].q + MOST_SHIFT)
 
     def _settling(self, k: int) -> tuple[dict[int, float], Mapping[int, Number], float]:
         """The arguments of the sum that sets x_k at a bumpless change."""
         f, F = self.f, self.f["F"][k]
-        meant = _merged(
+        meant = _merge(
             _row_of(f["E_r"][k], self.r),
             _row_of(f["E_y"][k], self.m, OMEGA),
             {U + OMEGA - 1: float(f["E_y"][k, OMEGA])},

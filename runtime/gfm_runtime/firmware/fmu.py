@@ -20,7 +20,7 @@ from xml.sax.saxutils import escape
 
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import plain, written
+from gfm_runtime.firmware.c_text import plain, render
 from gfm_runtime.firmware.check import FLAGS, OPTIMISED
 from gfm_runtime.firmware.dll import build_library
 from gfm_runtime.firmware.elf import elf_a2l
@@ -75,12 +75,12 @@ def fmu(laws: LawSet, T_s: float, real: str, fmi: Fmi, omega_b: float, xcp: bool
     if fmi == "3":
         options = " ".join([*FLAGS, OPTIMISED])
         keys = {"P": m.prefix, "OPTIONS": options, "FILES": _files("SourceFile", code)}
-        held["sources/buildDescription.xml"] = written("buildDescription.xml", keys).encode()
+        held["sources/buildDescription.xml"] = render("buildDescription.xml", keys).encode()
     held |= _binaries(m, code, fmi, xcp)
     if xcp:
         keys = keys_of(m)
-        held[f"{_LS_XCP}/fmi-ls-manifest.xml"] = written("fmi-ls-manifest.xml", keys).encode()
-        held["documentation/fmi-ls-xcp.txt"] = written("fmi-ls-xcp.txt", keys).encode()
+        held[f"{_LS_XCP}/fmi-ls-manifest.xml"] = render("fmi-ls-manifest.xml", keys).encode()
+        held["documentation/fmi-ls-xcp.txt"] = render("fmi-ls-xcp.txt", keys).encode()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for file, content in held.items():
@@ -111,9 +111,9 @@ def _sources(
             "TOKEN": "@TOKEN@",
         }
     )
-    keys["FIRST"] = written("first.c", keys, m.choices)
+    keys["FIRST"] = render("first.c", keys, m.choices)
     choices = {"fmi2": two, "tuned": m.tuning is not None, "xcp": xcp}
-    interface = written("fmi.c", keys, choices)
+    interface = render("fmi.c", keys, choices)
     code = {
         **own,
         f"fmi{fmi}.c": interface.replace("@REFUSALS@", _refusals(fmi, interface).rstrip()),
@@ -126,7 +126,7 @@ def _sources(
         "VERSION": _quoted(f"signal table {TABLE_VERSION} ({table_hash()})"),
         "FILES": _files("File", code),
     }
-    description = written("modelDescription.xml", keys, {"fmi2": two})
+    description = render("modelDescription.xml", keys, {"fmi2": two})
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, chr(10).join([*code.values(), description]))}}}"
     code[f"fmi{fmi}.c"] = code[f"fmi{fmi}.c"].replace("@TOKEN@", token)
     return code, description.replace("@TOKEN@", token).encode()
@@ -213,12 +213,12 @@ def _headers() -> Path:
 def _refusals(fmi: Fmi, interface: str) -> str:
     """The functions of the standard that the interface has not, as C that says so."""
     declared = _headers().joinpath(f"fmi{fmi}FunctionTypes.h").read_text(encoding="utf-8")
-    written = set(re.findall(r"\b(fmi\d\w+)\(", interface))
+    defined = set(re.findall(r"\b(fmi\d\w+)\(", interface))
     out = []
     for kind, name, text in re.findall(
         r"typedef\s+(fmi\dStatus|fmi3Instance)\s+(fmi\d\w+)TYPE\s*\((.*?)\);", declared, re.DOTALL
     ):
-        if name in written:
+        if name in defined:
             continue
         arguments = " ".join(text.split())
         first, *others = re.findall(r"(\w+)(?:\[\])?\s*(?:,|$)", arguments)

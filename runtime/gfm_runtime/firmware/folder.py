@@ -8,7 +8,7 @@ from xml.sax.saxutils import escape
 from gfm_runtime.catalogue import LawSet
 from gfm_runtime.counts import COUNTS_STATE
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import plain, written
+from gfm_runtime.firmware.c_text import plain, render
 from gfm_runtime.firmware.check import script
 from gfm_runtime.firmware.fixed import FIXED
 from gfm_runtime.firmware.golden import SHIPPED, Golden, columns, golden
@@ -112,7 +112,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
             "SETS": ",\n        ".join(map(m.tuning.initialiser, m.sets())) if m.tuning else "",
             **e,
         }
-        adapters.append(written("adapter.c", keys, choices))
+        adapters.append(render("adapter.c", keys, choices))
         table.append("    {" + ", ".join(f"{m.prefix}_do_{part}" for part in parts) + "},")
     states = max([1, *(m.n for m in modules)])
     keys = {
@@ -139,7 +139,7 @@ def selftest(modules: Sequence[Module], style: Style) -> dict[str, str]:
         "NAMES": "\n".join(f'    "{m.prefix}",' for m in modules),
         "SIZES": "\n".join(f"    sizeof({m.prefix if own else 'gfm'}_t)," for m in modules),
     }
-    return {name: written(name, keys, choices) for name in ("selftest.h", "selftest.c")}
+    return {name: render(name, keys, choices) for name in ("selftest.h", "selftest.c")}
 
 
 def _golden_header(rows: Golden) -> str:
@@ -184,4 +184,4 @@ def _build_files(
         "LIBM": "target_link_libraries(gfm PUBLIC m)\n" if root else "",
         "LAWS": escape(", ".join(plain(m.name) for m in modules)),
     }
-    return {file: written(template, keys) for file, template in _BUILD_FILES.items()}
+    return {file: render(template, keys) for file, template in _BUILD_FILES.items()}

@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike, NDArray
 from gfm_runtime.counts import COUNTS_CONSTANTS, COUNTS_NUMBERS, COUNTS_STATE
 from gfm_runtime.error_maps import ERROR_MAPS, HYBRID_ANGLE, LINEAR
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, written
+from gfm_runtime.firmware.c_text import Choices, identifier, literal, literals, plain, render
 from gfm_runtime.firmware.fixed import FIXED, REFS, U_DEFAULT, YS, FixedLaw, make_fixed
 from gfm_runtime.firmware.tick import SHARED, FixedTick, Tick
 from gfm_runtime.firmware.tuning import GainChanges
@@ -277,18 +277,18 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         for m in modules:
             tick = m.fixed_tick if m.fixed else m.tick
             keys = keys_of(m) | {"LAW": "", "law": ""}
-            keys["TYPES"], keys["IDENTIFICATION"] = _identified(m, T_s)
+            keys["TYPES"], keys["IDENTIFICATION"] = _identification_in_c(m, T_s)
             if m.tuning:
                 keys |= m.tuning.keys(m.prefix)
             if m.counts:
                 rows, which = carried_rows("y", INNER), not_bounded(m.record)
                 keys["PIN_CHECKS"] = _checks("y", rows, _literals(rows, m.real), which)
-            text = written("interface.h", keys, m.choices)
+            text = render("interface.h", keys, m.choices)
             out[f"{m.prefix}.h"] = about(m, T_s) + "\n" + text.replace("\n\n\n", "\n")
             out[f"{m.prefix}.c"] = _shell(keys | tick.keys(m.prefix), m.choices)
             if m.fixed:
                 keys["HINTS"] = m.fixed_tick.hints()
-                proofs[f"proof/{m.prefix}.c"] = written("proof.c", keys)
+                proofs[f"proof/{m.prefix}.c"] = render("proof.c", keys)
         return out | proofs
     states = max([1, *(m.n for m in modules)])
     real, stages = modules[0].real, modules[0].stages
@@ -310,11 +310,11 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         ),
         "CONSTANTS": "\n        ".join(textwrap.wrap(", ".join(names), 80)),
     }
-    common["TYPES"] = written("records.h", types, choices).rstrip("\n")
+    common["TYPES"] = render("records.h", types, choices).rstrip("\n")
     generic = Tick(None, real, states, stages, counts=counts)
     out = {
         "gfm.h": f"/* The generic step of a law. {MADE} */\n"
-        + written("interface.h", common, choices),
+        + render("interface.h", common, choices),
         "gfm.c": _shell(common | generic.keys("gfm"), choices),
     }
     for m in modules:
@@ -322,16 +322,16 @@ def sources(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
         out[f"{m.prefix}.h"] = (
             f"{about(m, T_s)}\n#ifndef {guard}\n#define {guard}\n\n"
             f'#include "gfm.h"\n\nextern const gfm_law_t {m.prefix}_law;\n'
-            f"{_identified(m, T_s)[0]}\n\n#endif\n"
+            f"{_identification_in_c(m, T_s)[0]}\n\n#endif\n"
         )
         out[f"{m.prefix}.c"] = (
             f'#include "{m.prefix}.h"\n\nconst gfm_law_t {m.prefix}_law = {_record(m, states)};\n'
-            f"{_identified(m, T_s)[1]}"
+            f"{_identification_in_c(m, T_s)[1]}"
         )
     return out
 
 
-def _identified(m: Module, T_s: float) -> tuple[str, str]:
+def _identification_in_c(m: Module, T_s: float) -> tuple[str, str]:
     """Its identification in C: the declaration and the definition."""
     text = m.identification(T_s)
     name = f"const char {m.prefix}_id[{len(text) + 1}]"
@@ -341,8 +341,8 @@ def _identified(m: Module, T_s: float) -> tuple[str, str]:
 
 def _shell(keys: Mapping[str, str], choices: Choices) -> str:
     """The source of a module; with the whole interrupt if its law measures and modulates."""
-    text = written("shell.c", keys, choices)
-    return text + (written("isr.c", keys, choices) if choices["counts"] else "")
+    text = render("shell.c", keys, choices)
+    return text + (render("isr.c", keys, choices) if choices["counts"] else "")
 
 
 def about(m: Module, T_s: float) -> str:
@@ -414,7 +414,7 @@ def _keys(
         "P": prefix,
         "GUARD": guard,
         **C_TYPES[str(real)],
-        "GUARDS": written("guards.c", {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
+        "GUARDS": render("guards.c", {"P": prefix, **C_TYPES[str(real)]}).rstrip("\n"),
         "SIGNALS": "\n".join([f"{where} ({table_hash()}). */", *rows]),
         "REASONS": "\n".join(
             f"    {guard}_{name} = {code}{',' * (name != 'BAD_REF')} /* {text} */"
@@ -532,16 +532,16 @@ def _record(m: Module, states: int) -> str:
         value = (
             m.record[field][tuple(map(slice, room[field]))] if field in room else m.record[field]
         )
-        text = _braced(value, m.real)
+        text = _initialiser(value, m.real)
         if field in integers:
             text = "{" + ", ".join(map(str, value)) + "}" if field == "row" else str(int(value))
         lines.append(f"    .{field} = {text},")
     return "\n".join([*lines, "}"])
 
 
-def _braced(value: NDArray[Any], real: np.dtype[Any]) -> str:
+def _initialiser(value: NDArray[Any], real: np.dtype[Any]) -> str:
     if value.ndim == 0:
         return literal(value, real)
     if value.ndim == 1:
         return "{" + literals(value, real) + "}"
-    return "{\n        " + ",\n        ".join(_braced(row, real) for row in value) + "}"
+    return "{\n        " + ",\n        ".join(_initialiser(row, real) for row in value) + "}"

@@ -43,7 +43,7 @@ _FAR = (
 )
 
 
-class Exported(NamedTuple):
+class FirmwareFolder(NamedTuple):
     """What a firmware folder holds."""
 
     modules: list[Module]
@@ -82,7 +82,7 @@ def reports(modules: Sequence[Module], T_s: float, style: Style) -> dict[str, st
     }
 
 
-def read_report(folder: Path) -> Exported:
+def read_report(folder: Path) -> FirmwareFolder:
     """What ``report.json`` of a folder says. Raises LawError: there is none, or it is not of this
     format."""
     path = folder / "report.json"
@@ -99,7 +99,7 @@ def read_report(folder: Path) -> Exported:
     except (ValueError, RecursionError) as problem:
         raise LawError(str(path), f"is not JSON: {problem}") from None
     try:
-        return _exported(whole)
+        return _parse(whole)
     except LawError as problem:
         raise problem.within(str(path)) from None
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
@@ -109,7 +109,7 @@ def read_report(folder: Path) -> Exported:
 
 
 @np.errstate(over="ignore")  # what overflows is refused
-def _exported(whole: Any) -> Exported:
+def _parse(whole: Any) -> FirmwareFolder:
     for key, allowed in (("format", (FORMAT,)), ("real", (*REALS, FIXED)), ("style", STYLES)):
         if whole[key] not in allowed:
             raise LawError(key, f"{whole[key]!r} must be {' or '.join(map(str, allowed))}")
@@ -130,7 +130,7 @@ def _exported(whole: Any) -> Exported:
         modules = [tunable(m, file, T_s) for m, file in zip(modules, files, strict=True)]
     if fixed:
         modules = [replace(m, fixed=make_fixed(m.name, m.record)) for m in modules]
-    return Exported(modules, whole["real"], whole["style"])
+    return FirmwareFolder(modules, whole["real"], whole["style"])
 
 
 def _hex(value: Any) -> str | int | list[int]:

@@ -13,7 +13,7 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.catalogue import LawSet, law_file
 from gfm_runtime.controller import choose
 from gfm_runtime.errors import LawError
-from gfm_runtime.firmware.c_text import literals, plain, written
+from gfm_runtime.firmware.c_text import literals, plain, render
 from gfm_runtime.firmware.module import Module, Style, keys_of, make_modules, sources, tunable
 from gfm_runtime.firmware.tick import place
 from gfm_runtime.firmware.translate import Array, Expr, Printer, Struct, Translator
@@ -108,7 +108,7 @@ def schedule_sources(
         "AT_START": "nominal V" if schedule.by_V else f"the estimate X_0 = {schedule.X_0!r} p.u.",
         "FUNCTIONS": _functions(m.prefix, None if schedule.by_V else bench.est[0], ctl, n),
     }
-    return {f"{m.prefix}{end}": written(f"schedule{end}", keys, choices) for end in (".h", ".c")}
+    return {f"{m.prefix}{end}": render(f"schedule{end}", keys, choices) for end in (".h", ".c")}
 
 
 def _functions(prefix: str, est: np.void | None, ctl: np.void, n: int) -> str:

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_runtime.firmware.c_text import literal, plain, wrapped
+from gfm_runtime.firmware.c_text import literal, plain, wrap_line
 
 _DOES = {"//": operator.floordiv, "<<": operator.lshift, ">>": operator.rshift,
          "&": operator.and_, "+": operator.add, "-": operator.sub, "*": operator.mul,
@@ -720,9 +720,9 @@ def _constant(value: Any) -> Any:
 def tidy(one: CFunction, unread: Sequence[Expr] = ()) -> None:
     """Take out variables that nothing uses and writes to the places ``unread``, and make sums of
     what was added step by step."""
-    while _pruned(one.body, _uses(one), unread):
+    while _prune(one.body, _uses(one), unread):
         pass
-    _summed(one.body, _uses(one))
+    _join_sums(one.body, _uses(one))
     _check_names(one)
 
 
@@ -730,11 +730,11 @@ def _uses(one: CFunction) -> Counter[Variable]:
     return Counter(e.args[0] for e in one.expressions() if e.op == "local")
 
 
-def _pruned(body: list[Any], uses: Counter[Variable], unread: Sequence[Expr]) -> bool:
+def _prune(body: list[Any], uses: Counter[Variable], unread: Sequence[Expr]) -> bool:
     kept: list[Any] = []
     for s in body:
         if isinstance(s, Compound) and (
-            _pruned(s.body, uses, unread) | _pruned(s.other, uses, unread)
+            _prune(s.body, uses, unread) | _prune(s.other, uses, unread)
         ):
             return True
         idle = isinstance(s, Compound) and s.word != "while" and not s.body and not s.other
@@ -751,11 +751,11 @@ def _pruned(body: list[Any], uses: Counter[Variable], unread: Sequence[Expr]) ->
     return changed
 
 
-def _summed(body: list[Any], uses: Counter[Variable]) -> None:
+def _join_sums(body: list[Any], uses: Counter[Variable]) -> None:
     for k, let in reversed(list(enumerate(body))):  # a sum's last part first
         if isinstance(let, Compound):
-            _summed(let.body, uses)
-            _summed(let.other, uses)
+            _join_sums(let.body, uses)
+            _join_sums(let.other, uses)
         if not (isinstance(let, Variable) and let.sums and not let.stays and uses[let] == 1):
             continue
         for s in body[k + 1 :]:
@@ -931,7 +931,9 @@ class Printer:
         names = {p.place if isinstance(p, Array) else p.name for p in one.parameters}
         lines = [f"/* {one.about} */"] if one.about else []
         lines = ["\n * ".join(textwrap.wrap(line, 97)) for line in lines]
-        lines += wrapped(f"static {self._types[one.kind]} {one.name}({', '.join(given) or 'void'})")
+        lines += wrap_line(
+            f"static {self._types[one.kind]} {one.name}({', '.join(given) or 'void'})"
+        )
         used = uses | {e.args[0].name for e in one.expressions() if e.op == "local"}
         idle = [f"    (void){name};" for name in sorted(names - used)]
         return "\n".join([*lines, "{", *idle, *self._block(one.body, names, "    "), "}", ""])
@@ -944,17 +946,17 @@ class Printer:
                     lines.append(f"{indent}/* {text} */")
                 case Variable(name, value):
                     if name in names:
-                        lines += wrapped(indent + self._put(name, _local(s), value))
+                        lines += wrap_line(indent + self._put(name, _local(s), value))
                     else:
                         once = self._often[name] == 1 and not s.stays
                         what = f"{'const ' * once}{self._types[value.kind]} {name}"
-                        lines += wrapped(f"{indent}{what} = {self.expression(value)};")
+                        lines += wrap_line(f"{indent}{what} = {self.expression(value)};")
                         names.add(name)
                 case Assignment(to, value):
-                    lines += wrapped(indent + self._put(self.expression(to), to, value))
+                    lines += wrap_line(indent + self._put(self.expression(to), to, value))
                 case CallOrReturn(value, returns):
                     text = self.expression(value) if value else ""
-                    lines += wrapped(f"{indent}{'return ' * returns}{text}".rstrip() + ";")
+                    lines += wrap_line(f"{indent}{'return ' * returns}{text}".rstrip() + ";")
                 case Compound():
                     lines += self._inner(s, names, indent)
         return lines
@@ -967,7 +969,7 @@ class Printer:
             names = names | {i}
         else:
             head = f"{s.word} ({test})"
-        lines = wrapped(f"{indent}{word}{head} {{")
+        lines = wrap_line(f"{indent}{word}{head} {{")
         lines += self._block(s.body, names, indent + "    ")
         more = [one for one in s.other if not isinstance(one, Comment)]
         if len(more) == 1 and isinstance(more[0], Compound) and more[0].word == "if":

@@ -58,7 +58,7 @@ def _both_ways(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any],
 
 
 @dataclass(eq=False)
-class Recorded:
+class TracedNumber:
     """A number that remembers its operation and operands; ``near`` is its value beside the file's,
     and ``book`` gets the comparisons."""
 
@@ -84,7 +84,7 @@ class Recorded:
     def __pow__(self, power: Any) -> Any:
         if power == 0.5:
             return self.book.of("sqrt", self)
-        if isinstance(power, Recorded) or power != int(power) or abs(power) > _MOST_POWER:
+        if isinstance(power, TracedNumber) or power != int(power) or abs(power) > _MOST_POWER:
             raise LawError("**", f"only to the power of 0.5 and -{_MOST_POWER} to {_MOST_POWER}")
         product = functools.reduce(operator.mul, [self] * abs(int(power)), 1.0)
         return 1.0 / product if power < 0 else product
@@ -103,7 +103,7 @@ class Recorded:
 class _Book:
     """The operations, each once, and the comparisons a <= b that have to hold."""
 
-    known: dict[tuple[Any, ...], Recorded] = field(default_factory=dict)
+    known: dict[tuple[Any, ...], TracedNumber] = field(default_factory=dict)
     holds: list[tuple[Any, Any]] = field(default_factory=list)
 
     def of(self, op: str, *args: Any) -> Any:
@@ -120,20 +120,20 @@ class _Book:
             return a if b > 0 else self.of("neg", a)
         if op == "*" and isinstance(a, float) and abs(a) == 1.0:
             return b if a > 0 else self.of("neg", b)
-        if op == "neg" and isinstance(a, Recorded) and a.op == "neg":
+        if op == "neg" and isinstance(a, TracedNumber) and a.op == "neg":
             return a.args[0]
-        args = tuple(x if isinstance(x, Recorded) else float(x) for x in args)
-        if not any(isinstance(x, Recorded) for x in args):
+        args = tuple(x if isinstance(x, TracedNumber) else float(x) for x in args)
+        if not any(isinstance(x, TracedNumber) for x in args):
             return float(_DOES[op](*args))
-        key = (op, *(id(x) if isinstance(x, Recorded) else x for x in args))
+        key = (op, *(id(x) if isinstance(x, TracedNumber) else x for x in args))
         if key not in self.known:
             near = float(_DOES[op](*map(np.float64, map(float, args))))
-            self.known[key] = Recorded(op, args, near, self)
+            self.known[key] = TracedNumber(op, args, near, self)
         return self.known[key]
 
     def compared(self, a: Any, b: Any) -> bool:
         """Whether a <= b holds beside the file's values; then it has to hold for all."""
-        a, b = (x if isinstance(x, Recorded) else float(x) for x in (a, b))
+        a, b = (x if isinstance(x, TracedNumber) else float(x) for x in (a, b))
         good = float(a) <= float(b)
         if good and (a, b) not in self.holds:
             self.holds.append((a, b))
@@ -141,7 +141,7 @@ class _Book:
 
 
 def _zero(value: Any) -> bool:
-    return not isinstance(value, Recorded) and value == 0.0
+    return not isinstance(value, TracedNumber) and value == 0.0
 
 
 Matrix = list[list[Any]]
@@ -200,9 +200,11 @@ def _poles(book: _Book, where: str, factor: Sequence[Any]) -> list[Any]:
             return []
         book.compared(0.0, square)
         return [
-            -2.0 * c / (b + (square**0.5 if isinstance(square, Recorded) else math.sqrt(square)))
+            -2.0
+            * c
+            / (b + (square**0.5 if isinstance(square, TracedNumber) else math.sqrt(square)))
         ]
-    if any(isinstance(c, Recorded) for c in factor):
+    if any(isinstance(c, TracedNumber) for c in factor):
         raise LawError(where, f"a denominator of degree {len(factor) - 1} has parameters in it")
     zeros = np.roots(factor[::-1])
     real = zeros[np.abs(zeros.imag) <= 1e-9 * np.abs(zeros)].real
@@ -365,11 +367,11 @@ class GainChanges:
             raise LawError(where, "has an inner stage that follows from its parameters")
         self.file, self.record, self.T_s = file, record, T_s
         self._book = book = _Book()
-        self._nodes: dict[str, Recorded] = {}
+        self._nodes: dict[str, TracedNumber] = {}
         for k, (name, one) in enumerate(file.parameters.items()):
             near = one.value * (1.0 + _ASIDE * math.cos(k)) or _ASIDE * math.cos(k)
             if one.tied is None:
-                self._nodes[name] = Recorded("gain", (name,), near, book)
+                self._nodes[name] = TracedNumber("gain", (name,), near, book)
         # as gfm_runtime.lawfile.tied has it, a tied parameter follows those that are not tied
         numbers = {name: one.value for name, one in file.parameters.items()} | self._nodes
         values: dict[str, Any] = dict(self._nodes)
@@ -389,20 +391,20 @@ class GainChanges:
         for name, parts in found.items():
             self._places[name] = []
             for part, value in zip(parts, np.ravel(record[name]), strict=True):
-                other = isinstance(part, Recorded) and part.op == "neg"
+                other = isinstance(part, TracedNumber) and part.op == "neg"
                 what = part.args[0] if other else part
-                if not isinstance(what, Recorded) and value == value.dtype.type(what):
+                if not isinstance(what, TracedNumber) and value == value.dtype.type(what):
                     self._places[name].append(None)
                     continue
                 own = -value if other else value
-                key = (id(what) if isinstance(what, Recorded) else what, own.tobytes())
+                key = (id(what) if isinstance(what, TracedNumber) else what, own.tobytes())
                 if key not in known:
                     known[key] = len(first)
                     self._made.append(what)
                     first.append(own)
                 self._places[name].append((known[key], other))
         self.first = np.array(first, record["u_0"].dtype)
-        self._steps = self._needed()
+        self._steps = self._needed_steps()
         used = {id(a) for step in self._steps for a in step.args} | set(map(id, self._made))
         #: the gains that a coefficient follows, with their values in the file
         self.gains = {
@@ -411,19 +413,19 @@ class GainChanges:
             if id(node) in used
         }
 
-    def _needed(self) -> list[Recorded]:
+    def _needed_steps(self) -> list[TracedNumber]:
         """The operations of the coefficients and of what has to hold, in their order."""
         ends = [*self._made, *(x for pair in self._book.holds for x in pair)]
-        open_ones = [one for one in ends if isinstance(one, Recorded)]
+        open_ones = [one for one in ends if isinstance(one, TracedNumber)]
         seen: set[int] = set()
         while open_ones:
             one = open_ones.pop()
             if id(one) not in seen:
                 seen.add(id(one))
-                open_ones += [a for a in one.args if isinstance(a, Recorded)]
+                open_ones += [a for a in one.args if isinstance(a, TracedNumber)]
         return [one for one in self._book.known.values() if id(one) in seen]
 
-    def _values(self, gains: Mapping[str, float], steps: Iterable[Recorded]) -> Any:
+    def _values(self, gains: Mapping[str, float], steps: Iterable[TracedNumber]) -> Any:
         """What gives each number's value with these gains, the file's if not among them."""
         found: dict[int, Any] = {
             id(node): np.float64(gains.get(name, self.file.parameters[name].value))
@@ -431,7 +433,7 @@ class GainChanges:
         }
 
         def value(one: Any) -> Any:
-            return found[id(one)] if isinstance(one, Recorded) else np.float64(one)
+            return found[id(one)] if isinstance(one, TracedNumber) else np.float64(one)
 
         for step in steps:
             found[id(step)] = _DOES[step.op](*map(value, step.args))
@@ -502,7 +504,7 @@ class GainChanges:
         texts |= {id(node): f"gains->{name}" for name, node in self._nodes.items()}
 
         def text(one: Any) -> str:
-            return texts[id(one)] if isinstance(one, Recorded) else literal(one, double)
+            return texts[id(one)] if isinstance(one, TracedNumber) else literal(one, double)
 
         members, ranges, lines = [], [], []
         for k, (name, (low, high)) in enumerate(self.ranges.items()):
@@ -525,8 +527,8 @@ class GainChanges:
             "GAIN_MEMBERS": "\n".join(members),
             "N_GAINS": str(len(self.gains)),
             "N_COEFFICIENTS": str(len(self.first)),
-            "GAINS": _wrapped(self.initialiser(self.gains)),
-            "FIRST": _wrapped(literals(self.first, real)),
+            "GAINS": _wrap(self.initialiser(self.gains)),
+            "FIRST": _wrap(literals(self.first, real)),
             "GAIN_RANGES": "\n".join(ranges),
             "GAIN_STEPS": "\n".join(lines),
             "GAINS_HOLD": "\n        && ".join(holds) or "1",
@@ -615,7 +617,7 @@ class GainChanges:
         else:
             bounds = []
         for one in bounds:
-            if isinstance(one, Recorded):
+            if isinstance(one, TracedNumber):
                 book.compared(one, _ON_CIRCLE)
 
 
@@ -624,5 +626,5 @@ def _flat(table: Mapping[str, Any]) -> Iterator[Any]:
         yield from _flat(value) if isinstance(value, dict) else [value]
 
 
-def _wrapped(numbers: str) -> str:
+def _wrap(numbers: str) -> str:
     return "\n    ".join(["", *textwrap.wrap(numbers, 96)])

@@ -34,7 +34,7 @@ from gfm_hil.studies.conformity.sets import (
     Test,
     TestPart,
     all_limits,
-    counted,
+    count_limits,
     load_cases,
     load_under_test,
     scaled,
@@ -1241,7 +1241,7 @@ def test_every_limit_has_a_source_and_says_how_it_is_known(tmp_path):
     """A limit that no source gives is called ours, in the list and in the results."""
     limits = all_limits(load_cases(["all"]))
     assert {row["known"] for row in limits} == {"read", "summary", "memory", "ours"}
-    assert counted(limits).startswith(f"{len(limits)} limits: ")
+    assert count_limits(limits).startswith(f"{len(limits)} limits: ")
     of = {(row["test"], row["clause"]): row for row in limits}
     miso = of["miso/3-phase-jump", "90 % of the peak within 15 ms"]
     assert (miso["known"], miso["criterion"]) == ("read", "rise_within")

@@ -17,7 +17,7 @@ from gfm_hil.recording.run import Run
 from gfm_hil.results.export.comtrade import write_cfg, write_dat
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.studies.conformity.criteria.base import judge
-from gfm_hil.studies.conformity.result import explained
+from gfm_hil.studies.conformity.result import explain_counts
 from gfm_hil.studies.conformity.sets import load_cases, load_under_test, scenario_of
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS
 
@@ -177,7 +177,7 @@ def test_the_first_page_is_about_the_recording(place: Path, waves: Columns) -> N
     facts = dict(made.about("page"))
     assert facts["part"] == f"{PART}; not judged: +10"
     assert not facts.keys() & {"law", "inner stage"}
-    assert "about what was recorded" in explained(made, "page")
+    assert "about what was recorded" in explain_counts(made, "page")
 
 
 def test_a_clock_of_its_own_changes_no_verdict(

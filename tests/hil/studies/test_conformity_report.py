@@ -20,7 +20,7 @@ from gfm_hil.results.curves import PackedCurves, Panel
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.conformity.panels import panels_of_run
-from gfm_hil.studies.conformity.saturation import marked
+from gfm_hil.studies.conformity.saturation import mark_saturation
 from gfm_hil.studies.conformity.verdict import FAIL, PASS, Verdict
 from gfm_runtime.lawfile import shipped_law
 
@@ -161,10 +161,10 @@ def test_a_clause_is_marked_by_the_part_of_its_window_in_which_a_limiter_acts():
     limited = np.zeros(20_000)
     limited[5_000:6_000] = 1
     run = run_of(20_000, y_p=y_p, limited=limited)
-    first, second = marked(run, [verdict_in(0.0, 2.0), verdict_in(0.7, 0.9)], True)
+    first, second = mark_saturation(run, [verdict_in(0.0, 2.0), verdict_in(0.7, 0.9)], True)
     assert first.saturated == pytest.approx({"current": 0.05, "power": acts.mean()})
     assert "current" not in second.saturated
-    (foreign,) = marked(run, [verdict_in(0.4, 0.6)], False)
+    (foreign,) = mark_saturation(run, [verdict_in(0.4, 0.6)], False)
     assert foreign.saturated == pytest.approx({"current": 0.5})
 
 

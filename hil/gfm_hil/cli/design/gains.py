@@ -40,7 +40,7 @@ def chosen_law(options: argparse.Namespace) -> LawFile:
     return file.model_copy(update={"inner": named_inner(options.inner)})
 
 
-def judged(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
+def problem_title(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
     """The name of a law, and which problem its gamma is that of if it is not the paper's."""
     if on is None and file.inner is None:
         return file.name
@@ -176,7 +176,7 @@ def _gamma(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"law": law.name, **design.channels_as_json(channels)}, indent=2))
     else:
-        print_channels(judged(law.file, on, converter), channels)
+        print_channels(problem_title(law.file, on, converter), channels)
     return 0
 
 
@@ -219,7 +219,7 @@ def _tune(options: argparse.Namespace) -> int:
     if options.full_order and law.file.inner is not None:
         raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
-        found = _searched(law, on, options)
+        found = _search(law, on, options)
     except design.NotTuned as none:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
@@ -245,7 +245,7 @@ def _tune(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(judged(law.file, on, options.converter), channels)
+    print_channels(problem_title(law.file, on, options.converter), channels)
     lines = [
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
@@ -257,7 +257,7 @@ def _tune(options: argparse.Namespace) -> int:
     return 0
 
 
-def _searched(law: Law, on: Scenario | None, options: argparse.Namespace) -> design.Tuning:
+def _search(law: Law, on: Scenario | None, options: argparse.Namespace) -> design.Tuning:
     """The search, with a bar on stderr."""
     with watching(f"tuning {law.name}", options.quiet) as watch:
         return design.tune(

@@ -279,7 +279,7 @@ DroopValues = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Adopted:
+class CurveState:
     """State of a function with stored curves."""
 
     enabled: bool = False
@@ -305,7 +305,7 @@ class Curves(PointGroup):
         self._fixed, self._own = (f"{self.model}.{self.curve}{k}." for k in (1, _WRITABLE))
         own = (self._own + name for name in self.stored)
         self.writable = (self._enable, self._request, *own)
-        self.state = Adopted()
+        self.state = CurveState()
         self._stored: dict[str, Value] = {}
 
     @abstractmethod
@@ -362,7 +362,7 @@ class Curves(PointGroup):
         return Effect(events, store, fail)
 
     def forget(self) -> None:
-        self.state, self._stored = Adopted(), {}
+        self.state, self._stored = CurveState(), {}
 
     def show(self, run: RunState, now: float) -> dict[str, Value]:
         s, now_in_force = self.state, self.write(self.in_force(run))

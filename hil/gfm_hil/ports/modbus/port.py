@@ -117,7 +117,7 @@ class ModbusPort(OperatorPort):
             )
         began = time.monotonic()
         served = [
-            _served(run, place, unit, options.heartbeat, began)
+            _make_device(run, place, unit, options.heartbeat, began)
             for unit, place in enumerate(places.values(), 1)
         ]
         devices, units = [device for device, _ in served], [*enumerate(places, 1)]
@@ -148,7 +148,7 @@ class ModbusPort(OperatorPort):
         return 0
 
 
-def _served(
+def _make_device(
     run: BesideRun, place: Path, unit: int, heartbeat_ms: int, began: float
 ) -> tuple[Device, Watcher]:
     """The device of one place of a run, and what it sees of it. Raises UserError: no run is in

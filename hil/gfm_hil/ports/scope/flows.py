@@ -42,7 +42,7 @@ class Flows:
                  "symbol": one.symbol}
                 for name, one in lines.items()
             ],
-            "mesh": single_line.collide(bars, lines), "stacked": _stacked(bars, lines),
+            "mesh": single_line.collide(bars, lines), "stacked": _stack(bars, lines),
         }  # fmt: skip
 
     @property
@@ -57,9 +57,9 @@ class Flows:
         for entry in next(iter(self._runs.values())).happened()["events"]:
             if (change := switched(entry)) is not None:
                 closed[change[0]] = change[1]
-        return {"converters": converters, "flows": self._recorded(), "closed": closed}
+        return {"converters": converters, "flows": self._recorded_flows(), "closed": closed}
 
-    def _recorded(self) -> dict[str, list[float]]:
+    def _recorded_flows(self) -> dict[str, list[float]]:
         run = next(iter(self._runs.values()))
         columns, done = run.record.columns, run.pyramid.done
         names = [n.removesuffix(".P") for n in self._scenario.flows if n.endswith(".P")]
@@ -72,7 +72,7 @@ class Flows:
         }
 
 
-def _stacked(bars: Mapping[str, single_line.Bar], lines: single_line.Lines) -> dict[str, Any]:
+def _stack(bars: Mapping[str, single_line.Bar], lines: single_line.Lines) -> dict[str, Any]:
     """For a narrow page: the rows of each node, and the row and the lane of each line."""
     rows = single_line.assign_rows(bars, lines, stacked=True)
     lanes = single_line.assign_lanes(bars, lines)

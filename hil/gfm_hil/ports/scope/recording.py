@@ -6,7 +6,7 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.announcement import read_announcement, running_roles
-from gfm_hil.ports.port import recorded
+from gfm_hil.ports.port import has_recording
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.recording.log import read_events, read_summary
@@ -92,7 +92,7 @@ def open_recording(folder: Path) -> Recording:
         record = Recording(folder, scenario, run.recorded, laws, live=False)
         record._done = record.capacity = run.ticks
         return record
-    if not recorded(folder):
+    if not has_recording(folder):
         raise UserError(f"{folder}: nothing has been recorded there")
     return Recording(folder, scenario, laws=_laws(scenario))
 

@@ -63,7 +63,7 @@ class _Number:
     key: str = ""  # its name in the command
 
 
-def _recorded(name: str, now: dict[str, Any]) -> float:
+def _read_column(name: str, now: dict[str, Any]) -> float:
     return float(now[name])
 
 
@@ -90,13 +90,13 @@ class Memory:
         self.epk = f"gfmhil {version('gfmhil')}; {digest}"
         names = ["tick", *signals_of("plant", inner), *signals_of("controller", inner)]
         for k, name in enumerate(names):
-            self._add(self._measured(name, _MEASURED + k * CELL))
+            self._add(self._measurement(name, _MEASURED + k * CELL))
         for k, s in enumerate(group("ref")):
             entry = Entry(
                 s.name, f"reference: {s.description}", "FLOAT64_IEEE", _REFERENCES + k * CELL,
                 unit_of(s), s.low, s.high, calibrated=True,
             )  # fmt: skip
-            self._add(_Number(entry, partial(_recorded, f"ref_{s.name}"), _A_REFERENCE, s.name))
+            self._add(_Number(entry, partial(_read_column, f"ref_{s.name}"), _A_REFERENCE, s.name))
         words = tuple(enumerate(self._laws))
         entry = Entry(
             "active_law", "the law in force", "FLOAT64_IEEE", _LAW, low=0.0, words=words,
@@ -118,7 +118,7 @@ class Memory:
     def _add(self, cell: _Number) -> None:
         self._cells[cell.entry.address] = cell
 
-    def _measured(self, name: str, address: int) -> _Number:
+    def _measurement(self, name: str, address: int) -> _Number:
         row = describe(name, self._laws)
         signal = _SIGNALS.get(name)
         low, high = (signal.low, signal.high) if signal else (None, None)
@@ -130,7 +130,7 @@ class Memory:
         if name == "state":  # a snapshot has its word
             numbers = {word: number for number, word in row.words}
             return _Number(entry, lambda now: numbers[now[name]])
-        return _Number(entry, partial(_recorded, name))
+        return _Number(entry, partial(_read_column, name))
 
     def _gain(self, law: str, name: str, now: dict[str, Any]) -> float:
         file = self._files[law]

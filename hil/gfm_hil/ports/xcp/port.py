@@ -153,7 +153,7 @@ class CanFd:
         )  # fmt: skip
 
 
-def packed(line: Udp | CanFd, timeout_ms: int, commands: Sequence[str]) -> list[str]:
+def xcp_section(line: Udp | CanFd, timeout_ms: int, commands: Sequence[str]) -> list[str]:
     """The A2L file's section on XCP: T1 and T2, ms, and the optional commands that there are."""
     return [
         "/begin IF_DATA XCP",
@@ -216,7 +216,7 @@ class XcpPort(OperatorPort):
         )
 
         def a2l() -> str:
-            return memory.a2l("bench", packed(self.line, _TIMEOUT_MS, _COMMANDS))
+            return memory.a2l("bench", xcp_section(self.line, _TIMEOUT_MS, _COMMANDS))
 
         if options.a2l is not None:
             write_text(options.a2l, a2l())

@@ -104,7 +104,7 @@ class Slave:
         try:
             if not packet or len(packet) < _LEAST.get(packet[0], 1):
                 raise Refusal(CMD_SYNTAX, "a packet is not as its length or its command wants it")
-            return bytes([_RES]) + self._carried_out(packet, peer)
+            return bytes([_RES]) + self._execute(packet, peer)
         except Refusal as problem:
             if problem.code != CMD_SYNCH:
                 self._print_refusal(f"refused: {problem}")
@@ -116,7 +116,7 @@ class Slave:
             last = "; further refusals are not told" if self._printed == _MOST_PRINTED else ""
             self._notice(text + last)
 
-    def _carried_out(self, packet: bytes, peer: Any) -> bytes:
+    def _execute(self, packet: bytes, peer: Any) -> bytes:
         """What follows the code of a positive response. Raises Refusal: the response is an
         error."""
         command, count = packet[0], packet[1] if len(packet) > 1 else 0

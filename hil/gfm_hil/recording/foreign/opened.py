@@ -9,7 +9,7 @@ import numpy as np
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.foreign.channels import RecordingMap, read_recording_map
 from gfm_hil.recording.foreign.files import read_channels
-from gfm_hil.recording.foreign.signals import Sampled, Vector, at_ticks, sampled, sequences
+from gfm_hil.recording.foreign.signals import SampledRecording, Vector, at_ticks, sampled, sequences
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.grid import GridFrequency
@@ -72,7 +72,10 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
     for name, vector in s.vectors.items():
         rests = at_ticks(s, vector * frame, there, T_s)
         columns |= {f"true_{name}_re": rests.real, f"true_{name}_im": rests.imag}
-    if "true_omega_g" not in columns and (omega_g := _prescribed(scenario, t, f_n)) is not None:
+    if (
+        "true_omega_g" not in columns
+        and (omega_g := _prescribed_frequency(scenario, t, f_n)) is not None
+    ):
         columns["true_omega_g"] = omega_g
     if not any(e.type == "reference" for e in scenario.events):
         columns["ref_P_ref"] = np.full(ticks, scenario.references.P_ref)
@@ -97,7 +100,9 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
     return Run(scenario, summary, columns)
 
 
-def _event(s: Sampled, of: RecordingMap, scenario: Scenario, cycle: float) -> tuple[float, str]:
+def _event(
+    s: SampledRecording, of: RecordingMap, scenario: Scenario, cycle: float
+) -> tuple[float, str]:
     """When the first event is by the recording's clock, s, and how that is known: where p, q or V
     leaves the band in which it rests. Raises UserError: nothing moves, or not where the map says
     that the event is."""
@@ -134,7 +139,7 @@ def _event(s: Sampled, of: RecordingMap, scenario: Scenario, cycle: float) -> tu
     return of.event_s, f"as its map says ({name} leaves its band of rest at {at:.6g} s)"
 
 
-def _check_rest(s: Sampled, event: float, scenario: Scenario, f_n: float) -> None:
+def _check_rest(s: SampledRecording, event: float, scenario: Scenario, f_n: float) -> None:
     """See that the recording rests where the scenario begins. Raises UserError: it does not."""
     before = s.t <= event + 1e-12
     before[: max(0, int(before.sum()) - max(2, int(10 / f_n / s.dt)))] = False
@@ -164,7 +169,7 @@ def _check_rest(s: Sampled, event: float, scenario: Scenario, f_n: float) -> Non
             )
 
 
-def _ends(s: Sampled, event: float, cycle: float) -> tuple[str, str, float | None]:
+def _ends(s: SampledRecording, event: float, cycle: float) -> tuple[str, str, float | None]:
     """Status, reason and time of the end of a converter that trips: by the channel of its trip, or
     as it carries no current to the end. "?" is the reason if the recording cannot show it."""
     if "trip" in s.of:
@@ -181,7 +186,7 @@ def _ends(s: Sampled, event: float, cycle: float) -> tuple[str, str, float | Non
     return "completed", "", None
 
 
-def _prescribed(scenario: Scenario, t: Vector, f_n: float) -> Vector | None:
+def _prescribed_frequency(scenario: Scenario, t: Vector, f_n: float) -> Vector | None:
     """The frequency of a stiff grid as a scenario prescribes it, p.u.; None if it does not."""
     moves = [e for e in scenario.sorted_events() if e.type not in _KEEP]
     stiff = scenario.network is None and scenario.plant.grid.finite is None

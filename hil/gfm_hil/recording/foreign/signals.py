@@ -22,7 +22,7 @@ _EVEN = 0.01  # of a sample: by how much two of them may be further apart than o
 
 
 @dataclass(frozen=True)
-class Sampled:
+class SampledRecording:
     """A recording at its own samples."""
 
     t: Vector  # s of its clock, shape (samples,)
@@ -32,7 +32,7 @@ class Sampled:
     vectors: dict[str, NDArray[np.complex128]] = field(default_factory=dict)
 
 
-def sampled(columns: dict[str, Vector], of: RecordingMap, f_n: float) -> Sampled:
+def sampled(columns: dict[str, Vector], of: RecordingMap, f_n: float) -> SampledRecording:
     """The signals of a file's columns by their map. Raises UserError: a channel is not there, has
     gaps or no even clock."""
     for name in of.names():
@@ -61,13 +61,13 @@ def sampled(columns: dict[str, Vector], of: RecordingMap, f_n: float) -> Sampled
             with np.errstate(divide="ignore", invalid="ignore"):
                 size = np.hypot(found["p"], found["q"]) / found["V"]
             found["i"] = np.where(found["V"] > _LEAST_V, size, np.nan)
-        return Sampled(t, dt, found)
+        return SampledRecording(t, dt, found)
     v, i = vectors["v"], vectors["i"]
     s = v * np.conj(i)
     made: dict[str, Vector] = {"p": s.real, "q": s.imag, "V": np.abs(v), "i": np.abs(i)}
     turns = of.v is not None and of.v.phases is not None
     made["f"] = _frequency(t, v, 1 / f_n) / f_n + (0.0 if turns else 1.0)
-    return Sampled(t, dt, {**made, **found}, vectors if turns else {})
+    return SampledRecording(t, dt, {**made, **found}, vectors if turns else {})
 
 
 def _frequency(t: Vector, v: NDArray[np.complex128], cycle: float) -> Vector:
@@ -92,7 +92,7 @@ def sequences(t: Vector, x: NDArray[np.complex128], f_n: float) -> tuple[float, 
     return tuple(float(np.abs(np.mean((x * y)[-count:]))) for y in (turn, turn.conj()))  # type: ignore[return-value]
 
 
-def at_ticks(s: Sampled, x: NDArray[Any], t: Vector, T_s: float) -> NDArray[Any]:
+def at_ticks(s: SampledRecording, x: NDArray[Any], t: Vector, T_s: float) -> NDArray[Any]:
     """A signal at other instants, nan outside the recording: straight lines between samples, of
     which as many as lie in a tick are averaged first."""
     inside = np.clip(t, s.t[0], s.t[-1])

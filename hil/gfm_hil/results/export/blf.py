@@ -102,7 +102,7 @@ def _commands(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
         times = _times(run, "controller", begin, first, last)
         state = run.recorded["state"][first:last]
         beyond = last + n  # u[k] may be taken as late as that
-        rows, taken = _vector(run, "u", first, beyond), _taken(run, first, beyond)
+        rows, taken = _vector(run, "u", first, beyond), _took_in_time(run, first, beyond)
         for j in np.flatnonzero(~np.isnan(state)).tolist():
             k = first + j
             at = j + n if n > 1 and k else j
@@ -128,7 +128,7 @@ def _vector(run: Run, group: Vector, first: int, last: int) -> NDArray[np.float6
     return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in carries])
 
 
-def _taken(run: Run, first: int, last: int) -> NDArray[np.bool_]:
+def _took_in_time(run: Run, first: int, last: int) -> NDArray[np.bool_]:
     """Ticks at which the plant took a command in time; in process it always does."""
     received = run.recorded.get("plant_received", run.recorded["tick"])
     return received[first:last] >= 0

@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import Described
+from gfm_hil.recording.columns import ColumnInfo
 from gfm_hil.recording.log import event_text
 from gfm_hil.recording.run import Run
 
@@ -27,7 +27,7 @@ def write_mf4(run: Run, file: Path) -> None:
     """Write a run."""
     from asammdf import MDF, Signal
 
-    def signal(c: Described, rows: dict[str, NDArray[Any]]) -> Any:
+    def signal(c: ColumnInfo, rows: dict[str, NDArray[Any]]) -> Any:
         return Signal(
             rows[c.name],
             rows["t"],

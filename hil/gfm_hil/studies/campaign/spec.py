@@ -28,7 +28,7 @@ from gfm_hil.scenario import Scenario
 _LEAST = 1e-9  # of a normal's probability that must lie within its bounds
 
 
-class _Drawn(StrictSchema):
+class _DrawnValue(StrictSchema):
     path: str = Field(description="dotted path in the scenario, e.g. plant.factors.L_g")
     also: list[str] = Field([], description="further paths that get the same value")
     label: str | None = Field(None, description="of the figure's axis, the path if none")
@@ -38,7 +38,7 @@ class _Drawn(StrictSchema):
         return [self.path, *self.also]
 
 
-class _Between(_Drawn):
+class _Between(_DrawnValue):
     low: float = Field(description="least value")
     high: float = Field(description="greatest value")
 
@@ -110,7 +110,7 @@ class Normal(_Between):
         return self._within(NormalDist(self.mean, self.sigma).inv_cdf(share))
 
 
-class Choice(_Drawn):
+class Choice(_DrawnValue):
     """One of some values, all alike; they may be numbers, words or true and false."""
 
     type: Literal["choice"] = Field(description="kind of distribution")

@@ -69,13 +69,13 @@ class _Content:
         """The whole report."""
         from reportlab.platypus import PageBreak
 
-        from gfm_hil.studies.conformity.result import HEADS, explained, row, saturation, tally
+        from gfm_hil.studies.conformity.result import HEADS, explain_counts, row, saturation, tally
 
         self._head(0, f"{title}: {found.verdict_of(law)}")
         self._table([[name, text] for name, text in found.about(law)], [0.2, 0.8], head=False)
         counts = tally(found, law)
         self._table(counts, [0.3, *[0.7 / (len(counts[0]) - 1)] * (len(counts[0]) - 1)])
-        self._paragraph(explained(found, law))
+        self._paragraph(explain_counts(found, law))
         self._signature()
         rows = [
             [found.matrix[law, c.id], f"{c.id}: {c.test.title}", c.test.source.words()]

@@ -21,7 +21,7 @@ from gfm_hil.studies.conformity.criteria.base import UnderTest, cannot_judge, ju
 from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_hil.studies.conformity.in_network import NetworkUnderTest
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
-from gfm_hil.studies.conformity.saturation import marked
+from gfm_hil.studies.conformity.saturation import mark_saturation
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
 from gfm_hil.studies.conformity.shared_start import SharedStart, alike, first_event, judged
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
@@ -351,7 +351,7 @@ def _run_part(job: Job) -> PartResult:
                     under = criterion.declared(under, scenario)
             status, reason = run.status, str(run.summary["reason"])
             recording = run.digest
-            verdicts = marked(run, judge(run, criteria, under, others), external is None)
+            verdicts = mark_saturation(run, judge(run, criteria, under, others), external is None)
         again, figure = list[str](), None
         if job.folder is not None:
             place = job.folder / "runs" / slug(job.law) / slug(job.name)

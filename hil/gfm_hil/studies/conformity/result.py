@@ -263,7 +263,7 @@ class Conformity:
             template, title=title, found=self, law=law, slug=slug, known=KNOWN, signs=SIGNS,
             row=row, heads=HEADS, saturation=saturation, curves=curves, script=plot_script(),
             tally=None if law is None else tally(self, law),
-            explained=None if law is None else explained(self, law),
+            explained=None if law is None else explain_counts(self, law),
         )  # fmt: skip
 
     def __repr__(self) -> str:
@@ -302,7 +302,7 @@ def saturation(v: Verdict) -> str:
     )
 
 
-def explained(found: Conformity, law: str) -> str:
+def explain_counts(found: Conformity, law: str) -> str:
     """What the table of counts of the first page means."""
     counts = Counter[str]()
     for of in found.counts(law).values():

@@ -13,7 +13,7 @@ from gfm_hil.studies.conformity.verdict import Verdict
 from gfm_runtime import load_law
 
 
-def marked(run: Run, verdicts: Sequence[Verdict], ours: bool) -> list[Verdict]:
+def mark_saturation(run: Run, verdicts: Sequence[Verdict], ours: bool) -> list[Verdict]:
     """The verdicts, each with the part of its window in which a limiter of the inner stage acts.
 
     Args:

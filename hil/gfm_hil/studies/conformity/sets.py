@@ -167,7 +167,7 @@ def _load_case(path: Path) -> Case:
     for part in test.runs():
         if part.cannot is None:
             content = content_of(case, part, {})
-            _checked(path, Scenario, content, "scenario.")
+            _validate(path, Scenario, content, "scenario.")
             wrong = _mistakes(test, part, content)
             if wrong:
                 raise UserError("\n".join(printable(f"{path}: {line}") for line in wrong))
@@ -231,7 +231,7 @@ def all_limits(cases: Sequence[Case]) -> list[dict[str, str]]:
     return [dict(zip(_LIMIT, row, strict=True)) for row in found]
 
 
-def counted(limits: Sequence[Mapping[str, str]]) -> str:
+def count_limits(limits: Sequence[Mapping[str, str]]) -> str:
     """How many limits there are, and how many are known in which way, in one line."""
     ways = Counter(row["known"] for row in limits)
     told = ", ".join(f"{ways[known]} {known}" for known in KNOWN if known in ways)
@@ -267,10 +267,10 @@ def _read(path: Path, model: type[Any]) -> Any:
         content = read_toml(path)
     except (OSError, ValueError) as problem:
         raise UserError(printable(f"{path}: {problem}")) from None
-    return _checked(path, model, content)
+    return _validate(path, model, content)
 
 
-def _checked(path: Path, model: type[BaseModel], content: Any, table: str = "") -> Any:
+def _validate(path: Path, model: type[BaseModel], content: Any, table: str = "") -> Any:
     try:
         return model.model_validate(content)
     except ValidationError as problem:
@@ -291,7 +291,7 @@ def scenario_of(
     content["plant"]["converter"] = converter_at(given, test.f_n, 1.0, converters)
     members = content.get("network", {}).get("converters", {})
     for name, member in members.items():
-        own = _merged({k: v for k, v in content["plant"].items() if k != "grid"},
+        own = _merge({k: v for k, v in content["plant"].items() if k != "grid"},
                       member.get("plant", {}))  # fmt: skip
         own["converter"] = converter_at(given, test.f_n, test.ratings.get(name, 1.0), converters)
         member["plant"] = own
@@ -301,20 +301,20 @@ def scenario_of(
 
 def content_of(case: Case, part: TestPart, plant: dict[str, Any]) -> dict[str, Any]:
     """The scenario of a part as plain data, without a law."""
-    base = _merged({"plant": plant, "link": {"type": "inproc"}}, case.test.scenario)
-    content = _merged(base, part.scenario)
+    base = _merge({"plant": plant, "link": {"type": "inproc"}}, case.test.scenario)
+    content = _merge(base, part.scenario)
     words = part.title or part.name
     content["title"] = f"{case.test.title}: {words}" if words else case.test.title
     return content
 
 
-def _merged(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Tables merged key by key; anything else is replaced. Both stay as they are."""
-    made = {k: _merged(v, {}) if isinstance(v, dict) else v for k, v in base.items()}
+    made = {k: _merge(v, {}) if isinstance(v, dict) else v for k, v in base.items()}
     for key, value in over.items():
         before = made.get(key)
         if isinstance(value, dict):
-            made[key] = _merged(before if isinstance(before, dict) else {}, value)
+            made[key] = _merge(before if isinstance(before, dict) else {}, value)
         else:
             made[key] = value
     return made

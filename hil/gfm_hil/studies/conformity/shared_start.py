@@ -103,10 +103,10 @@ def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | N
     events = [
         line
         for k, (piece, a, b, by) in enumerate(pieces)
-        for line in _moved(piece.events, by, scenario.T_s)
+        for line in _shift_lines(piece.events, by, scenario.T_s)
         if a <= line["tick"] - by < b + (piece is run) and not (k and line["event"] == "handshake")
     ]
-    moved = _moved(run.summary["events"], after - first, scenario.T_s)
+    moved = _shift_lines(run.summary["events"], after - first, scenario.T_s)
     summary = {**run.summary, "events": [*moved], "ticks": ticks - first}
     shifted = scenario.shifted(-settle_s)
     return replace(
@@ -135,7 +135,7 @@ def _of_bridge(columns: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]
     }
 
 
-def _moved(lines: Sequence[dict[str, Any]], by: int, T_s: float) -> Iterator[dict[str, Any]]:
+def _shift_lines(lines: Sequence[dict[str, Any]], by: int, T_s: float) -> Iterator[dict[str, Any]]:
     """Lines of a log, or entries of a summary, so many ticks later."""
     for line in lines:
         tick = line["tick"] + by
