@@ -19,9 +19,9 @@ from gfm_design.margins.delays import longest, overall_delay
 from gfm_design.model.closed_loop import T_S
 from gfm_design.norms.hinf import Unstable
 from gfm_design.tuning.gains import free_gains
-from gfm_hil.api.design import problem_name
+from gfm_hil.api.design import channels_as_json, problem_name
 from gfm_hil.cli.common import add_inner
-from gfm_hil.cli.design.gains import channels_as_json, chosen_law
+from gfm_hil.cli.design.gains import chosen_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_runtime import build_law, discretise

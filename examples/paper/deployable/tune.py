@@ -15,10 +15,9 @@ from gfm_design.margins.delays import overall_delay
 from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.synthesis import NotStabilised
-from gfm_hil.api.design import law_text, problem_name
+from gfm_hil.api.design import channels_as_json, law_text, problem_name
 from gfm_hil.cli.design.gains import (
     add_law_options,
-    channels_as_json,
     chosen_law,
     print_channels,
     problem_title,
