@@ -52,9 +52,7 @@ def save(run: Run | NetworkRun, folder: str | Path) -> Path:
     return run_folder.save(run, folder, write_report)
 
 
-def look_between_ticks(
-    run: Run, start: float, stop: float, step: float = 1e-6
-) -> BetweenTicks:  # fmt: skip
+def look_between_ticks(run: Run, start: float, stop: float, step: float = 1e-6) -> BetweenTicks:
     """What a switched bridge does between the ticks in a window of a run, which is repeated for it.
 
     Args:

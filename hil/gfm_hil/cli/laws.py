@@ -87,15 +87,12 @@ def call(options: argparse.Namespace) -> int:
                 "title": first.title,
                 "order": discretise(first, 1e-4).order,
                 "error_map": first.error_map,
-                "elements": {
-                    k: cell_text(file, k)
-                    for k in sorted({*file.phi, *file.psi})
-                },
+                "elements": {k: cell_text(file, k) for k in sorted({*file.phi, *file.psi})},
                 "stages": len(laws.laws),
                 "home_grid": first.home_grid.model_dump(),
                 "source": " ".join(first.source.split()),
             }
-        )  # fmt: skip
+        )
     if options.json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
         return 0
@@ -206,4 +203,4 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
         "discrete": [
             {"T_s": d.T_s, **{n: getattr(d, n).tolist() for n in MATRICES}} for d in discrete
         ],
-    }  # fmt: skip
+    }

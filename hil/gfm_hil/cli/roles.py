@@ -23,8 +23,8 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("-o", "--out", help="run folder; runs/<role>-<time> by default")
     command.add_argument("--quiet", action="store_true", help="say nothing but errors")
     command.add_argument(
-        "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u",
-    )  # fmt: skip
+        "--model", metavar="KIND:NAME", help=f"of the controller: {FORMS}, which computes u"
+    )
     common.add_map(command, "--model")
     command.add_argument("--part", action="store_true", help=argparse.SUPPRESS)
 

@@ -176,9 +176,7 @@ def _time(role: Role, name: str) -> ColumnInfo:
 
 
 #: letter, base and meaning; both parts of each are recorded, see `gfm_plant.TRUTH`
-_SPACE_VECTORS = (
-    ("v", "p.u. (V_n)", "voltage of C_f"), ("i", "p.u. (S_n/V_n)", "current of L_f"),
-)  # fmt: skip
+_SPACE_VECTORS = (("v", "p.u. (V_n)", "voltage of C_f"), ("i", "p.u. (S_n/V_n)", "current of L_f"))
 
 
 def _table() -> dict[str, ColumnInfo]:

@@ -250,9 +250,7 @@ class Picture(NamedTuple):
 
 
 # the same bytes for the same run; text as text; curves without steps that no eye sees
-_IN_A_PAGE: Any = {
-    "svg.hashsalt": "gfmhil", "svg.fonttype": "none", "path.simplify_threshold": 0.4,
-}  # fmt: skip
+_IN_A_PAGE: Any = {"svg.hashsalt": "gfmhil", "svg.fonttype": "none", "path.simplify_threshold": 0.4}
 _PANEL = (4.6, 2.3)  # inches, of a panel in a page: its text is readable on a phone
 
 

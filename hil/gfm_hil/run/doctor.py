@@ -231,7 +231,7 @@ def _judge_rest(facts: Facts) -> Iterator[_Row]:
         kind if steal is None or kind == "no" else f"{kind}, host takes {steal:g} %",
         "green" if kind == "no" else stopped,
         "the host can stop it for milliseconds: bare metal, or processors pinned by the host",
-    )  # fmt: skip
+    )
     load = facts["load_average"][0]
     yield (
         "load", f"{load:g}", "yellow" if load / facts["cpus"] > 0.5 else "green",

@@ -101,7 +101,7 @@ def _phase(name: str, phase: str, T_s: float, f_b: float) -> ScopeChannel:
 
     return ScopeChannel(
         row.name, "wave", row.symbol, "p.u.", row.quantity, _LEAST["p.u."], needs, base, of
-    )  # fmt: skip
+    )
 
 
 def _i_ref(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
