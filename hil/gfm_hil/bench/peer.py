@@ -48,7 +48,7 @@ _TICKS = 600_000  # exchanges at most with a controller that the bench starts: i
 _MOST = 1 << 20  # exchanges of a round
 _LOST_NS = 100_000_000  # after which an answer counts as lost
 _SILENCE_NS = 20_000_000_000
-_START_S, _LOOK_S = 30.0, 0.1
+_START_S, _POLL_S = 30.0, 0.1
 _LIMITS = {"shm": shm.LIMIT, "zmq": zmq.TCP, "udp": udp.LIMIT, "can": udp.LIMIT}
 _CLOCK_TAI = 11
 _UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
@@ -331,7 +331,7 @@ def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) 
     thread.start()
     priority.restore_priority()
     while thread.is_alive():
-        thread.join(_LOOK_S)
+        thread.join(_POLL_S)
         stop[0] = interrupt.came
     getattr(link, "stop", lambda: None)()
     if why[0] == LEFT:  # the bench waits for our last frame

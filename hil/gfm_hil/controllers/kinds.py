@@ -27,7 +27,7 @@ _KINDS: dict[str, Callable[[Path, PortMap, BenchContext], ExternalController]] =
 }
 _FILES = "dll:FILE, fmu:FILE or c:FILE"
 FORMS = "dll:FILE, fmu:FILE, c:FILE or pil:TARGET"
-_LOOK_S = 0.05
+_POLL_S = 0.05
 
 T = TypeVar("T")
 
@@ -65,7 +65,7 @@ def until_signal(what: str, work: Callable[[], T]) -> T:
 
     with Interrupt() as interrupt:
         threading.Thread(target=call, daemon=True).start()
-        while not wait([found], _LOOK_S).done:
+        while not wait([found], _POLL_S).done:
             if interrupt.came:
                 raise UserError(f"{what} does not come back")
     return found.result()

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from gfm_hil.controllers.external import Retuned
 
 _SHOWN = 120  # characters of an identification
-_START_S, _LOOK_S = 30.0, 0.05
+_START_S, _POLL_S = 30.0, 0.05
 _LINES, _BYTES = 3, 2000  # of what QEMU says, at most
 _SIGNALS = {BAD_Y: carried("y", True), BAD_SENSOR: names("adc"), RESULTS["BAD_REF"][0]: REF_NAMES}
 _SAID = dict(RESULTS.values())
@@ -245,7 +245,7 @@ class PilController(ExternalController):
         """The next answer, or what follows it. Raises ControllerError: the program has ended."""
         into = (self._answer if what is None else what).view(np.uint8).data
         while len(into):
-            while self._starts and not self._starts.poll(_LOOK_S * 1e3):
+            while self._starts and not self._starts.poll(_POLL_S * 1e3):
                 if self._process.poll() is not None:
                     raise self._ending()
                 if time.monotonic() > self._give_up:

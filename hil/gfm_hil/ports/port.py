@@ -32,7 +32,7 @@ from gfm_runtime.children import guarded
 INTERRUPTED = 130
 OWN_NUMBER = -1  # the port serves at its own number
 _GRACE_S = 5.0
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _NICENESS = 5  # the loop comes first, also where it has no real-time rights
 _T = TypeVar("_T")
 
@@ -86,11 +86,11 @@ class BesideRun:
         is reported, and not over."""
         now = time.monotonic()
         if not self._gone and now >= self._next_look:
-            self._next_look = now + _LOOK_S
+            self._next_look = now + _POLL_S
             try:
                 self._gone = not any(map(running_roles, self.places.values()))
             except (OSError, UserError) as problem:
-                report("the look whether the run goes on", problem)
+                report("the check whether the run goes on", problem)
                 self._next_look = now + PAUSE_S
         return self._gone or self.interrupted
 
@@ -101,7 +101,7 @@ class BesideRun:
         while self._patient and not all(map(there, self.places.values())):
             if self.interrupted:
                 raise KeyboardInterrupt
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         with contextlib.suppress(OSError):
             os.nice(_NICENESS)
 
@@ -117,7 +117,7 @@ class BesideRun:
         while (found := ask()) is None:
             if self.over():
                 raise not_running(self.folder)
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         return found
 
     def serve_until(
@@ -129,7 +129,7 @@ class BesideRun:
         async def until() -> None:
             task = asyncio.create_task(work)
             while not task.done() and not over():
-                await asyncio.wait([task], timeout=_LOOK_S)
+                await asyncio.wait([task], timeout=_POLL_S)
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task

@@ -217,7 +217,7 @@ def test_a_client_has_a_limit_of_commands(monkeypatch, attack_now):
     "the server ends as if the run were over",
 )  # fmt: skip
 def test_the_server_outlives_its_own_exceptions(monkeypatch, caplog, tmp_path, attack_now):
-    for where in ("core.supervised.PAUSE_S", "ports.port.PAUSE_S", "ports.port._LOOK_S"):
+    for where in ("core.supervised.PAUSE_S", "ports.port.PAUSE_S", "ports.port._POLL_S"):
         monkeypatch.setattr(f"gfm_hil.{where}", 0.01)
     full = OSError(errno.EMFILE, "Too many open files")
     failures = {"clock": [full] * 3, "look": [UserError("Too many open files"), full]}

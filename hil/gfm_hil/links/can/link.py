@@ -46,7 +46,7 @@ for _name in ("can", "isotp"):
     logging.getLogger(_name).addHandler(logging.NullHandler())
 
 _PATIENCE_S = 0.2  # for a peer that takes a message of the handshake, and for room in the kernel
-_LOOK_S = 20e-6  # poll interval while a frame is on the emulated bus
+_POLL_S = 20e-6  # poll interval while a frame is on the emulated bus
 _DIGEST_BYTES = 4  # before each message of the handshake
 #: what else can-isotp reports happens where one side is not there yet, or begins anew
 _DAMAGE = (
@@ -210,7 +210,7 @@ class CanLink:
             left = until - time.monotonic()
             if left <= 0:
                 return False
-            select.select([self._bus], [], [], min(left, _LOOK_S) if busy(node.bus) else left)
+            select.select([self._bus], [], [], min(left, _POLL_S) if busy(node.bus) else left)
         return True
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ from gfm_hil.links.serial.line import (
     set_line,
 )
 
-_LOOK_S = 0.01  # poll interval while the other side's pseudo terminal is not there
+_POLL_S = 0.01  # poll interval while the other side's pseudo terminal is not there
 
 _DEFAULT = SerialOptions()
 
@@ -136,7 +136,7 @@ class SerialLink:
             left = until - time.monotonic()
             if left <= 0:
                 return False
-            time.sleep(min(_LOOK_S, left))
+            time.sleep(min(_POLL_S, left))
         left = max(until - time.monotonic(), 0.0)
         return bool(select.select([self], [], [], left)[0])
 

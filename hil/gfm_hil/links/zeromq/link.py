@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _LAST_WORDS, _FAREWELL = 500, 50  # ms
 _NEVER = 10**9  # ms, 11 days; -1 would drop received messages that are not read yet
-_LOOK_S = 0.01  # poll interval while no controller listens
+_POLL_S = 0.01  # poll interval while no controller listens
 
 # The queues for a stalled peer are bounded, and further messages are dropped: each end holds
 _ROOM = 64
@@ -156,7 +156,7 @@ class ZmqLink:
             left = until - time.monotonic()
             if left <= 0:
                 return False
-            time.sleep(min(_LOOK_S, left))
+            time.sleep(min(_POLL_S, left))
         left = until - time.monotonic()
         return bool(self._socket.poll(max(1, round(left * 1000)), zmq.POLLIN))
 

@@ -35,8 +35,8 @@ from gfm_hil.ports.port import BesideRun, OperatorPort, make_tls, say
 from gfm_hil.scenario import load_scenario
 
 LOCAL = "modbus-local"  # in the run folder while the bench is commanded there
-_LOOK_S = 0.1  # poll interval of what changes rarely
-_LOOKS = 10  # such polls per update of the slack
+_POLL_S = 0.1  # poll interval of what changes rarely
+_POLLS = 10  # such polls per update of the slack
 _TIMER = Identity(through="modbus", name="timer")
 
 MOST_UNITS = 247  # of Modbus; those of a network's converters count from 1, in their order
@@ -137,7 +137,7 @@ class ModbusPort(OperatorPort):
                 await asyncio.gather(
                     supervised("the clock of the Modbus server", lambda: tick(devices, began)),
                     supervised(
-                        "the Modbus server's look at the run",
+                        "the Modbus server's poll of the run",
                         lambda: watch(run.folder, served, server),
                     ),
                 )
@@ -213,12 +213,12 @@ async def watch(folder: Path, served: Sequence[tuple[Device, Watcher]], server: 
     while True:
         for device, watcher in served:
             device.slack = watcher.slack()
-        for _ in range(_LOOKS):
+        for _ in range(_POLLS):
             local = (folder / LOCAL).exists()
             for device, _watcher in served:
                 device.take(local)
             server.peers.reap()
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_POLL_S)
 
 
 class Connection(ServerRequestHandler):

@@ -110,7 +110,7 @@ class Scope:
                 ready(listener.port)
                 await asyncio.gather(
                     supervised("the scope's pictures", self._frames),
-                    supervised("the scope's look at events", self._follow_log),
+                    supervised("the scope's poll of the events", self._follow_log),
                     supervised("the scope's connections", reap),
                 )
 

@@ -21,7 +21,7 @@ from gfm_hil.recording.live import LiveRun, begun
 from gfm_hil.recording.timing import ROUND_TRIP, SLACK, count_misses
 
 _LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _LINGER_MS = 500  # to send the last messages
 _LONGEST = 256  # bytes of a subscription; ours have 17 and the name of a converter
 _WAITING = 100  # queued subscription messages per subscriber
@@ -133,8 +133,8 @@ class Publisher:
                         self._blocks.send_multipart(message)
 
         while not all(one.over for one in followers) and not stopped():
-            time.sleep(_LOOK_S)
-            attempt("the stream's look at the run", look)
+            time.sleep(_POLL_S)
+            attempt("the stream's poll of the run", look)
         return count["plant"] or count["controller"]
 
 
