@@ -15,7 +15,7 @@ def tests() -> str:
     rows = []
     for case in sets.load_cases(["all"]):
         test, runs = case.test, len(case.test.runs())
-        asked = [c for part in test.runs() for c in test.asked(part)]
+        asked = [c for part in test.runs() for c in test.clauses(part)]
         clauses = ", ".join(dict.fromkeys(c.clause for c in asked)) or "cannot be run yet"
         source = f"{test.source.words()}; {KNOWN[test.source.known]}"
         rows.append((f"`{case.id}`", test.title, str(runs), f"{test.f_n:g}", clauses, source))

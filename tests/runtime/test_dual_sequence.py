@@ -11,7 +11,7 @@ import pytest
 import gfmhil
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.scenario import toml_text
-from gfm_hil.studies.conformity.sets import scaled
+from gfm_hil.studies.conformity.sets import to_base
 from gfm_plant import Plant, load_converter
 from gfm_runtime import LawError, LawSet, load_law
 from gfm_runtime.assembly import Controller
@@ -174,7 +174,7 @@ def test_it_holds_where_the_grid_becomes_weak(f_n, tmp_path):
     """From SCR 2.5 to 1: the loop around 100 Hz grew here while the stage filtered v."""
     file = tmp_path / "converter.toml"
     nominal = load_converter("paper")
-    file.write_text(toml_text(scaled(nominal, f_n, 1.0).model_dump()))
+    file.write_text(toml_text(to_base(nominal, f_n, 1.0).model_dump()))
     weaker = {"t": 0.5, "type": "grid-impedance", "scr": 1.0, "x_over_r": 6.0}
     run = gfmhil.run(
         {

@@ -17,7 +17,7 @@ from gfm_runtime.firmware.translate import (
     constants,
     number,
     operations,
-    reached,
+    with_callees,
 )
 
 X = Expr("var", ("s->x",))
@@ -53,7 +53,7 @@ def branches(c: Any, s: Any) -> None:
 def text(python: Any, unroll: bool = True, algebra: Algebra | None = None, c: Any = C) -> str:
     entry = Translator(unroll, algebra).function(python, [c, STATE])
     printer = Printer(np.dtype("f4"), {"c": "c_t", "s": "s_t"})
-    return "\n".join(map(printer.function, reached([entry])))
+    return "\n".join(map(printer.function, with_callees([entry])))
 
 
 def test_a_loop_with_known_bounds_becomes_one_sum_without_zeros():

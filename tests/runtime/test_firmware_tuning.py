@@ -56,7 +56,7 @@ def test_the_coefficients_are_those_of_the_law_with_these_gains(name):
     sets = tuning.sets(1)
     assert sets[0] == tuning.gains and len(sets) == 3
     for gains in sets:
-        found = tuning.tuned(gains)
+        found = tuning.record_of(gains)
         law = get_law(name, **tied(tuning.file, gains))
         expected = pack_law(discretise(law, T_S))[0]
         n = int(found["n"])
@@ -151,11 +151,11 @@ def test_a_step_has_the_old_set_or_the_new_one(library):
     np.testing.assert_array_equal(library.coefficients(), old)  # no step has come yet
     after = library.step(REF, Y)
     np.testing.assert_allclose(after, before, atol=1e-3)  # no bump
-    record = of.tuned(NEW)
+    record = of.record_of(NEW)
     assert library.coefficients()[0] == record["A"][1, 1] != old[0]
     assert library.tune() == 0 and library.tune(D_p=0.03) == 0  # the newest holds
     library.step(REF, Y)
-    assert library.coefficients()[2] == of.tuned({"D_p": 0.03})["B_r"][1, 1]
+    assert library.coefficients()[2] == of.record_of({"D_p": 0.03})["B_r"][1, 1]
     library.of.gfm_vsg_2_init(c.byref(library.law))
     np.testing.assert_array_equal(library.coefficients(), old)
 
@@ -170,7 +170,7 @@ def test_gains_that_no_law_has_are_refused_and_the_old_ones_stay(library, gains,
     assert library.tune(**gains) == why
     assert bytes(library.law) == old
     with pytest.raises(LawError):
-        library.tuning.tuned(gains)
+        library.tuning.record_of(gains)
 
 
 def test_the_crc_is_that_of_zlib_and_finds_any_bit_that_changed(library):
@@ -200,7 +200,7 @@ def ticks(inner: str, real: str) -> tuple[Any, Any, Any, Any]:
     out, now = [], u.copy()
     for k in range(TICKS):
         if k == AT:
-            record = tuning_of("vsg-2", real, inner).tuned(NEW)
+            record = tuning_of("vsg-2", real, inner).record_of(NEW)
             kernel.retune(kernel.discrete[0], record.reshape(1), NEW)
         kernel.ctl["ref"] = kernel.ctl["ref_target"] = refs[k]
         kernel.step(ys[k], now)
@@ -275,7 +275,7 @@ def test_what_the_style_does_not_cover_is_said(tmp_path, refused):
 
 def test_settle_takes_gains_at_once(library):
     """A law that is tuned before it starts has the state that the kernel gives it."""
-    record = library.tuning.tuned(NEW)
+    record = library.tuning.record_of(NEW)
     state = np.zeros(1, state_dtype("float64"))
     u, trend = np.array([0.5, 1.0, 1.0]), np.zeros(3)
     settle_into(record.reshape(1)[0], state[0], np.array(REF), np.array(Y), u.copy(), trend)

@@ -17,7 +17,7 @@ from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import printed
+from gfm_hil.recording.columns import symbol_of
 from gfm_hil.results.figures import (
     COLOURS,
     GREY,
@@ -67,7 +67,7 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     margins = []
     for k, (name, hz, L) in enumerate(_gains(loop, at)):
         dB, degrees = 20 * np.log10(np.abs(L)), _degrees(L)
-        _curve(gain, hz, dB, k, printed(name))
+        _curve(gain, hz, dB, k, symbol_of(name))
         _curve(phase, hz, degrees, k, "_")
         margins.append((hz, dB, degrees))
     for k, found in enumerate(margins):

@@ -155,7 +155,7 @@ def _ratios(other: _Late, ours: _Late) -> dict[str, list[float]]:
     The others skip each deadline that passed while they were late, so a stall of ten periods is one
     of their times. Ours here are those of the same deadlines.
     """
-    pairs = [(a, awaited(b)) for a, b in zip(other.rounds, ours.rounds, strict=False) if a.size]
+    pairs = [(a, at_awaited(b)) for a, b in zip(other.rounds, ours.rounds, strict=False) if a.size]
     of_rounds = [np.percentile(a, (50, 99)) / np.percentile(b, (50, 99)) for a, b in pairs]
     return {
         name: [round(x, 3) for x in (statistics.median(each), *median_interval(each))]
@@ -163,7 +163,7 @@ def _ratios(other: _Late, ours: _Late) -> dict[str, list[float]]:
     }
 
 
-def awaited(late: Times) -> Times:
+def at_awaited(late: Times) -> Times:
     """The lateness, of (2, ticks) in ns, at deadlines that were still to come when the loop woke
     for the tick before."""
     waited = np.ones(late.shape, bool)

@@ -30,12 +30,12 @@ def call(options: argparse.Namespace) -> int:
         if options.scenarios:
             said: list[str] = []
 
-            def told(text: str) -> None:
+            def note(text: str) -> None:
                 said.append(text)
                 notice(text)
 
             for scenario in [load_scenario(given) for given in options.scenarios]:
-                compiled_benches(scenario, told)
+                compiled_benches(scenario, note)
             ready, compiled = f"{len(options.scenarios)} scenarios are", len(said)
         else:
             task = bar.add_task("")

@@ -134,7 +134,7 @@ class ColumnInfo:
         """``quantity`` and ``origin`` in one line."""
         return f"{self.quantity}, {self.origin}" if self.origin else self.quantity
 
-    def shown(self, f_n: float) -> DisplayUnit:
+    def display_unit(self, f_n: float) -> DisplayUnit:
         """A frequency in Hz (``f_n`` is nominal), an angle in degrees, the rest as recorded."""
         signal = self.name
         if self.name not in CONTROLLER_INNER and "." not in self.name:  # their names have no prefix
@@ -335,7 +335,7 @@ def unit_of(name: str) -> str:
     return row.unit.partition(" (")[0]
 
 
-def printed(name: str) -> str:
+def symbol_of(name: str) -> str:
     """A signal's name as people write it: f for ``f_hz``, ω_u for ``omega_u``, δ for ``delta``."""
     return "f" if name == HERTZ else name.replace("omega", "ω").replace("delta", "δ")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, COUNTS_OF, kept_of, recorded_in
 from gfm_hil.recording.npz import BLOCK, ColumnGroup, write_npz
-from gfm_hil.recording.parts import FLOWS, RolePart, mapped, place_of
+from gfm_hil.recording.parts import FLOWS, RolePart, map_file, place_of
 from gfm_runtime.assembly import SPARE
 from gfm_runtime.signals import NY
 
@@ -20,7 +20,7 @@ _AT_ONCE = 64  # columns
 
 def _rows(file: Path, first: int, last: int, columns: slice = slice(None)) -> NDArray[Any]:
     """Rows of a part's file, shape (columns, last - first); mapped only while they are read."""
-    return np.ascontiguousarray(mapped(file)[first:last, columns].T)
+    return np.ascontiguousarray(map_file(file)[first:last, columns].T)
 
 
 def _blocks(rows: int) -> Iterator[tuple[int, int]]:

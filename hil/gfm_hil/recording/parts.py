@@ -115,7 +115,7 @@ class RolePart:
         files = [place / f"{role}_{what}.npy" for what in _KINDS] if place is not None else []
         if not files or not all(os.path.lexists(file) for file in files):
             return None
-        signals, times, progress = arrays = [mapped(file) for file in files]
+        signals, times, progress = arrays = [map_file(file) for file in files]
         types = [x.dtype.str for x in arrays] == ["<f8", "<i8", "<i8"]
         known = signals.ndim == 2 and recorded_in(role, signals.shape[1]) != ()
         widths = known and times.shape[1:] == (len(kept_of(role)),)
@@ -125,7 +125,7 @@ class RolePart:
         own = [file.with_name(name) for file in files[:1] for name in (FLOWS, _NAMES)]
         if role != "plant" or not all(os.path.lexists(file) for file in own):
             return RolePart(signals, times, progress)
-        flows, names = map(mapped, own)
+        flows, names = map(map_file, own)
         shape = (len(signals), len(names)) if names.dtype.kind == "U" and names.ndim == 1 else ()
         if flows.dtype.str != "<f8" or flows.shape != shape:
             raise UserError(f"{own[0]}: is no recording of a network")
@@ -136,8 +136,8 @@ class RolePart:
         return dict(zip(self.names, self.flows.T, strict=True))
 
 
-def mapped(file: Path) -> NDArray[Any]:
-    """The array in a file of a part, mapped. Raises UserError: the file is gone or damaged."""
+def map_file(file: Path) -> NDArray[Any]:
+    """A file of a part, memory-mapped. Raises UserError: the file is gone or damaged."""
     try:
         with open_file(file) as opened:
             shape, dtype = read_header(opened)
@@ -202,7 +202,7 @@ class Kept:
         if len(self._flows):
             self._flows[:, first : first + len(rows)] = flows.T
 
-    def named(self, done: int) -> dict[str, NDArray[np.float64]]:
+    def by_name(self, done: int) -> dict[str, NDArray[np.float64]]:
         """The columns of the first ``done`` ticks by name, as views of shape (done,)."""
         found = dict(zip(self._names, self._columns[:, :done], strict=True))
         return found | dict(zip(self._of_network, self._flows[:, :done], strict=True))

@@ -141,12 +141,12 @@ class Run:
         """
         folder = Path(folder)
         try:
-            return cls._loaded(folder)
+            return cls._load(folder)
         except UserError as problem:
             raise UserError(f"{problem}{_written_by_another(folder)}") from None
 
     @classmethod
-    def _loaded(cls, folder: Path) -> Self:
+    def _load(cls, folder: Path) -> Self:
         try:
             columns, timing, laws = read_recording(folder)
             ticks = len(columns["tick"])

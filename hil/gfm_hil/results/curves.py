@@ -117,7 +117,7 @@ class PackedCurves:
         self.plots.append(
             {
                 "x": self._abscissa(panel.x),
-                "curves": [[label, *self._packed(y)] for label, y in panel.curves.items()],
+                "curves": [[label, *self._pack(y)] for label, y in panel.curves.items()],
                 "colours": list(panel.colours),
                 "limits": limits,
                 "bars": bars,
@@ -138,12 +138,12 @@ class PackedCurves:
         step = float(steps[steps > 0].min(initial=np.inf))
         whole = np.rint(steps / step)
         if step == np.inf or (np.abs(steps / step - whole) > 1e-3).any() or whole.max() > 0xFFFF:
-            return self._packed(x)
+            return self._pack(x)
         step = float(x[-1] - x[0]) / float(whole.sum())
         self._put(whole)
         return [self._count - len(x), len(x), float(x[0]), step, 1]
 
-    def _packed(self, x: Vector) -> list[float]:
+    def _pack(self, x: Vector) -> list[float]:
         """Where its levels begin, how many there are, and what the least and the largest mean."""
         known = x[np.isfinite(x)]
         low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
@@ -156,6 +156,6 @@ class PackedCurves:
         self._parts.append(words.astype("<u2").tobytes())
         self._count += len(words)
 
-    def packed(self) -> str:
+    def text(self) -> str:
         """All levels, little-endian, as zlib compresses them, in base 64."""
         return base64.b64encode(zlib.compress(b"".join(self._parts), 9)).decode()

@@ -150,7 +150,7 @@ def _draw_columns(
 ) -> float:
     """One quantity in the unit in which people read the column ``name``: curves of columns, the
     name of one of them, colour and label. Returns the factor from what is recorded."""
-    shown = TABLE[name].shown(nominal_frequency(scenario))
+    shown = TABLE[name].display_unit(nominal_frequency(scenario))
     drawn = [(columns["t"], columns[n], colour, label) for columns, n, colour, label in curves]
     text = symbol(name, shown.unit)
     draw_panel(axes, f"{title} [{shown.unit}]", drawn, shown.factor, label=text)
@@ -454,7 +454,7 @@ def panels_of_run(
     t = signals["t"]
     limited = _limited_spans(t, signals["limited"]) if "limited" in signals else []
     for title, named in panels:
-        shown = TABLE[named[0][0]].shown(nominal_frequency(scenario))
+        shown = TABLE[named[0][0]].display_unit(nominal_frequency(scenario))
         curves = {label: signals[n] for n, _, label in named}
         yield _panel(
             f"{title} [{shown.unit}]", t, curves, _marks_of(summary), [c for _, c, _ in named],
@@ -485,7 +485,7 @@ def panels_of_all(
     happened = [(float(e["t"]), str(e["label"])) for e in events]
     colours = {run: COLOURS[k % len(COLOURS)] for k, run in enumerate(runs)}
     for title, name in SHARED:
-        shown = TABLE[name].shown(nominal_frequency(scenario))
+        shown = TABLE[name].display_unit(nominal_frequency(scenario))
         curves = {run: _PaddedColumn(of[name], len(t)) for run, of in runs.items() if name in of}
         if curves:
             own = [colours[run] for run in curves]

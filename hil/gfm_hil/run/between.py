@@ -196,7 +196,7 @@ def between_ticks(
     with np.errstate(all="ignore"):  # a diverging run is a result
         done = run_inproc([bench], [plant], [controller], timelines, lambda k: k < last)
     timeline.close()
-    for name, x in plant.named(min(done, last)).items():
+    for name, x in plant.by_name(min(done, last)).items():
         if len(x) < last or not np.array_equal(x, run.columns[name][:last]):
             raise UserError(f"{where}: {name} differs when the run is repeated in lockstep")
     return _join(watcher.pieces, bench, bases(scenario), T_s, step)

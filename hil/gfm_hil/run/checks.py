@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.columns import printed, unit_of
+from gfm_hil.recording.columns import symbol_of, unit_of
 from gfm_hil.run.modes import fast_mode, swing
 
 Vector = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Window:
     @property
     def symbol(self) -> str:
         """The signal's name in a message."""
-        return printed(self.name)
+        return symbol_of(self.name)
 
 
 @dataclass(frozen=True)

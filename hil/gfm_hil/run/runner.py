@@ -338,7 +338,7 @@ def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> l
             "tick": np.arange(done),
             "t": np.arange(done) * scenario.T_s,
         }
-        columns |= plant.named(done) | controller.named(done)
+        columns |= plant.by_name(done) | controller.by_name(done)
         outcome = timeline.outcome or Outcome("safe", "the run did not record its end", done)
         summary = summarise(scenario, columns, {}, timeline.lines, outcome, {}, wall_s)
         summary |= stages(scenario) | origin(scenario, date)

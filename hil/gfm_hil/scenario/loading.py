@@ -38,7 +38,7 @@ def find_scenario(name: str) -> Path:
 def find_file(kind: str, name: str, pattern: str) -> Path:
     """The file at that path, or the shipped file of that name; ``kind`` is for the message. Raises
     UserError: neither exists."""
-    given, shipped = Path(name), _shipped(pattern)
+    given, shipped = Path(name), _shipped_files(pattern)
     try:
         is_file, exists = given.is_file(), given.exists()
     except OSError as problem:  # for example a name of 300 characters
@@ -52,13 +52,13 @@ def find_file(kind: str, name: str, pattern: str) -> Path:
     raise UserError(printable(f"{kind} {name}: {what}; {known}"))
 
 
-def _shipped(pattern: str) -> dict[str, Path]:
+def _shipped_files(pattern: str) -> dict[str, Path]:
     return {p.stem: p for folder in SCENARIO_FOLDERS for p in folder.glob(pattern)}
 
 
 def shipped_scenarios() -> list[str]:
     """Names of the scenarios that come with gfmhil."""
-    return sorted(_shipped("*.toml"))
+    return sorted(_shipped_files("*.toml"))
 
 
 def load_scenario(

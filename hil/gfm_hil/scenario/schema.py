@@ -288,12 +288,12 @@ class Scenario(StrictSchema):
         members = {name: with_defaults(member) for name, member in self.network.converters.items()}
         network = self.network.model_copy(update={"converters": members})
 
-        def seen(name: str, member: NetworkConverter) -> Scenario:
+        def member_view(name: str, member: NetworkConverter) -> Scenario:
             own = {key: getattr(member, key) for key in keys}
             own["plant"] = own["plant"].model_copy(update={"grid": self.plant.grid})
             return self.model_copy(update={**own, "network": network, "converter": name})
 
-        return {name: seen(name, member) for name, member in members.items()}
+        return {name: member_view(name, member) for name, member in members.items()}
 
     def __copy__(self) -> Scenario:
         """A copy without the cached properties, since the fields of a copy may be changed."""

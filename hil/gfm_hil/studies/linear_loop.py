@@ -144,7 +144,7 @@ def network_loop(
     if scenario.network is None:
         raise UserError("network: the scenario has none; use Law.closed_loop")
     try:
-        return _linearised(scenario, laws)
+        return _linearise(scenario, laws)
     except NoEquilibrium as problem:
         raise UserError(f"network: {problem}") from None
 
@@ -153,11 +153,11 @@ def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> Clos
     """The sampled loop of a checked scenario under another law, of one converter if there is a
     network. Raises NoEquilibrium: there is no operating point."""
     if converter is not None:
-        return _linearised(scenario, {converter: law}).converter(converter)
+        return _linearise(scenario, {converter: law}).converter(converter)
     return ClosedLoop.of(law, scenario.plant, scenario.references.vector(), T_s=scenario.T_s)
 
 
-def _linearised(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
+def _linearise(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
     each = [*scenario.each.values()]
     built = [
         discretise(laws[name], scenario.T_s) if name in laws else initial_law(one)[0]

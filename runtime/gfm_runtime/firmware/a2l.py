@@ -89,14 +89,14 @@ def a2l_text(
     module = ['/begin MOD_COMMON ""', f"  BYTE_ORDER {order}", "/end MOD_COMMON"]
     for address, text in identifications[:1]:
         every = " | ".join(text for _, text in identifications)
-        module += ['/begin MOD_PAR ""', f"  VERSION {_quoted(every)}"]
-        module += [f"  ADDR_EPK {address:#x}", f"  EPK {_quoted(text)}", "/end MOD_PAR"]
+        module += ['/begin MOD_PAR ""', f"  VERSION {_quote(every)}"]
+        module += [f"  ADDR_EPK {address:#x}", f"  EPK {_quote(text)}", "/end MOD_PAR"]
     module += more
     module += [line for lines in methods.values() for line in lines]
     for kind in sorted(kinds):
         module += [f"/begin RECORD_LAYOUT {kind}_rows", f"  FNC_VALUES 1 {kind} ROW_DIR DIRECT",
                    "/end RECORD_LAYOUT"]  # fmt: skip
-    head = f"{name} {_quoted(about)}"
+    head = f"{name} {_quote(about)}"
     return (
         f"ASAP2_VERSION 1 71\n/begin PROJECT {head}\n  /begin MODULE {head}\n"
         + "".join(f"    {line}\n" for line in (*module, *blocks))
@@ -104,7 +104,7 @@ def a2l_text(
     )
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     escaped = plain(text).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
 
@@ -127,11 +127,11 @@ def _method(entry: Entry, methods: dict[str, list[str]]) -> str:
                 f"  COMPU_TAB_REF {name}_words",
                 "/end COMPU_METHOD",
                 f'/begin COMPU_VTAB {name}_words "" TAB_VERB {len(entry.words)}',
-                *(f"  {code} {_quoted(word or 'none')}" for code, word in entry.words),
+                *(f"  {code} {_quote(word or 'none')}" for code, word in entry.words),
                 "/end COMPU_VTAB",
             ]
         else:
-            text = f'"" IDENTICAL "%12.6" {_quoted(entry.unit)}'
+            text = f'"" IDENTICAL "%12.6" {_quote(entry.unit)}'
             lines = [f"/begin COMPU_METHOD {name} {text}", "/end COMPU_METHOD"]
         if methods.setdefault(name, lines) == lines:
             return name
@@ -151,4 +151,4 @@ def _block(entry: Entry, method: str) -> list[str]:
     lines += [f"  MATRIX_DIM {' '.join(map(str, entry.shape))}"] if entry.shape else []
     lines += [f'  SYMBOL_LINK "{entry.symbol}" 0'] if entry.symbol else []
     lines += ["  READ_ONLY"] if entry.calibrated and entry.fixed else []
-    return [f"/begin {what} {entry.name} {_quoted(entry.text)}", *lines, f"/end {what}"]
+    return [f"/begin {what} {entry.name} {_quote(entry.text)}", *lines, f"/end {what}"]

@@ -121,9 +121,9 @@ def _sources(
     assert m.law is not None
     keys |= _variables(m, two) | {
         "TOKEN_NAME": "guid" if two else "instantiationToken",
-        "MODEL": _quoted(m.name),
-        "ABOUT": _quoted(f"{plain(m.law.title)}, {m.real}. Source: {plain(m.law.source)}"),
-        "VERSION": _quoted(f"signal table {TABLE_VERSION} ({table_hash()})"),
+        "MODEL": _quote(m.name),
+        "ABOUT": _quote(f"{plain(m.law.title)}, {m.real}. Source: {plain(m.law.source)}"),
+        "VERSION": _quote(f"signal table {TABLE_VERSION} ({table_hash()})"),
         "FILES": _files("File", code),
     }
     description = render("modelDescription.xml", keys, {"fmi2": two})
@@ -166,7 +166,7 @@ def _variables(m: Module, two: bool) -> dict[str, str]:
         str(k - first + last + 1) if k < first + len(u) else "" for k in range(first, last + 1)
     ]
     return {
-        "UNITS": "\n".join(f"    <Unit name={_quoted(x)} />" for x in sorted(filter(None, units))),
+        "UNITS": "\n".join(f"    <Unit name={_quote(x)} />" for x in sorted(filter(None, units))),
         "VARIABLES": "\n".join(lines),
         "OUTPUTS": "\n".join(
             f'    {tags[0]}="{k}" dependencies="" />' for k in range(first, last + 1)
@@ -189,12 +189,12 @@ def _gains(m: Module) -> list[Signal]:
     ]  # fmt: skip
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     return '"' + escape(text, {'"': "&quot;"}) + '"'
 
 
 def _attributes(named: Mapping[str, str]) -> str:
-    return "".join(f" {name}={_quoted(value)}" for name, value in named.items())
+    return "".join(f" {name}={_quote(value)}" for name, value in named.items())
 
 
 def _files(tag: str, code: Mapping[str, str]) -> str:

@@ -113,7 +113,7 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
     places = []  # of each law's records with other gains
     for m in modules:
         places.append(len(records))
-        records += [m.tuning.tuned(gains) for gains in m.sets() if m.tuning]
+        records += [m.tuning.record_of(gains) for gains in m.sets() if m.tuning]
     laws = np.array(records)
     instances = np.zeros((len(modules), 2), state_dtype(real))
     signals = (*carried_rows("y", stages), *group("ref"))

@@ -25,7 +25,7 @@ from gfm_runtime.firmware.translate import (
     constants,
     number,
     operations,
-    reached,
+    with_callees,
     without_unread,
 )
 from gfm_runtime.inner import INNER_NUMBERS, INNER_STATE, stage
@@ -145,7 +145,7 @@ class Tick:
                 translate.function(calibrate, adc),
             ]
         entries = [self.output, self.advance, self.look, self.settle, *self._counts]
-        self._functions = reached(entries)
+        self._functions = with_callees(entries)
         without_unread(self._functions, "t->")
         self._real, self._own = real, own
 
@@ -239,7 +239,7 @@ class FixedTick:
         def call(one: CFunction, *arguments: str) -> str:
             return printer.call(one, arguments, {"t": "&t"})
 
-        functions = reached([self.reset, self.look, self.advance, self.settle, self.bump])
+        functions = with_callees([self.reset, self.look, self.advance, self.settle, self.bump])
         return {
             "FUNCTIONS": "\n".join(map(printer.function, functions)),
             "RESET": call(self.reset),

@@ -164,7 +164,7 @@ class CFunction:
             if e.op == "call" and isinstance(e.args[0], CFunction):
                 yield e.args[0]
 
-    def touched(self) -> tuple[set[str], set[str]]:
+    def uses_and_writes(self) -> tuple[set[str], set[str]]:
         """The roots of the places that it uses, callees included, and of those it writes to."""
         uses, writes = set(), set()
         for s in self.statements():
@@ -174,7 +174,7 @@ class CFunction:
             if e.op == "var":
                 uses.add(_root(e.args[0]))
             if e.op == "call" and isinstance(e.args[0], CFunction):
-                used, written = e.args[0].touched()
+                used, written = e.args[0].uses_and_writes()
                 names = {
                     p.place: _root(a.place)
                     for p, a in zip(e.args[0].parameters, e.args[1:], strict=True)
@@ -268,7 +268,7 @@ class Algebra:
             short = (self._sum if sign in "+-" else self._product)(sign, a, b)
             if short is not None:
                 return short
-        return Expr(sign, (_shown(a), _shown(b)), kind)
+        return Expr(sign, (_as_number(a), _as_number(b)), kind)
 
     def _whole(self, sign: str, a: Expr, b: Expr) -> Expr:
         """Of whole numbers, one of which is no constant."""
@@ -297,7 +297,7 @@ class Algebra:
         if _is(b, 1.0):
             return a
         if a.op == "zero" or (sign == "*" and (b.op == "zero" or _is(a, 0.0) or _is(b, 0.0))):
-            return Expr("zero", (Expr(sign, (_shown(a), _shown(b))),))
+            return Expr("zero", (Expr(sign, (_as_number(a), _as_number(b))),))
         if sign == "*" and (_is(a, 1.0) or _is(a, -1.0)):
             return b if a.args[0] > 0 else self.negative(b)
         return None
@@ -308,7 +308,7 @@ class Algebra:
             return replace(e, args=(-e.args[0],))
         return e if e.op == "zero" else (e.args[0] if e.op == "neg" else Expr("neg", (e,), e.kind))
 
-    def joined(self, word: str, parts: Sequence[Expr]) -> Expr:
+    def join(self, word: str, parts: Sequence[Expr]) -> Expr:
         """Of ``and`` and ``or``; what is known goes."""
         decides = word == "or"
         if any(p.op == "num" and bool(p.args[0]) == decides for p in parts):
@@ -319,7 +319,7 @@ class Algebra:
         return Expr(word, left, "bool")
 
 
-def _shown(e: Expr) -> Expr:
+def _as_number(e: Expr) -> Expr:
     return number(0.0) if e.op == "zero" else e
 
 
@@ -363,7 +363,7 @@ class Translator:
         """A function for arguments of these kinds: records, constants and arrays are part of it,
         and numbers are its parameters."""
         tree, _, _ = _source(python)
-        names, passed = [a.arg for a in tree.args.args], list(map(id, self.passed(values)))
+        names, passed = [a.arg for a in tree.args.args], list(map(id, self.arguments(values)))
         bound, parameters, env = [], list[Variable | Array](), dict[str, Any]()
         for key, value in zip(names, values, strict=True):
             if isinstance(value, Expr) and id(value) in passed:
@@ -389,7 +389,7 @@ class Translator:
             self._made[made] = one
         return self._made[made]
 
-    def passed(self, values: Sequence[Any]) -> list[Any]:
+    def arguments(self, values: Sequence[Any]) -> list[Any]:
         """The arguments that stay arguments; constants become part of a function with a record."""
         scalar = not any(isinstance(v, Struct | Array) for v in values)
         return [
@@ -485,7 +485,7 @@ class _Body:
         elif isinstance(value, tuple):
             self.function.kind = "tuple"
         else:
-            out.append(CallOrReturn(value and _shown(value), returns=True))
+            out.append(CallOrReturn(value and _as_number(value), returns=True))
             if value is not None and self.function.kind != "real":
                 self.function.kind = value.kind
 
@@ -509,7 +509,7 @@ class _Body:
 
     def put(self, place: Any, value: Any, out: list[Any]) -> None:
         if isinstance(place, Expr):
-            value = _real(_shown(value)) if place.kind == "real" else value
+            value = _real(_as_number(value)) if place.kind == "real" else value
             value = wide(value) if place.kind == "wide" else value
             if value != place:
                 out.append(Assignment(place, value))
@@ -518,7 +518,7 @@ class _Body:
         if place in self.shared or not known:
             tree = _source(self.python)[0]
             name = f"{tree.name.lstrip('_')}_{place}" if place in self.taken else place
-            let = Variable(name, _shown(value), sums=self.inlined, stays=place in self.shared)
+            let = Variable(name, _as_number(value), sums=self.inlined, stays=place in self.shared)
             out.append(let)
             value = _local(let)
         self.env[place] = value
@@ -629,7 +629,7 @@ class _Body:
                 return algebra.binary(_SIGNS[type(op)], a, b)
             case ast.BoolOp(op, values):
                 word = "and" if isinstance(op, ast.And) else "or"
-                return algebra.joined(word, [self.value(v, out) for v in values])
+                return algebra.join(word, [self.value(v, out) for v in values])
             case ast.IfExp(test, then, other):
                 return self.choice(self.value(test, out), self.value(then, out),
                                    self.value(other, out))  # fmt: skip
@@ -643,7 +643,7 @@ class _Body:
         if test.op == "num":
             return a if test.args[0] else b
         kind = next((k for k in ("real", "wide") if k in (a.kind, b.kind)), a.kind)
-        a, b = (_real(_shown(e)) if kind == "real" else e for e in (a, b))
+        a, b = (_real(_as_number(e)) if kind == "real" else e for e in (a, b))
         return Expr("?:", (test, a, b), kind)
 
     def element(self, node: ast.AST, of: Any, at: list[Expr]) -> Any:
@@ -674,7 +674,7 @@ class _Body:
                 test = self.of.algebra.binary("<" if name == "min" else ">", b, a)
                 return self.choice(test, b, a)
             case ast.Name(name) | ast.Attribute(_, name) if name in _MATHS:
-                return Expr("call", (_MATHS[name], *map(_shown, values)))
+                return Expr("call", (_MATHS[name], *map(_as_number, values)))
             case ast.Name("wide"):
                 return wide(values[0])
             case ast.Name("divided"):
@@ -688,7 +688,7 @@ class _Body:
         one = self.of.function(python, values)
         if self.of.short(one):
             return self.inline(python, values, out)
-        passed = [_shown(v) if isinstance(v, Expr) else v for v in self.of.passed(values)]
+        passed = [_as_number(v) if isinstance(v, Expr) else v for v in self.of.arguments(values)]
         call = Expr("call", (one, *passed), one.kind)
         if alone and one.body:
             out.append(CallOrReturn(call))
@@ -828,7 +828,7 @@ def _check_names(one: CFunction) -> None:
     visit(one.body)
 
 
-def reached(entries: Iterable[CFunction]) -> list[CFunction]:
+def with_callees(entries: Iterable[CFunction]) -> list[CFunction]:
     """These functions and those that they call, callees first."""
     out: list[CFunction] = []
 
@@ -881,7 +881,7 @@ def constants(entry: CFunction) -> set[float]:
     """The different numbers in a call of ``entry`` but 0 and 1."""
     return {
         e.args[0]
-        for one in reached([entry])
+        for one in with_callees([entry])
         for e in one.expressions()
         if e.op == "num" and e.kind == "real" and e.args[0] not in (0.0, 1.0)
     }
@@ -915,7 +915,7 @@ class Printer:
 
     def function(self, one: CFunction) -> str:
         """A function with its comment."""
-        uses, writes = one.touched()
+        uses, writes = one.uses_and_writes()
         self._often = Counter(s.name for s in one.statements() if isinstance(s, Variable))
         given = [
             f"{'' if root in writes else 'const '}{kind} *{root}"
@@ -1035,7 +1035,7 @@ class Printer:
 
     def call(self, one: CFunction, arguments: Sequence[str], at: Mapping[str, str] = {}) -> str:
         """A call of a function; ``at`` says what stands for a pointer if not its name."""
-        uses, _ = one.touched()
+        uses, _ = one.uses_and_writes()
         roots = [at.get(root, root) for root in self.roots if root in uses]
         return f"{one.name}({', '.join([*roots, *arguments])})"
 

@@ -93,10 +93,10 @@ class TracedNumber:
         raise LawError("**", "takes no gain as its power")
 
     def __le__(self, other: Any) -> bool:
-        return self.book.compared(self, other)
+        return self.book.compare(self, other)
 
     def __ge__(self, other: Any) -> bool:
-        return self.book.compared(other, self)
+        return self.book.compare(other, self)
 
 
 @dataclass
@@ -131,7 +131,7 @@ class _Book:
             self.known[key] = TracedNumber(op, args, near, self)
         return self.known[key]
 
-    def compared(self, a: Any, b: Any) -> bool:
+    def compare(self, a: Any, b: Any) -> bool:
         """Whether a <= b holds beside the file's values; then it has to hold for all."""
         a, b = (x if isinstance(x, TracedNumber) else float(x) for x in (a, b))
         good = float(a) <= float(b)
@@ -159,7 +159,7 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return total
 
 
-def _scaled(a: Matrix, factor: Any) -> Matrix:
+def _times(a: Matrix, factor: Any) -> Matrix:
     return [[factor * x for x in row] for row in a]
 
 
@@ -196,9 +196,9 @@ def _poles(book: _Book, where: str, factor: Sequence[Any]) -> list[Any]:
         c, b, a = factor
         square = b * b - 4.0 * a * c
         if float(square) < 0.0:
-            book.compared(square, 0.0)
+            book.compare(square, 0.0)
             return []
-        book.compared(0.0, square)
+        book.compare(0.0, square)
         return [
             -2.0
             * c
@@ -254,13 +254,13 @@ def _row(
         A[k][0] = -1.0 * d[m - 1 - k] * (T[0] / T[k])
         if k + 1 < m:
             A[k][k + 1] = A[k][k + 1] + T[k + 1] / T[k]
-    backward = _inverse(_sum(_eye(m), _scaled(A, half), -1.0))
-    A_d = _product(backward, _sum(_eye(m), _scaled(A, half)))
+    backward = _inverse(_sum(_eye(m), _times(A, half), -1.0))
+    A_d = _product(backward, _sum(_eye(m), _times(A, half)))
     c = backward[0]
     for k in range(2):
         direct = _product([c], B[k])[0]
         D[k] = [x + half * y for x, y in zip(D[k], direct, strict=True)]
-        B[k] = _scaled(_product(backward, B[k]), 2.0 * half)
+        B[k] = _times(_product(backward, B[k]), 2.0 * half)
     # of a limit: the slowest mode that does not swing, as its eigenvector in observer form
     poles = [p for factor in dict.fromkeys(den) for p in _poles(book, where, factor)]
     W: list[Any] = [0.0] * m
@@ -440,7 +440,7 @@ class GainChanges:
         return value
 
     @np.errstate(all="ignore")
-    def tuned(self, gains: Mapping[str, float]) -> np.void:
+    def record_of(self, gains: Mapping[str, float]) -> np.void:
         """The law's record with other gains, in the bits that C gives it. Raises LawError: a gain
         that is out of its range, or gains that together give no law."""
         for name, value in gains.items():
@@ -479,7 +479,7 @@ class GainChanges:
                 low, high = self.ranges[name]
                 one[name] = min(max(value * (0.9 + 0.2 * share) or 0.01 * share, low), high)
             with contextlib.suppress(LawError):
-                self.tuned(one)
+                self.record_of(one)
                 out.append(one)
         return out
 
@@ -559,7 +559,7 @@ class GainChanges:
         for k, value in enumerate(impedance):
             if value is not None:
                 of = evaluate(f"error_map.{'RX'[k]}", value, values)
-                book.compared(0.0 if k == 0 else math.ulp(0.0), of)
+                book.compare(0.0 if k == 0 else math.ulp(0.0), of)
                 out["error_parameters"][k] = of
         at = 0
         for i, row in enumerate(rows):
@@ -601,7 +601,7 @@ class GainChanges:
         if all(map(_zero, [through, *feeds])):
             return
         book, where = self._book, f"law {self.file.name!r}"
-        book.compared(through, _LOOP)
+        book.compare(through, _LOOP)
         a = [
             [x + b / rest * c for x, c in zip(line, row.c, strict=True)]
             for line, b in zip(row.A, feeds, strict=True)
@@ -618,7 +618,7 @@ class GainChanges:
             bounds = []
         for one in bounds:
             if isinstance(one, TracedNumber):
-                book.compared(one, _ON_CIRCLE)
+                book.compare(one, _ON_CIRCLE)
 
 
 def _flat(table: Mapping[str, Any]) -> Iterator[Any]:

@@ -18,7 +18,7 @@ import pytest
 from gfm_hil.bench import outside
 from gfm_hil.bench.c_code import compile_twin
 from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
-from gfm_hil.bench.jitter import PERIOD_NS, WAITS, WATCHED, awaited
+from gfm_hil.bench.jitter import PERIOD_NS, WAITS, WATCHED, at_awaited
 from gfm_hil.bench.kernel import compare
 from gfm_hil.bench.sweep import highest
 from gfm_hil.bench.tables import _agrees
@@ -137,7 +137,7 @@ def test_others_are_compared_at_the_deadlines_that_both_wait_for():
             now = due + sleeps[k]
             theirs.append(sleeps[k])
         ours[:, k] = now - due
-    assert awaited(ours).tolist() == 2 * theirs
+    assert at_awaited(ours).tolist() == 2 * theirs
     assert len(theirs) == 1000 - 12 - 1
 
 

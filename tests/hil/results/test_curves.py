@@ -52,7 +52,7 @@ def test_a_page_holds_times_to_the_tick_and_values_to_its_levels():
     curves.add(Panel("b", np.geomspace(1, 100, 5), {"y": y}, (1.0, 100.0), log=(True, False)))
     page = (
         f'<script type="application/json" id="plots">{json.dumps(curves.plots)}</script>'
-        f'<script type="text/plain" id="curves">{curves.packed()}</script>'
+        f'<script type="text/plain" id="curves">{curves.text()}</script>'
     )
     first, second = unpacked(page)
     assert first["x"] == pytest.approx(3.2 + 1e-4 * at, abs=1e-9)

@@ -8,7 +8,7 @@ import pytest
 
 import gfmhil
 from gfm_hil.cli import main
-from gfm_hil.recording.columns import printed
+from gfm_hil.recording.columns import symbol_of
 
 from ...support.page import unpacked
 from ...support.processes import wait_for
@@ -72,7 +72,7 @@ def test_a_comparison_has_a_report_which_the_command_names_and_opens(
 
 def test_names_of_signals_are_printed_in_the_notation_of_the_field():
     names = ("f_hz", "omega_u", "omega_g", "delta", "v_dc", "p")
-    assert [printed(name) for name in names] == ["f", "ω_u", "ω_g", "δ", "v_dc", "p"]
+    assert [symbol_of(name) for name in names] == ["f", "ω_u", "ω_g", "δ", "v_dc", "p"]
 
 
 @pytest.mark.systems

@@ -37,12 +37,12 @@ from gfm_hil.studies.conformity.sets import (
     count_limits,
     load_cases,
     load_under_test,
-    scaled,
     scenario_of,
     shipped_sets,
+    to_base,
     under_test_file,
 )
-from gfm_hil.studies.conformity.shared_start import judged
+from gfm_hil.studies.conformity.shared_start import after_settling
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     CONSISTENT,
@@ -545,7 +545,7 @@ def test_a_swing_equation_answers_a_jump_as_the_closed_form_and_its_constants_co
 
 def test_another_frequency_and_rating_keep_the_elements_per_unit():
     paper = load_converter("paper")
-    twin = scaled(paper, 60.0, 0.5)
+    twin = to_base(paper, 60.0, 0.5)
     assert twin.pu() == pytest.approx({**paper.pu(), "C_dc": twin.pu()["C_dc"]})
     assert twin.bases.omega_b == pytest.approx(120 * math.pi)
     assert twin.C_dc * twin.V_dcref**2 / twin.S_n == pytest.approx(
@@ -900,7 +900,7 @@ def test_of_a_model_that_commands_phases_the_bridge_s_voltage_is_judged(miso, ev
     since = k % every * 2 * math.pi * 60.0 * scenario.T_s
     e = 0.9 * np.exp(-1j * (away[k - k % every] + since))
     run.columns.update(u_E_u=e.real, u_E_q=e.imag)
-    found = judged(scenario, run, 1.0, None)
+    found = after_settling(scenario, run, 1.0, None)
     np.testing.assert_allclose(found.signals["f_hz"], 59.7, atol=1e-9)
     np.testing.assert_allclose(found.signals["delta"], 0.2, atol=1e-8)
     assert (found.ticks, found.scenario.duration) == (run.ticks - 10000, scenario.duration - 1.0)

@@ -71,7 +71,7 @@ def verdicts(run: Run, place: Path) -> Verdicts:
     """What conform says of the run itself, by the kind of clause."""
     (case,), under = load_cases([TEST]), load_under_test(place / "converter.toml")
     part = next(part for part in case.test.runs() if part.name == PART)
-    return {v.kind: v.verdict for v in judge(run, case.test.asked(part), under)}
+    return {v.kind: v.verdict for v in judge(run, case.test.clauses(part), under)}
 
 
 @pytest.fixture(scope="module")

@@ -109,7 +109,7 @@ def singular_is_users(
     """A command that says in one line that its problem is singular."""
 
     @functools.wraps(call)
-    def checked(options: argparse.Namespace) -> int:
+    def run(options: argparse.Namespace) -> int:
         try:
             return call(options)
         except np.linalg.LinAlgError as problem:
@@ -118,7 +118,7 @@ def singular_is_users(
                 "out of range"
             ) from None
 
-    return checked
+    return run
 
 
 #: what a channel leads from and to, by its j and i

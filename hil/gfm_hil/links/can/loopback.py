@@ -42,7 +42,7 @@ class LoopbackBus(can.BusABC):
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         own = self._bind(first, reversed(range(NODES)) if place is None else [place])
-        self._others = [_connected(first + k) for k in range(NODES) if k != own]
+        self._others = [_connect(first + k) for k in range(NODES) if k != own]
         self.record = np.zeros(1, socket_dtype)
         set_socket(self.record, LOOPBACK, self.fileno(), [other.fileno() for other in self._others])
         self._frame = np.zeros(1, frame_dtype)
@@ -91,7 +91,7 @@ class LoopbackBus(can.BusABC):
                 end.close()
 
 
-def _connected(port: int) -> socket.socket:
+def _connect(port: int) -> socket.socket:
     """A socket that sends to another place of the bus."""
     end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     end.setblocking(False)

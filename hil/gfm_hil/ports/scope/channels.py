@@ -80,7 +80,7 @@ def make_channels(T_s: float, f_b: float) -> tuple[ScopeChannel, ...]:
 
 def _column(name: str, group: str, column: str, f_b: float) -> ScopeChannel:
     row = TABLE[column]
-    symbol, unit, factor = row.shown(f_b)
+    symbol, unit, factor = row.display_unit(f_b)
 
     def of(columns: Columns, first: int, last: int) -> NDArray[np.float64]:
         return np.asarray(columns[column][first:last] * factor)

@@ -54,14 +54,14 @@ class RunCollector(Collector):
             if self.followers and time.monotonic() > self._until:
                 families: dict[str, _Family] = {}
                 for of in self.followers:
-                    seen = self._seen(of)
+                    seen = self._newest(of)
                     for name, values in (*_counts(of.run), *_times(of.run), *_words(seen)):
                         _put(families, name, values, of.converter)
                 self._found = [*families.values()]
                 self._until = time.monotonic() + _FRESH_S
             yield from self._found
 
-    def _seen(self, follower: Follower) -> dict[str, Any]:
+    def _newest(self, follower: Follower) -> dict[str, Any]:
         """The newest tick in words; laws by index if no command server gives their names."""
         seen: dict[str, Any] = {}
         with contextlib.suppress(UserError):  # no command server, or none yet

@@ -46,7 +46,7 @@ class Axis:
             return np.array(found, dtype=float)
         return np.array([self._sum(r["drawn"]) for r in records], dtype=float)
 
-    def shown(self, drawn: dict[str, Any]) -> str:
+    def text(self, drawn: dict[str, Any]) -> str:
         """The value of one run in words."""
         return str(drawn[self.name]) if self.words else f"{self._sum(drawn):.4g}"
 

@@ -73,7 +73,7 @@ def worst_table(law: str, runs: list[dict[str, Any]], axes: list[Axis]) -> Table
         if what == "oscillating":
             why = f"{entry['ripple_pu']:.3g} p.u."
         words = Cell(f"{what.replace('-', ' ')} {why}".rstrip(), _STYLES.get(what, "bad"))
-        drawn = [axis.shown(entry["drawn"]) for axis in axes]
+        drawn = [axis.text(entry["drawn"]) for axis in axes]
         rows.append([str(entry["run"]), words, entry["end_s"], *drawn])
     heads = "run", "", "at [s]", *(axis.label for axis in axes)
     return Table(heads, rows, f"\nworst of {law}", text=2)

@@ -23,7 +23,7 @@ from gfm_hil.studies.conformity.in_network import NetworkUnderTest
 from gfm_hil.studies.conformity.panels import PartFigure, panels_of_plot, panels_of_run
 from gfm_hil.studies.conformity.saturation import mark_saturation
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
-from gfm_hil.studies.conformity.shared_start import SharedStart, alike, first_event, judged
+from gfm_hil.studies.conformity.shared_start import SharedStart, after_settling, alike, first_event
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
 from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import get_law, law_file
@@ -324,7 +324,7 @@ def run_part(job: Job) -> PartResult:
 
 
 def _run_part(job: Job) -> PartResult:
-    criteria = job.case.test.asked(job.part)
+    criteria = job.case.test.clauses(job.part)
     names = job.law, job.case.id, job.part.name
     if job.part.cannot is not None:
         reason = f"Cannot be judged: {job.part.cannot}"
@@ -348,7 +348,7 @@ def _run_part(job: Job) -> PartResult:
             under = job.under
             if external is None:  # a controller that is not ours runs over a link alone
                 for criterion in criteria:
-                    under = criterion.declared(under, scenario)
+                    under = criterion.declare(under, scenario)
             status, reason = run.status, str(run.summary["reason"])
             recording = run.digest
             verdicts = mark_saturation(run, judge(run, criteria, under, others), external is None)
@@ -374,7 +374,7 @@ def _run_part(job: Job) -> PartResult:
 
 def _plot(job: Job) -> Plot | None:
     """The plot by which a part is judged in place of a run, if it is."""
-    first = job.case.test.asked(job.part)[0]
+    first = job.case.test.clauses(job.part)[0]
     return first if isinstance(first, Plot) else None
 
 
@@ -400,7 +400,7 @@ def _run(job: Job, scenario: Scenario, stack: ExitStack) -> tuple[Run, Mapping[s
             run = job.start.go_on(scenario, folder)
         if run.status == "interrupted":
             raise KeyboardInterrupt
-        return judged(scenario, run, job.external.map.settle_s, job.start), {}
+        return after_settling(scenario, run, job.external.map.settle_s, job.start), {}
     if scenario.network is None:
         return runner.run_in_memory(scenario), {}
     runs = runner.run_network_in_memory(scenario)

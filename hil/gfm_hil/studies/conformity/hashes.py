@@ -38,7 +38,7 @@ def file_hashes(
             text = None if name.endswith(".toml") else shipped_law(name)
             yield f"law {title}", Path(name).read_bytes() if text is None else text.encode()
         if inner is not None and inner != "none":
-            yield f"inner stage {inner}", _named(inner, "gfm_runtime", "inner_stages")
+            yield f"inner stage {inner}", _file_content(inner, "gfm_runtime", "inner_stages")
         if external is not None and not external.model.startswith(PIL):
             yield external.name, controller_file(external.model)[1].read_bytes()
         if external is not None and external.ports is not None:
@@ -48,14 +48,14 @@ def file_hashes(
         if network is not None:
             yield f"network {network.name}", network.read_bytes()
         yield f"converter under test {under_test.name}", under_test.read_bytes()
-        yield f"converter {converter}", _named(converter, "gfm_plant", "converters")
+        yield f"converter {converter}", _file_content(converter, "gfm_plant", "converters")
         for case in cases:
             yield f"test {case.id}", case.path.read_bytes()
 
     return {name: hashlib.sha256(content).hexdigest() for name, content in each()}
 
 
-def _named(name: str, package: str, folder: str) -> bytes:
+def _file_content(name: str, package: str, folder: str) -> bytes:
     """The content of a file by its path, or by the name of one that ships."""
     if name.endswith(".toml"):
         return Path(name).read_bytes()

@@ -106,7 +106,7 @@ class NetworkUnderTest:
         own = [key for key in test["plant"] if key != "grid"]
         if own:
             raise UserError(f"{case.id} sets plant.{own[0]}, which is the network's own")
-        for criterion in case.test.asked(part):
+        for criterion in case.test.clauses(part):
             if criterion.alone:
                 raise UserError(f"{case.id}: {criterion.kind}: {criterion.alone}")
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import printed, unit_of
+from gfm_hil.recording.columns import symbol_of, unit_of
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.results.curves import Panel
 from gfm_hil.results.figures import COLOURS
@@ -88,7 +88,7 @@ def panels_of_run(run: Run, verdicts: Sequence[Verdict]) -> list[Panel]:
         means[first : first + len(inside)] = inside[: ticks - first]
         found.append(
             Panel(
-                f"{_TITLES.get(name, printed(name))} [{unit}]", x,
+                f"{_TITLES.get(name, symbol_of(name))} [{unit}]", x,
                 {"every tick": _thin(values, edges), "one-cycle mean": _thin(means, edges)},
                 (0.0, run.scenario.duration), [(t, "") for t in events],
                 _marks([(k, v) for k, v in numbered if v.signal == name], factor),

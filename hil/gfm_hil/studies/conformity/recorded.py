@@ -36,7 +36,7 @@ def judge_recording(
     files, ``folder``, if any, for the figure. Raises UserError: see ``open_recording``."""
     law = Scenario.model_fields["law"].default  # of which nothing counts
     run = open_recording(file, map_file, scenario_of(case, part, under, law, None, place))
-    verdicts = judge(run, case.test.asked(part), under)
+    verdicts = judge(run, case.test.clauses(part), under)
     figure = None
     if folder is not None and run.ticks:
         from gfm_hil.studies.conformity.figure import draw_panels  # half a second to import

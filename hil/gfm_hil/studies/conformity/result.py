@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.realtime.environment import environment
-from gfm_hil.recording.columns import printed
+from gfm_hil.recording.columns import symbol_of
 from gfm_hil.results.curves import PackedCurves
 from gfm_hil.results.page import plot_script, render
 from gfm_hil.results.report import finite
@@ -289,7 +289,7 @@ def row(v: Verdict) -> list[str]:
     """What a report says of a clause, under ``HEADS``."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
     window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
-    signal = printed(v.signal) or "–"
+    signal = symbol_of(v.signal) or "–"
     known = KNOWN.get(v.known, "–")
     return [v.clause, signal, window, measured, v.limit or "–", v.text, v.source or "–", known]
 

@@ -87,7 +87,7 @@ class Test(StrictSchema):
         """The parts, or the only run as a part without a name."""
         return self.parts or [TestPart.model_construct(name="", title="", cannot=None)]
 
-    def asked(self, part: TestPart) -> list[Clause]:
+    def clauses(self, part: TestPart) -> list[Clause]:
         """All that is asked of a part, each with its source."""
         return [c.of(self.source) for c in (*self.criteria, *part.criteria)]
 
@@ -97,7 +97,7 @@ class Test(StrictSchema):
         if len(set(names)) < len(names):
             raise ValueError(f"parts: names {names}: each once")
         for part in self.runs():
-            asked = self.asked(part)
+            asked = self.clauses(part)
             plot = next((c.kind for c in asked if isinstance(c, Plot)), None)
             if plot is not None and len(asked) > 1:
                 raise ValueError(f"parts {part.name!r}: {plot}: must be its only criterion")
@@ -193,7 +193,7 @@ def _mistakes(test: Test, part: TestPart, content: Mapping[str, Any]) -> list[st
             and key.partition(".")[0] not in test.replaces
         ]
     duration = content["duration"]
-    for c in test.asked(part):
+    for c in test.clauses(part):
         window = getattr(c, "window", None) or (0.0, 0.0)
         for at in c.at or []:
             if not 0 < at + window[1] <= duration or at >= duration:
@@ -223,7 +223,7 @@ def all_limits(cases: Sequence[Case]) -> list[dict[str, str]]:
     found = dict[tuple[str, ...], None]()
     for case in cases:
         for part in case.test.runs():
-            for c in case.test.asked(part):
+            for c in case.test.clauses(part):
                 assert c.source is not None and c.known is not None
                 found[case.id, c.clause, c.kind, c.limits() or "–", c.source.words(), c.known] = (
                     None
@@ -326,7 +326,7 @@ def converter_at(given: str, f_n: float, rating: float, folder: Path) -> str:
     f_own = nominal.omega_n / (2 * math.pi)
     if math.isclose(f_own, f_n, rel_tol=1e-9) and rating == 1.0:
         return given
-    made = scaled(nominal, f_n, rating)
+    made = to_base(nominal, f_n, rating)
     share = "" if rating == 1.0 else f"-{rating:g}"
     path = folder / f"{Path(given).stem}-{f_n:g}hz{share}.toml"
     if not path.is_file():
@@ -335,7 +335,7 @@ def converter_at(given: str, f_n: float, rating: float, folder: Path) -> str:
     return str(path.absolute())
 
 
-def scaled(nominal: ConverterParameters, f_n: float, rating: float) -> ConverterParameters:
+def to_base(nominal: ConverterParameters, f_n: float, rating: float) -> ConverterParameters:
     """The same converter for another nominal frequency, Hz, and another rating over its own: its
     elements have the same per-unit values, and its DC link stores as much for its rating."""
     slower = nominal.omega_n / (2 * math.pi * f_n)

@@ -72,7 +72,7 @@ def alike(scenario: Scenario) -> str:
     return json.dumps([content, scenario.laws()], sort_keys=True)
 
 
-def judged(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | None) -> Run:
+def after_settling(scenario: Scenario, run: Run, settle_s: float, start: SharedStart | None) -> Run:
     """The run of a scenario after its first ``settle_s``, as a run of its own. Raises UserError: it
     did not last so long.
 

@@ -166,12 +166,12 @@ class Clause(StrictSchema):
             f"{k} = {_plain(x)}" for k, x in limits.items() if x not in (None, [], False)
         )
 
-    def sourced(self, verdict: Verdict) -> Verdict:
+    def with_source(self, verdict: Verdict) -> Verdict:
         """A verdict with the source of its clause."""
         words = "" if self.source is None else self.source.words()
         return replace(verdict, source=words, known=self.known or "")
 
-    def declared(self, under: UnderTest, scenario: Scenario) -> UnderTest:
+    def declare(self, under: UnderTest, scenario: Scenario) -> UnderTest:
         """The owner's declarations, with measured values of what this clause needs besides."""
         return under
 
@@ -372,7 +372,7 @@ def judge(
     T_s, events = run.scenario.T_s, run.scenario.events
     first = min((e.at(T_s) * T_s for e in events), default=0.0)
     return [
-        criterion.sourced(Moment(run, under, others or {}, criterion, at).verdict())
+        criterion.with_source(Moment(run, under, others or {}, criterion, at).verdict())
         for criterion in criteria
         for at in criterion.at or [first]
     ]
@@ -381,7 +381,7 @@ def judge(
 def cannot_judge(criteria: Sequence[Clause], reason: str) -> list[Verdict]:
     """Verdicts on a run that did not take place, or none of a part without criteria."""
     return [
-        c.sourced(
+        c.with_source(
             Verdict(
                 c.clause, c.kind, getattr(c, "signal", ""), at, at, CANNOT, None, "", "", reason
             )

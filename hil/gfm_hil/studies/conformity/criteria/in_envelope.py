@@ -32,7 +32,7 @@ class InEnvelope(Windowed):
     kind: Literal["in_envelope"] = Field(description="kind of criterion")
     longest_s: float = Field(0.0, ge=0, description="s that p may be beyond, in one piece")
 
-    def declared(self, under: UnderTest, scenario: Scenario) -> UnderTest:
+    def declare(self, under: UnderTest, scenario: Scenario) -> UnderTest:
         """With the unit that is measured by a small phase jump if none is declared."""
         if under.unit is not None:
             return under

@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from gfm_hil.recording.columns import printed
+from gfm_hil.recording.columns import symbol_of
 from gfm_hil.run.ripple import remaining_ripple
 from gfm_hil.studies.conformity.criteria.base import Clause, Moment
 from gfm_hil.studies.conformity.verdict import Verdict
@@ -30,7 +30,7 @@ class NoOscillation(Clause):
         name = ripple.oscillates or max(ripple.pu, key=lambda n: ripple.pu[n])
         size = round(ripple.pu[name], 4)
         moves = f"{size:.2g}" if size else "less than 0.0001"
-        text = f"At the end {printed(name)} moves by {moves} p.u. peak to peak at most."
+        text = f"At the end {symbol_of(name)} moves by {moves} p.u. peak to peak at most."
         if ripple.oscillates:
             text = ripple.words()[0].upper() + ripple.words()[1:] + "."
         limit = f"at most {ripple.limit:g} p.u."

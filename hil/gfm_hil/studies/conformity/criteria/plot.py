@@ -70,4 +70,4 @@ class Plot(Clause):
         raise NotImplementedError
 
     def _made(self, *rest: Any) -> Verdict:
-        return self.sourced(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
+        return self.with_source(Verdict(self.clause, self.kind, "p", 0.0, 0.0, *rest))
