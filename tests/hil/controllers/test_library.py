@@ -81,7 +81,7 @@ def test_phases_are_those_of_the_turning_frame(step_ticks, delay, tmp_path, monk
     w = speed * rig.bases.omega_b
     V, A = 380.0 * math.sqrt(2 / 3), 4000.0 / (1.5 * 380.0 * math.sqrt(2 / 3))
     fake = Fake(lambda t: phases(0.9 * V, w * (t + fake.setup.delay) + 0.3))
-    monkeypatch.setattr(library, "_loaded", lambda path: fake)
+    monkeypatch.setattr(library, "_load", lambda path: fake)
     ports = PortMap(step_s=step_ticks * rig.T_s)
     model = library.LibraryController(tmp_path / "x.so", ports, rig)
     assert fake.setup.delay == pytest.approx((delay + step_ticks / 2) * rig.T_s)
@@ -117,7 +117,7 @@ def test_phases_are_those_of_the_turning_frame(step_ticks, delay, tmp_path, monk
     ],
 )
 def test_what_does_not_fit_is_refused(rig, ports, message, tmp_path, monkeypatch):
-    monkeypatch.setattr(library, "_loaded", lambda path: Fake(None))
+    monkeypatch.setattr(library, "_load", lambda path: Fake(None))
     with pytest.raises(UserError, match=message):
         library.LibraryController(tmp_path / "x.so", ports, rig)
 
