@@ -24,7 +24,8 @@ from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.run.cycles import cycle_means, cycle_ticks, hann, whole_ticks
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import FaultClear
-from gfm_hil.scenario.events.grid import GridFrequency, GridVoltage
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
+from gfm_hil.scenario.events.grid_voltage import GridVoltage
 from gfm_hil.scenario.events.reference import Reference
 
 Vector = NDArray[np.float64]

@@ -22,7 +22,7 @@ from gfm_hil.recording.foreign import ABOUT
 from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import Scenario, load_scenario
-from gfm_hil.scenario.events.grid import PhaseJump
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.envelopes import Unit, fit_swing, modes
 from gfm_plant import make_plant
 

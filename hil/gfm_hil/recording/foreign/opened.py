@@ -12,7 +12,7 @@ from gfm_hil.recording.foreign.files import read_channels
 from gfm_hil.recording.foreign.signals import SampledRecording, Vector, at_ticks, sampled, sequences
 from gfm_hil.recording.run import Run, nominal_frequency
 from gfm_hil.scenario import Scenario
-from gfm_hil.scenario.events.grid import GridFrequency
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
 
 ABOUT = "recording"  #: the entry of a summary that tells how a recording was read
 _BAND, _BAND_S = 1e-3, 0.1  # p.u. and s: the least band of rest, and how long it is looked at

@@ -1,5 +1,7 @@
-"""The events of a scenario, one file each, the short ones of the grid together: fields, checks and
-what they do. A new kind is imported here and named in ``_KINDS``."""
+"""The events of a scenario, one file each: its fields, its checks and what it does.
+
+A new kind is a file, imported here and named in ``_KINDS``.
+"""
 
 from typing import TYPE_CHECKING, Annotated, Union, get_args
 
@@ -9,12 +11,15 @@ from gfm_hil.scenario.events.base import Event
 from gfm_hil.scenario.events.breaker import GridBreaker, LineBreaker
 from gfm_hil.scenario.events.fault import Fault, FaultClear
 from gfm_hil.scenario.events.gains import GainChange
-from gfm_hil.scenario.events.grid import GridFrequency, GridLoad, GridVoltage, PhaseJump
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
 from gfm_hil.scenario.events.grid_impedance import GridImpedance
+from gfm_hil.scenario.events.grid_load import GridLoad
 from gfm_hil.scenario.events.grid_profile import GridProfile
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
+from gfm_hil.scenario.events.grid_voltage import GridVoltage
 from gfm_hil.scenario.events.law import LawChange
 from gfm_hil.scenario.events.note import Note
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.scenario.events.reference import Reference
 from gfm_hil.scenario.events.reset import Reset
 

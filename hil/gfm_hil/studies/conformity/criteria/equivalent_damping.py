@@ -8,7 +8,7 @@ from pydantic import Field
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.cycles import whole_ticks
-from gfm_hil.scenario.events.grid import PhaseJump
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 from gfm_hil.studies.envelopes import Unit, fit_jump

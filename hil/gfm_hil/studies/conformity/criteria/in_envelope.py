@@ -11,8 +11,9 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import whole_ticks
 from gfm_hil.scenario import Scenario
-from gfm_hil.scenario.events.grid import GridFrequency, PhaseJump
+from gfm_hil.scenario.events.grid_frequency import GridFrequency
 from gfm_hil.scenario.events.grid_impedance import GridImpedance
+from gfm_hil.scenario.events.phase_jump import PhaseJump
 from gfm_hil.studies.conformity.criteria.base import Moment, UnderTest, Vector, Windowed
 from gfm_hil.studies.conformity.verdict import CONSISTENT, Verdict
 from gfm_hil.studies.envelopes import Envelope, Unit, phase_jump, rocof, scr_jump
