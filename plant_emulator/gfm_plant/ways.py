@@ -40,8 +40,7 @@ def find_ways(
         all_events: also what it calls only while the phases of a fault or a breaker open, or while
             a breaker waits for its synchro-check.
     """
-    plant, net = (types.CPointer(typeof(records)),), records.net[0]
-    circuit = tuple(typeof(record).dtype for record in (records.net, records.now))
+    net, (plant, circuit) = records.net[0], _kinds(records)
     contact = all_events or wiring.joint or len(wiring.contacts) > 1
     each: dict[str, tuple[Any, tuple[Any, ...], Callable[..., None]]] = {
         "step": (True, plant, _step),
@@ -59,6 +58,20 @@ def find_ways(
         needed, kinds, way = each[name]
         if needed:
             net[name] = address_of(kinds, way)
+
+
+def _kinds(records: PlantRecords) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """What functions of a plant and of its circuit work on, see ``address_of``. numba takes longer
+    to find the types of such records than a short run does, so they are kept."""
+    par, st, net, now, parts = records
+    key = tuple((one.dtype, one.flags.c_contiguous) for one in (par, st, net, now, *parts))
+    if key not in _known:
+        circuit = tuple(typeof(record).dtype for record in (net, now))
+        _known[key] = (types.CPointer(typeof(records)),), circuit
+    return _known[key]
+
+
+_known: dict[tuple[Any, ...], tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
 
 
 def _way_between(net: Any) -> Callable[..., None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -89,6 +90,11 @@ def _silent(*_: object) -> None:
     """Neither progress nor notices."""
 
 
+def _on_stderr(text: str) -> None:
+    """A notice for whoever waits at a prompt or in a notebook."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def _explain_and_report(run: Run | NetworkRun) -> None:
     """The figures and the report of a run; if it did not last because its linear loop is unstable,
     its summary says so."""
@@ -114,7 +120,7 @@ def run(
     ports: str | Path | None = None,
     figures: bool = True,
     progress: Progress = _silent,
-    notice: Notice = _silent,
+    notice: Notice | None = None,
     **changes: Any,
 ) -> Run:
     """Run a scenario.
@@ -133,7 +139,8 @@ def run(
         ports: file of the map of its ports.
         figures: in the folder, figures and report.html.
         progress: is called with the ticks done and the misses so far; with a folder.
-        notice: is called with a line for a person who waits; with a folder.
+        notice: is called with a line for a person who waits. None: a run in memory says on stderr
+            what it compiles, which happens once a machine; one with a folder says nothing.
         changes: keys of the scenario with ``__`` for the dot, e.g. ``duration=2.0`` [s],
             ``plant__factors__L_g=2.0``.
 
@@ -145,6 +152,7 @@ def run(
         if isinstance(law, Law):
             raise UserError(f"law = {law.name!r}: save it first, as the folder names its file")
         checked = _load(scenario, {**changes, "law": law})
+        notice = notice or _silent
         command = runner.controller_program(checked, controller, ports, notice)
         report = _explain_and_report if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
@@ -153,7 +161,8 @@ def run(
     with law_files([] if law is None else [law]) as files:
         for file in files.values():
             changes = {**changes, "law": file}
-        made = runner.run_in_memory(_load(scenario, changes, in_process=True))
+        checked = _load(scenario, changes, in_process=True)
+        made = runner.run_in_memory(checked, notice=notice or _on_stderr)
     return _with_name(made, law) if isinstance(law, Law) else made
 
 
@@ -165,7 +174,7 @@ def run_network(
     ports: Mapping[str, str | Path] = MappingProxyType({}),
     figures: bool = True,
     progress: Progress = _silent,
-    notice: Notice = _silent,
+    notice: Notice | None = None,
     **changes: Any,
 ) -> NetworkRun:
     """Run a scenario with several converters; arguments as for ``run``.
@@ -191,7 +200,8 @@ def run_network(
     if folder is None:
         if controllers:
             raise UserError("controllers: take a folder")
-        return runner.run_network_in_memory(checked)
+        return runner.run_network_in_memory(checked, notice or _on_stderr)
+    notice = notice or _silent
     commands = {
         name: runner.controller_program(checked.each[name], controller, ports.get(name), notice)
         for name, controller in controllers.items()

@@ -26,7 +26,7 @@ from gfm_hil.engine.compiling import compile_external, compiled_benches
 from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
-from gfm_hil.engine.setup import ONE_CONVERTER, Bench, make_bench, make_benches
+from gfm_hil.engine.setup import ONE_CONVERTER, Bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
 from gfm_hil.recording.columns import ColumnLike
 from gfm_hil.recording.log import Outcome
@@ -286,7 +286,9 @@ def _run_here(
     return began
 
 
-def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> Run:
+def run_in_memory(
+    scenario: Scenario, kept: tuple[Kept, Kept] | None = None, notice: Notice | None = None
+) -> Run:
     """Run a scenario in this process and leave nothing on the disk. Raises UserError: the scenario
     has no operating point.
 
@@ -295,18 +297,26 @@ def run_in_memory(scenario: Scenario, kept: tuple[Kept, Kept] | None = None) -> 
         kept: what to record into, the plant's and the controller's columns, at least
             ``summary.READ`` of them. The run's columns lie in there, so they are good until the
             next run in the same room. None: new room for all columns.
+        notice: is called with what is compiled meanwhile; None: each function is compiled when it
+            is first called, without a word.
     """
-    bench = make_bench(scenario)
-    (run,) = _in_memory([bench], [kept] if kept else make_room([bench]))
+    if scenario.parts:
+        raise UserError(ONE_CONVERTER)
+    benches = _benches(scenario, notice)
+    (run,) = _in_memory(benches, [kept] if kept else make_room(benches))
     return run
 
 
-def run_network_in_memory(scenario: Scenario) -> NetworkRun:
-    """Run a scenario with a network in this process and leave nothing on the disk. Raises
-    UserError: the scenario has no operating point."""
-    benches = make_benches(scenario)
+def run_network_in_memory(scenario: Scenario, notice: Notice | None = None) -> NetworkRun:
+    """Run a scenario with a network in this process and leave nothing on the disk; ``notice`` as of
+    ``run_in_memory``. Raises UserError: the scenario has no operating point."""
+    benches = _benches(scenario, notice)
     runs = _in_memory(benches, make_room(benches))
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
+
+
+def _benches(scenario: Scenario, notice: Notice | None) -> list[Bench]:
+    return make_benches(scenario) if notice is None else compiled_benches(scenario, notice)
 
 
 def make_room(benches: Sequence[Bench]) -> list[tuple[Kept, Kept]]:

@@ -99,21 +99,19 @@ def test_loops_are_compiled_for_the_records_that_a_started_bench_has(make, conte
 
 
 _RUN = """
-from gfm_hil.engine.compiling import compiled_benches
-from gfm_hil.scenario.loading import check_scenario
-one = {"title": "test", "duration": 0.1, "link": {"type": "inproc"}}
-compiled_benches(check_scenario(one, "test"), print)
+import gfmhil
+gfmhil.run({"title": "test", "duration": 0.1})
 """
 
 
 @pytest.mark.full  # compiles a whole run
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one processor")
-def test_a_second_process_compiles_the_loop_meanwhile(tmp_path):
+def test_the_first_run_in_memory_says_what_it_compiles_and_a_second_process_helps(tmp_path):
     first, second = (
         subprocess.run(
             [sys.executable, "-c", _RUN], capture_output=True, text=True, check=True,
             env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
-        ).stdout
+        ).stderr
         for _ in range(2)
     )  # fmt: skip
     assert "the operating point" in first and "the loop of both sides" not in first
