@@ -3,6 +3,7 @@
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,9 @@ def add(command: argparse.ArgumentParser) -> None:
         help="judge this recording, of one part of the test --against, in place of a run: CSV, "
         "COMTRADE (.cfg, .cff), Parquet, MF4 or MAT",
     )  # fmt: skip
-    command.add_argument("--part", metavar="NAME", help="with --recording: the part of the test")
+    command.add_argument(
+        "--part", metavar="NAME", help="with --recording: the part of the test, see --list parts"
+    )
     common.add_map(command, "--controller, or the channels of --recording")
     common.add_inner(command)
     command.add_argument(
@@ -114,8 +117,9 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument(
-        "--list", nargs="?", const="tests", choices=("tests", "limits"),
-        help="list the tests, or all limits with source and how each is known; run nothing",
+        "--list", nargs="?", const="tests", choices=("tests", "parts", "limits"),
+        help="list the tests, the parts of each, or all limits with source and how each is known; "
+        "run nothing",
     )  # fmt: skip
     common.add_open(command)
     common.add_study_options(command, "results.json")
@@ -125,7 +129,7 @@ def call(options: argparse.Namespace) -> int:
     against = options.against or [ALL]
     if options.list:
         cases = load_cases(against)
-        rows = [_plain(case) for case in cases] if options.list == "tests" else all_limits(cases)
+        rows = {"tests": _tests, "parts": _parts, "limits": all_limits}[options.list](cases)
         if options.json:
             print(json.dumps(rows, indent=2))
         else:
@@ -211,9 +215,22 @@ def _diff(options: argparse.Namespace) -> int:
     return EXIT_FAILED if found.worse else 0
 
 
-def _plain(case: Case) -> dict[str, Any]:
-    runs, source = len(case.test.runs()), case.test.source.words()
-    return {"test": case.id, "runs": runs, "title": case.test.title, "source": source}
+def _tests(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    return [
+        {
+            "test": case.id, "runs": len(case.test.runs()), "title": case.test.title,
+            "source": case.test.source.words(),
+        }
+        for case in cases
+    ]  # fmt: skip
+
+
+def _parts(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    return [
+        {"test": case.id, "part": part.name, "title": part.title or case.test.title}
+        for case in cases
+        for part in case.test.runs()
+    ]
 
 
 def _why(part: PartResult) -> list[tuple[str, ...]]:

@@ -4,6 +4,7 @@ import cmath
 import json
 import math
 import shlex
+from collections import Counter
 from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
@@ -1268,6 +1269,11 @@ def test_the_list_is_also_json(capsys):
     listed = json.loads(capsys.readouterr().out)
     assert [row["test"] for row in listed] == [case.id for case in load_cases(chosen)]
     assert all(row["runs"] > 0 and row["title"] and row["source"] for row in listed)
+    assert main(["conform", "--against", *chosen, "--list", "parts", "--json"]) == 0
+    parts = json.loads(capsys.readouterr().out)
+    runs = Counter(row["test"] for row in parts)
+    assert runs == {row["test"]: row["runs"] for row in listed}
+    assert all(row["part"] and row["title"] for row in parts)
 
 
 def test_a_converter_under_test_may_switch(tmp_path):

@@ -316,9 +316,9 @@ def explain_counts(found: Conformity, law: str) -> str:
     return (
         f"Clauses, each as often as it is judged. {found.saturated(law)} of them are judged while "
         "a limiter of the controller acts: the tables mark them with the limiter and the part of "
-        f"the window in which it does. {terms} A test, and the law, has the first that it has of "
-        f"fail, cannot judge, limited, consistent with itself, pass. {about} Check each limit "
-        "against the source before you rely on it."
+        f"the window in which it does. {terms} The verdict of a test, and of the law, is the first "
+        "of fail, cannot judge, limited, consistent with itself and pass that one of its clauses "
+        f"has. {about} Check each limit against the source before you rely on it."
     )
 
 
