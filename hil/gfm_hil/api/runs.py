@@ -91,7 +91,7 @@ def _silent(*_: object) -> None:
 
 
 def _on_stderr(text: str) -> None:
-    """A notice for whoever waits at a prompt or in a notebook."""
+    """A notice for a person who waits at a prompt or in a notebook."""
     print(text, file=sys.stderr, flush=True)
 
 
