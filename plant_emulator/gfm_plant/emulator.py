@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gfm_plant.by_address import call_at
 from gfm_plant.clearing import begin_clearing
-from gfm_plant.components import TICK, act_of_components, every_at_rest
+from gfm_plant.components import TICK, call_components, every_at_rest
 from gfm_plant.dc_link import limit_dc_source
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.model import DELTA, V_DC, terminal
@@ -143,7 +143,7 @@ def whole_period(plant: PlantRecords) -> None:
         go_back(plant)
         trip(plant, worst, DIVERGED, largest)
         enter(n, now, plant.st[0].tick, circuit(n, now))
-    act_of_components(plant, TICK, circuit(n, now))
+    call_components(plant, TICK, circuit(n, now))
     advance_grid(now, n.T_s)
     if now.check == WATCHING:
         call_at(n.watch, plant, 0.0, 0.0)

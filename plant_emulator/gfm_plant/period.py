@@ -11,7 +11,7 @@ from gfm_plant.by_address import call_at
 from gfm_plant.components import (
     GO_BACK,
     KEEP,
-    act_of_components,
+    call_components,
     every_begin,
     every_drive,
     every_end,
@@ -65,7 +65,7 @@ def keep(plant: PlantRecords) -> None:
     w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
         w_before[i] = w[i]
-    act_of_components(plant, KEEP, circuit(n, now))
+    call_components(plant, KEEP, circuit(n, now))
 
 
 @compiled
@@ -89,7 +89,7 @@ def go_back(plant: PlantRecords) -> None:
     w, w_before = field(now, "w"), field(now, "w_before")
     for i in range(n.n_states):
         w[i] = w_before[i]
-    act_of_components(plant, GO_BACK, circuit(n, now))
+    call_components(plant, GO_BACK, circuit(n, now))
 
 
 @inlined

@@ -61,8 +61,8 @@ def find_ways(
 
 
 def _kinds(records: PlantRecords) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """What functions of a plant and of its circuit work on, see ``address_of``. numba takes longer
-    to find the types of such records than a short run does, so they are kept."""
+    """Return the types of a plant's records and of its circuit's, see ``address_of``. numba takes
+    milliseconds to find them, and every run asks for them, so they are kept."""
     par, st, net, now, parts = records
     key = tuple((one.dtype, one.flags.c_contiguous) for one in (par, st, net, now, *parts))
     if key not in _known:

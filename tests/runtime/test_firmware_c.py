@@ -35,7 +35,7 @@ RISC_V = pytest.mark.skipif(
 STRICT = [*firmware.STRICT, "-Wdouble-promotion", "-ffp-contract=off"]
 
 
-#: plain laws, and laws with inner stages; and of each kind those of which the code differs most
+#: the laws without and with an inner stage; ``FEW`` has those whose code differs most
 KINDS = {"plain": LAWS, "staged": STAGED}
 FEW = {"plain": SOME, "staged": FEW_STAGED}
 Folder = Callable[..., Path]

@@ -113,8 +113,8 @@ def _unstarted(scenario: Scenario) -> list[Bench]:
 def _shares(
     scenario: Scenario, roles: Iterable[Role], found: Callable[[], list[Bench]]
 ) -> tuple[list[Set], list[Set]]:
-    """What the ticks of a scenario call, in shares for two processes, of which the first compiles
-    the operating point and the plant's period besides."""
+    """Split what the ticks of a scenario call between two processes. The first one also compiles
+    the operating point and the plant's period."""
     first, second = list[Set](), list[Set]()
     if scenario.in_process:
         second.append(_both(found))

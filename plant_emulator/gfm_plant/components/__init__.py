@@ -143,7 +143,7 @@ def components_act(plant: Any, act: int, c: int) -> None:
 
 
 @inlined
-def act_of_components(plant: Any, act: int, c: int) -> None:
-    """``components_act``, which only a plant with components compiles."""
+def call_components(plant: Any, act: int, c: int) -> None:
+    """Call ``components_act`` by its address, of a plant that has components."""
     if plant.net[0].n_dynamic > 0:
         call_at(plant.net[0].components, plant, act, c)
