@@ -78,16 +78,16 @@ def test_our_own_model_gives_the_run_of_the_law(exported, kind, inner, tmp_path,
     near = runner.run_in_memory(scenario)
 
     def settled(scenario: Any) -> Any:
-        bench = setup.make_bench(scenario)
+        (bench,) = setup.make_benches(scenario)
         c, y = bench.controller, bench.y.copy()
         plant_sample(bench.plant.copy().records, 0, y)
         own = bench.u[:3].copy()  # with a stage its E_u begins at e_d: no port says more
         settle_into(c.laws[0], c.states[0], c.ctl["ref"][0], y[:5], own, np.zeros(3))
         if bench.inner:
             settle(c.laws[:1], c.states[:1], own, y, *c.ctl["out"][0, 2:])
-        return bench
+        return [bench]
 
-    monkeypatch.setattr(runner, "make_bench", settled)
+    monkeypatch.setattr(runner, "make_benches", settled)
     equal = runner.run_in_memory(scenario)
     empty = {"law", "X_est", "E_law", "i_ref_d", "i_ref_q", "limited"}
     assert np.ptp(equal.columns["true_p"][:]) > 0.01

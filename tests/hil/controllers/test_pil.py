@@ -69,7 +69,7 @@ def run(tmp_path: Path, target: str, **content: Any) -> Run:
 
 def in_process(found: Run, real: str, monkeypatch: pytest.MonkeyPatch) -> Run:
     """The same scenario with the kernel of a precision in this process."""
-    monkeypatch.setattr(runner, "make_bench", partial(setup.make_bench, real=real))
+    monkeypatch.setattr(runner, "make_benches", partial(setup.make_benches, real=real))
     assert found.folder is not None
     return runner.run_in_memory(
         load_scenario(str(found.folder / "scenario.toml"), link__type="inproc")

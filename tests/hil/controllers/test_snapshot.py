@@ -81,17 +81,15 @@ def test_two_dlls_and_a_law_in_a_network_and_their_snapshot(exported, tmp_path, 
     for name, run in goes_on.items():
         check_equal(run, whole[name], CUT, OF_TIME | (OF_LAWS if name != "C" else set()))
 
-    make = setup.make_benches
-
-    def settled(scenario: Any) -> Any:
-        benches = make(scenario)
+    def settled(scenario: Any, _: Any) -> Any:
+        benches = setup.make_benches(scenario)
         for k, bench in enumerate(benches[:2]):
             c, y = bench.controller, bench.y.copy()
             plant_sample(bench.plant.copy().records, k, y)
             settle_into(c.laws[0], c.states[0], c.ctl["ref"][0], y, bench.u.copy(), np.zeros(3))
         return benches
 
-    monkeypatch.setattr(runner, "make_benches", settled)
+    monkeypatch.setattr(runner, "compiled_benches", settled)
     ours = gfmhil.run_network(network())
     for name, run in whole.items():
         check_equal(run, ours[name], 0, OF_LAWS if name != "C" else set())
