@@ -10,7 +10,7 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from gfm_plant.layout import intrinsic
+from gfm_runtime.compiled import intrinsic
 
 _WORD = ir.IntType(64)
 

@@ -9,7 +9,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.by_address import call_at
 from gfm_plant.clearing import begin_clearing
 from gfm_plant.components import TICK, call_components, every_at_rest
 from gfm_plant.dc_link import limit_dc_source
@@ -24,6 +23,7 @@ from gfm_plant.ramps import advance_grid
 from gfm_plant.records import COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
 from gfm_plant.solution import circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING
+from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import cached, compiled, inlined
 
 _FAR = 1e6  # a state beyond this many p.u. has diverged
@@ -106,7 +106,7 @@ def plant_step(plant: PlantRecords) -> None:
     """Go on by one sampling period under the commands in the delay lines.
 
     The loops reach it by an address in the plant's records, see `ways`."""
-    call_at(plant.net[0].step, plant, 0.0, 0.0)
+    call_at(plant.net[0].step, plant.net[0].records, 0.0, 0.0)
 
 
 @compiled
@@ -119,7 +119,7 @@ def whole_period(plant: PlantRecords) -> None:
     for k in range(n.n_converters):
         plant.st[k].phase_sums[0] = math.nan
     if now.clearing:
-        call_at(n.clear, plant, 0.0, 0.0)
+        call_at(n.clear, n.records, 0.0, 0.0)
     elif n.conversions > 1:
         _advance_converting(plant)
     else:
@@ -146,7 +146,7 @@ def whole_period(plant: PlantRecords) -> None:
     call_components(plant, TICK, circuit(n, now))
     advance_grid(now, n.T_s)
     if now.check == WATCHING:
-        call_at(n.watch, plant, 0.0, 0.0)
+        call_at(n.watch, n.records, 0.0, 0.0)
     if now.contact:
         now.fault_left -= n.T_s
         if now.fault_left < 0.5 * n.T_s and begin_clearing(n, now):
@@ -213,7 +213,7 @@ def plant_options(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None
     ``batteries`` the state of charge."""
     n, now = plant.net[0], plant.now[0]
     if n.connections != 0:
-        call_at(n.connection, plant, k, 0.0)
+        call_at(n.connection, n.records, k, 0.0)
         out[0], out[1], out[2] = now.connection[0], now.connection[1], now.connection[2]
     if n.batteries != 0:
         out[len(out) - 1] = plant.st[k].soc

@@ -7,12 +7,12 @@ reach them by an address in the plant's records: only who records a network comp
 
 from typing import Any
 
-from gfm_plant.by_address import call_at
 from gfm_plant.clearing import contact_currents
 from gfm_plant.components import every_flow
 from gfm_plant.layout import field
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import grid_source, node_voltage
+from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import compiled, inlined
 
 
@@ -52,7 +52,7 @@ def plant_flows(plant: PlantRecords, out: Any) -> None:
     """Write what is recorded of the network at this tick to out, (columns,); nothing if that has no
     room."""
     if len(out) > 0:
-        call_at(plant.net[0].look, plant, 0.0, 0.0)
+        call_at(plant.net[0].look, plant.net[0].records, 0.0, 0.0)
         row = field(plant.now[0], "flow_row")
         for j in range(len(out)):
             out[j] = row[j]

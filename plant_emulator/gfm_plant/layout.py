@@ -13,12 +13,10 @@ import numpy as np
 from llvmlite import ir
 from numba import from_dtype, types
 from numba.core import cgutils
-from numba.extending import intrinsic as _intrinsic
 from numpy.typing import NDArray
 
 from gfm_plant.names import ADDRESSES
-
-intrinsic: Any = _intrinsic  # its stubs count typingctx among the caller's arguments
+from gfm_runtime.compiled import intrinsic
 
 MOST_CONTACTS = 8
 """None, one of three phases, and what is left of it as these open: two of them, or one."""

@@ -68,11 +68,15 @@ CONNECTION = ("p_c", "q_c", "V_c")
 BATTERY = ("soc",)
 """State of charge of a battery behind the DC source, in [0, 1]."""
 
-ADDRESSES = (
+WAYS = (
     "step", "advance", "components", "series", "sample", "connection", "look", "clear", "join",
     "watch",
 )  # fmt: skip
-"""In a plant's records, those of functions, see `ways`; 0: it does not call that one."""
+"""Functions that a plant calls by addresses in its records, see `ways`; 0: it does not call that
+one."""
+
+ADDRESSES = ("records", *WAYS)
+"""In a plant's records; the first one is that of the records themselves."""
 
 THE_GRID, FIRST_LINE = "\0grid", "\0line"
 """In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""

@@ -27,6 +27,7 @@ from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.ways import find_ways
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
+from gfm_runtime.by_address import in_memory
 
 _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC link's series
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
@@ -53,6 +54,10 @@ class Network:
     elsewhere: frozenset[str] = frozenset()
     at_least: float = 0.0
     fastest: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._in_memory = in_memory(self.typed)
+        self.net["records"] = self._in_memory.ctypes.data
 
     @property
     def typed(self) -> PlantRecords:

@@ -7,7 +7,6 @@ The functions are as those of `gfm_plant.emulator`.
 import math
 from typing import Any
 
-from gfm_plant.by_address import call_at
 from gfm_plant.components import (
     GO_BACK,
     KEEP,
@@ -33,6 +32,7 @@ from gfm_plant.solution import (
     read_states,
     state,
 )
+from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import compiled, inlined, inlined_as
 
 
@@ -41,7 +41,7 @@ def advance(plant: PlantRecords, begin: float, end: float) -> None:
     """Go on between two instants of the period, s after its beginning; inf: to its end.
 
     It reaches the plant's way by an address in its records, see `ways`."""
-    call_at(plant.net[0].advance, plant, begin, end)
+    call_at(plant.net[0].advance, plant.net[0].records, begin, end)
 
 
 @inlined

@@ -29,7 +29,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from gfm_plant.dc_link import advance_dc_link
-from gfm_plant.layout import DRIVES, LANES, MOMENTS, SPEEDS, TERMS, field, intrinsic
+from gfm_plant.layout import DRIVES, LANES, MOMENTS, SPEEDS, TERMS, field
 from gfm_plant.records import I_F, N_OWN, PlantRecords
 from gfm_plant.solution import own
 from gfm_plant.sparse import turned
@@ -45,7 +45,7 @@ from gfm_plant.vectors import (
     shuffle,
     store,
 )
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled, inlined, intrinsic
 
 _SLOWEST = 0.02  # rad; a source that turns further in half a unit has too few powers
 _SMALLEST = 1e-15  # of a power of the norm over its factorial; further ones are left out

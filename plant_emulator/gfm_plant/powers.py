@@ -16,9 +16,9 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from gfm_plant.layout import ORDER, POWERS, SLOTS, field, intrinsic
+from gfm_plant.layout import ORDER, POWERS, SLOTS, field
 from gfm_plant.vectors import FOUR, INT, ZERO, add, all_four, load, pointer, splat, store
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled, inlined, intrinsic
 
 ONE, P, SOURCE_AT, MID_AT, N = 8, 9, 12, 13, 14
 """Places in x, behind i_f, v, i_o (alpha and beta), v_dc and the integral of its source's control:

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_plant.by_address import call_at
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussians
 from gfm_plant.phases import read_phases
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecords
+from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.signals import NY, NY_INNER
 
@@ -24,7 +24,7 @@ def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
     and voltages of an inner stage besides, (i_d, i_q, v_d, v_q, i_od, i_oq), which pass no filter;
     one of (21,) the counts of the A/D at the phases too.
     """
-    call_at(plant.net[0].sample, plant, k, len(y))
+    call_at(plant.net[0].sample, plant.net[0].records, k, len(y))
     s = plant.st[k]
     for j in range(min(len(y), NY_INNER)):
         y[j] = s.reads[j]

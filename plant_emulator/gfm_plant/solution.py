@@ -17,7 +17,6 @@ omega. See `circuit.join_axes`.
 import math
 from typing import Any
 
-from gfm_plant.by_address import call_circuit_at
 from gfm_plant.joint import joint_circuit
 from gfm_plant.layout import CHECK_SIDES, field
 from gfm_plant.records import N_OWN
@@ -30,6 +29,7 @@ from gfm_plant.sparse import (
     turned,
     voltage_at,
 )
+from gfm_runtime.by_address import call_records_at
 from gfm_runtime.compiled import compiled, inlined
 
 
@@ -195,7 +195,7 @@ def _by_terms(n: Any, now: Any) -> bool:
 def half_step(n: Any, now: Any, c: int, part: int, which: int) -> None:
     """Take the modes on by half a piece: ``which`` is 0 for its first half, 1 for its second."""
     if by_series(n, now):
-        call_circuit_at(n.series, n, now, field(n, "half_h")[part], which)
+        call_records_at(n.series, n, now, field(n, "half_h")[part], which)
         return
     decay, z, forced = field(n, "decay"), field(now, "z"), field(now, "forced")
     for m in range(field(n, "n_modes")[c]):
@@ -350,7 +350,7 @@ def enter(n: Any, now: Any, tick: float, c: int) -> None:
     """Start the modes of circuit c at a tick, or between two, from w, which is projected onto what
     that circuit can hold."""
     if now.joint and not now.made:
-        call_circuit_at(n.join, n, now, 0.0, 0.0)
+        call_records_at(n.join, n, now, 0.0, 0.0)
     known, modes = field(now, "gain_omega"), field(n, "modes")
     z, w = field(now, "z"), field(now, "w")
     for part in range(len(known)):

@@ -19,7 +19,7 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from gfm_plant.layout import COARSE, FINE, LARGEST, ORDER, POWERS, field, intrinsic
+from gfm_plant.layout import COARSE, FINE, LARGEST, ORDER, POWERS, field
 from gfm_plant.powers import ONE, P, begin_powers, go_to
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import grid_source
@@ -36,7 +36,7 @@ from gfm_plant.vectors import (
     splat,
     store,
 )
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import compiled, inlined, intrinsic
 
 _PATIENCE = 2000  # intervals that the matrices would have served before they are made
 _NEAR = 1e-9  # of a count; what is as near to a whole one is one

@@ -6,7 +6,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from gfm_plant.layout import intrinsic
+from gfm_runtime.compiled import intrinsic
 
 REAL, INT = ir.DoubleType(), ir.IntType(64)
 FOUR = ir.VectorType(REAL, 4)

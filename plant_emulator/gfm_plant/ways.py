@@ -9,27 +9,24 @@ from typing import Any
 from numba import typeof, types
 
 from gfm_plant.bridge import advance_bridges
-from gfm_plant.by_address import address_of
 from gfm_plant.clearing import advance_clearing
 from gfm_plant.components import components_act
 from gfm_plant.emulator import look_at_connection, whole_period
 from gfm_plant.flows import look_at_flows
 from gfm_plant.joint import make_joint
 from gfm_plant.moving import advance_moving
-from gfm_plant.names import ADDRESSES
+from gfm_plant.names import WAYS
 from gfm_plant.period import advance_alone, advance_with_components
 from gfm_plant.records import PlantRecords
 from gfm_plant.sensors import read_sensors
 from gfm_plant.sparse import series_half
 from gfm_plant.synchro_check import watch
 from gfm_plant.wiring import Wiring
+from gfm_runtime.by_address import address_of
 
 
 def find_ways(
-    records: PlantRecords,
-    wiring: Wiring,
-    names: Collection[str] = ADDRESSES,
-    all_events: bool = False,
+    records: PlantRecords, wiring: Wiring, names: Collection[str] = WAYS, all_events: bool = False
 ) -> None:
     """Compile, or load, what a plant calls by address, and write the addresses to its records.
 

@@ -16,6 +16,7 @@ from gfm_runtime.counts import begin_counts, calibrate_with
 from gfm_runtime.errors import LawError
 from gfm_runtime.impedance import make_impedance
 from gfm_runtime.inner import settle
+from gfm_runtime.inner_tick import inner_tick
 from gfm_runtime.kernel import pack_law, state_dtype
 from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES
 from gfm_runtime.states import BAD_SENSOR, OK, READY, RUNNING, SAFE, STATES
@@ -202,6 +203,12 @@ class Controller:
                 self.ctl["state"], self.ctl["reason"] = SAFE, BAD_SENSOR
                 self.ctl["channel"] = suspect
 
+    def find_inner_tick(self) -> None:
+        """Compile, or load, what `control` calls of laws with an inner stage, if there are any;
+        before the first tick in this process."""
+        if self.inner:
+            self.ctl["inner_tick"] = inner_tick(self.laws.dtype, self.states.dtype)
+
     @property
     def calibrations(self) -> int:
         """How many counts without current the active law takes at its start."""
@@ -215,4 +222,6 @@ class Controller:
     def step(self, y: NDArray[np.float64], u: NDArray[np.float64]) -> None:
         """One tick from Python: y (5,) in, u (3,) in and out, p.u.; (11,) and (4,) with an inner
         stage, (21,) and (7,) with counts."""
+        if not self.ctl["inner_tick"][0]:
+            self.find_inner_tick()
         control(self.ctl, self.laws, self.states, self.est, y, u)

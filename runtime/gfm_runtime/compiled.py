@@ -31,6 +31,7 @@ from typing import Any
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
+from numba.extending import intrinsic as _intrinsic
 
 from gfm_runtime.deferred import DeferredDispatcher, Deferring, KeptResult
 from gfm_runtime.wheel_code import WheelCode, name_of
@@ -157,6 +158,9 @@ def callback(
     made.compile()
     return made
 
+
+#: numba's decorator; its stubs count typingctx among the caller's arguments
+intrinsic: Any = _intrinsic
 
 #: decorator for such a function
 compiled: Any = _decorator(**FREE)

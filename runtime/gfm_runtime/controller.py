@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_runtime.by_address import call_at, on_stack
 from gfm_runtime.compiled import compiled, inlined
-from gfm_runtime.counts import align, go_on_with, measure, modulate
 from gfm_runtime.impedance import estimate
-from gfm_runtime.inner import settle_inner, take_measurements
-from gfm_runtime.kernel import advance, advance_with_inner, look, look_with_inner
-from gfm_runtime.signals import N_LEGS, NU, NU_INNER, NY, NY_INNER, Y_V_D, Y_V_Q, group
-from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
+from gfm_runtime.kernel import advance, look
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group
+from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
 from gfm_runtime.switchover import change_law, settle_into
 
 MAX_STAGES = 8
@@ -45,7 +44,7 @@ controller_dtype = np.dtype(
         ("ref_rate", "f8", (NY,)),  # p.u. per tick; 0 is a step
         ("y", "f8", (NY_INNER,)),  # of this tick: the kernel takes fields of a record
         ("u", "f8", (NU,)),
-        ("ref_seen", "f8", (NY,)),  # with which a law joins, see ``_join``
+        ("ref_seen", "f8", (NY,)),  # with which a law joins, see ``join``
         ("out", "f8", (NU_INNER,)),  # with an inner stage: what goes to the bridge
         ("y_low", "f8", (NY_INNER,)),
         ("y_high", "f8", (NY_INNER,)),
@@ -57,6 +56,7 @@ controller_dtype = np.dtype(
         ("below", "f8", (MAX_STAGES,)),  # and left again below this one, p.u.
         ("dwell", "i8"),  # least ticks between two changes
         ("since", "i8"),  # ticks since the last change, until the next one is allowed
+        ("inner_tick", "i8"),  # address of the tick with an inner stage, see `inner_tick`
     ],
     align=True,
 )
@@ -85,7 +85,8 @@ def set_reference(ctl: NDArray[Any], index: int, value: float, per_tick: float =
 
 
 @compiled
-def _go_safe(ctl, reason, channel):
+def go_safe(ctl, reason, channel):
+    """Go to SAFE for a reason and a channel of it; the first reason stays."""
     if ctl.state != SAFE:
         ctl.state, ctl.reason, ctl.channel = SAFE, reason, channel
 
@@ -99,7 +100,7 @@ def missed(ctl):
     c = ctl[0]
     c.stale += 1
     if c.stale > c.hold:
-        _go_safe(c, STALE, -1)
+        go_safe(c, STALE, -1)
 
 
 @compiled
@@ -109,7 +110,7 @@ def follow_plant(ctl, tripped):
     c = ctl[0]
     if tripped:
         if c.state == RUNNING:
-            _go_safe(c, PLANT_TRIP, -1)
+            go_safe(c, PLANT_TRIP, -1)
     elif c.state == READY:
         c.state = RUNNING
 
@@ -154,7 +155,7 @@ def accept(c, y):
     """
     for j in range(len(y)):
         if not (c.y_low[j] <= y[j] <= c.y_high[j]):
-            _go_safe(c, BAD_Y, j)
+            go_safe(c, BAD_Y, j)
             return False
         c.y[j] = y[j]
     move_references(c)
@@ -181,19 +182,16 @@ def measured(y, u):
 
 
 @inlined
-def _join(law, state, c, inner):
+def join(law, state, c):
     """Set the law's state so that its output begins with what is measured."""
     measured(c.y, c.u)
     for j in range(NY):
         c.ref_seen[j] = c.ref[j]
         if j < NU:
             state.trend[j] = 0
-    if inner and law.k_pll > 0.0:
+    if law.k_pll > 0.0:  # of an inner stage
         c.ref_seen[2] = c.u[1]
     settle_into(law, state, c.ref_seen, c.y, c.u, state.trend)
-    if inner:
-        take_measurements(state, c.y)
-        settle_inner(law, state, c.u[2], 0.0)
 
 
 @inlined
@@ -205,10 +203,17 @@ def next_law(c, est, y):
     return -1 if k == c.active else k
 
 
+@inlined
+def change(c, laws, states, k):
+    """Change to law k, bumpless."""
+    c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u)
+    c.active, c.changes = k, c.changes + 1
+
+
 @compiled
 def bad_output(ctl, channel):
     """SAFE, because output ``channel`` is not finite."""
-    _go_safe(ctl[0], BAD_U, channel)
+    go_safe(ctl[0], BAD_U, channel)
 
 
 @inlined
@@ -226,63 +231,25 @@ def control(ctl, laws, states, est, y, u):
     c = ctl[0]
     if c.state != RUNNING:
         return
-    counts, before = len(y) > NY_INNER, c.active
-    if not (sense(c, laws[before], states[before], y) if counts else accept(c, y)):
-        return
-    _tick(c, laws, states, est, len(y) > NY, u)
-    if counts:
-        if c.active != before:
-            go_on_with(states[c.active], states[before])
-        if c.state == RUNNING:
-            modulate(laws[c.active], states[c.active])
-            for x in range(N_LEGS):
-                u[NU_INNER + x] = int(states[c.active].compare[x])
+    if len(y) > NY:
+        call_at(c.inner_tick, on_stack((ctl, laws, states, est, y, u)), 0.0, 0.0)
+    elif accept(c, y):
+        _tick(c, laws, states, est, u)
 
 
 @inlined
-def sense(c, law, state, y):
-    """Measure from the counts at the end of y (21,); whether all is plausible and in range."""
-    if c.aligns:
-        c.aligns = 0
-        if c.joins:
-            state.sensed[Y_V_D], state.sensed[Y_V_Q] = 1.0, 0.0
-        align(law, state, y, NY_INNER)
-    measure(law, state, y, NY_INNER)
-    if state.suspect >= 0:
-        _go_safe(c, BAD_SENSOR, state.suspect)
-        return False
-    return accept(c, state.sensed)
-
-
-@inlined
-def _tick(c, laws, states, est, inner, u):
-    """A tick in p.u., from the y that ``c`` has accepted; other arguments as of ``control``."""
+def _tick(c, laws, states, est, u):
+    """A tick from the y that ``c`` has accepted; other arguments as of ``control``."""
     if c.joins:
         c.joins = 0
-        _join(laws[c.active], states[c.active], c, inner)
+        join(laws[c.active], states[c.active], c)
     k = next_law(c, est[0], c.y)
     if k >= 0:
-        c.bump = change_law(laws[c.active], states[c.active], laws[k], states[k], c.ref, c.y, c.u)
-        if inner:
-            take_measurements(states[k], c.y)
-            settle_inner(laws[k], states[k], c.out[2], c.out[3])
-        c.active, c.changes = k, c.changes + 1
-    if inner:
-        look_with_inner(laws[c.active], states[c.active], c.ref, c.y, c.out)
-        for i in (1, 0, 2, 3):
-            if not math.isfinite(c.out[i]):
-                _go_safe(c, BAD_U, i)
-                return
-        advance_with_inner(laws[c.active], states[c.active])
-        for i in range(NU):
-            c.u[i] = states[c.active].u[i]  # the law's own
-        for i in range(NU_INNER):
-            u[i] = c.out[i]
-        return
+        change(c, laws, states, k)
     look(laws[c.active], states[c.active], c.ref, c.y, c.u)
     for i in (1, 0, 2):  # omega_u first: column 3 takes it to the others
         if not math.isfinite(c.u[i]):
-            _go_safe(c, BAD_U, i)
+            go_safe(c, BAD_U, i)
             return
     advance(laws[c.active], states[c.active])
     for i in range(NU):

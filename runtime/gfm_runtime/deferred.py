@@ -270,7 +270,7 @@ _typing = cache(_Typing)
 
 
 @contextmanager
-def _garbage_kept() -> Iterator[None]:
+def garbage_kept() -> Iterator[None]:
     """Collect no garbage meanwhile: numba keeps millions of objects while it compiles, and looking
     through them again and again took a tenth of the time."""
     if not gc.isenabled():
@@ -293,7 +293,7 @@ class Deferring(Compiler):
 
     def compile_extra(self, func: Any) -> Any:
         """As numba asks for it; those of callees are compiled in the course of it."""
-        with _garbage_kept():
+        with garbage_kept():
             return super().compile_extra(func)
 
     def define_pipelines(self) -> Any:

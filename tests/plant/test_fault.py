@@ -102,7 +102,7 @@ def test_fault_on_a_tripped_plant_and_a_new_line(rest):
 )
 def test_impossible_faults_change_nothing(rest, at, R, duration, message):
     plant = rest()
-    before = plant.plant.copy()
+    before = [r.tobytes() for r in plant.plant.memory]
     with pytest.raises(ValueError, match=message):
         fault(plant.plant, at, R, duration)
-    assert [r.tobytes() for r in plant.plant.memory] == [r.tobytes() for r in before.memory]
+    assert [r.tobytes() for r in plant.plant.memory] == before

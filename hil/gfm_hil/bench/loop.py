@@ -317,6 +317,7 @@ class InprocLoop:
     def __init__(self, scenario: str, law: str, ticks: int, folder: Path) -> None:
         b = make_bench(load_scenario(scenario, law=law, in_process=True))
         b.controller.set("P_ref", 0.8)
+        b.controller.find_inner_tick()
         self.bench, self.ticks, self.T_s = b, ticks, b.scenario.T_s
         plant, controller = (
             RolePart.create(folder, role, ticks).signals for role in ("plant", "controller")

@@ -27,6 +27,8 @@ from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
 from gfm_plant.ways import find_ways
 from gfm_runtime.compiled import wheel_code
+from gfm_runtime.deferred import garbage_kept
+from gfm_runtime.inner_tick import inner_tick
 
 
 class Set(NamedTuple):
@@ -60,14 +62,15 @@ def compile_sets(sets: Sequence[Set], notice: Callable[[str], None]) -> int:
         How many sets those were.
     """
     compiled = 0
-    for k, one in enumerate(sets, 1):
-        text = f"compiling {one.name} ({k} of {len(sets)}, once a machine) …"
-        if not compiled and (why := wheel_code().unfit):
-            text = f"the code in this wheel is not used ({why})\n{text}"
-        listener = _Listener(lambda text=text: notice(text))  # type: ignore[misc]
-        with event.install_listener("numba:compile", listener):
-            one.compile()
-        compiled += listener.heard
+    with garbage_kept():
+        for k, one in enumerate(sets, 1):
+            text = f"compiling {one.name} ({k} of {len(sets)}, once a machine) …"
+            if not compiled and (why := wheel_code().unfit):
+                text = f"the code in this wheel is not used ({why})\n{text}"
+            listener = _Listener(lambda text=text: notice(text))  # type: ignore[misc]
+            with event.install_listener("numba:compile", listener):
+                one.compile()
+            compiled += listener.heard
     return compiled
 
 
@@ -87,11 +90,8 @@ def compiled_benches(
     found: list[Bench] = []
     first, second = _shares(scenario, roles, lambda: found)
     with Beside(scenario, [*roles], notice) as beside:
-        sets = [Set(_START, lambda: found.extend(make_benches(scenario)))]
-        if "plant" in roles:
-            sets.append(Set(_PERIOD, lambda: _find_ways(found[0])))
-        sets += [*first, Set("the loops", beside.wait), *second]
-        compile_sets(sets, beside.begin)
+        start = Set(_START, lambda: found.extend(make_benches(scenario)))
+        compile_sets([start, *first, Set("the rest", beside.wait), *second], beside.begin)
     return found
 
 
@@ -100,8 +100,7 @@ def compile_share(scenario: Scenario, roles: Iterable[Role]) -> None:
     and errors as of ``compiled_benches``."""
     benches = _unstarted(scenario)
     _, second = _shares(scenario, roles, lambda: benches)
-    for one in second:
-        one.compile()
+    compile_sets(second, lambda _: None)
 
 
 def _unstarted(scenario: Scenario) -> list[Bench]:
@@ -113,15 +112,13 @@ def _unstarted(scenario: Scenario) -> list[Bench]:
 def _shares(
     scenario: Scenario, roles: Iterable[Role], found: Callable[[], list[Bench]]
 ) -> tuple[list[Set], list[Set]]:
-    """Split what the ticks of a scenario call between two processes. The first one also compiles
-    the operating point and the plant's period."""
-    first, second = list[Set](), list[Set]()
+    """Split what the ticks of a scenario call between two processes, so that they take as long.
+    The first one also compiles the operating point."""
+    period = [Set(_PERIOD, lambda: _find_ways(found()[0]))] if "plant" in roles else []
     if scenario.in_process:
-        second.append(_both(found))
+        first, second = [_both(found)], period
     else:
-        second += [_role(role, found) for role in sorted(roles)]
-        if len(second) > 1:
-            first.append(second.pop())  # that of the plant
+        first, second = period, [_role(role, found) for role in sorted(roles)]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
         second += [_link(link.type, link.options, scenario.carries) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
@@ -153,6 +150,10 @@ def everything() -> list[Set]:
     def found() -> list[Bench]:
         return _unstarted(Scenario(title="warm-up", duration=1.0))
 
+    def with_inner() -> None:
+        controller = found()[0].controller
+        inner_tick(controller.laws.dtype, controller.states.dtype)
+
     def between(large: int) -> None:
         plant = found()[0].plant.copy()
         for name in ("n_dynamic", "sparse", "connections"):
@@ -169,6 +170,7 @@ def everything() -> list[Set]:
         Set("the operating point of an inner stage", lambda: make_bench(limited), (_START,)),
         Set("the plant between two instants", lambda: between(0), (_PERIOD,)),
         Set("the components of networks", lambda: between(1), (_PERIOD,)),
+        Set("laws with an inner stage", with_inner),
         Set(_EVENTS, lambda: _find_event_ways(found()[0])),
         _both(found),
     ]

@@ -1,8 +1,7 @@
-"""A second process that compiles a scenario's loops while the first compiles what starts a run.
+"""A second process that compiles a share of what a run calls, while the first compiles the rest.
 
-The operating point takes as long to compile as the loops do, and the loops can do without it:
-they are compiled for the types of a bench's records. The first process then loads what the second
-has put into numba's cache, and compiles what it has not.
+The share is compiled for the types of a bench's records, without its operating point. The first
+process then loads what the second has put into numba's cache, and compiles what it has not.
 """
 
 import os
@@ -22,7 +21,7 @@ class Beside:
 
     Args:
         scenario: checked.
-        roles: the sides whose loops it compiles.
+        roles: the sides that it compiles for.
         notice: told when it starts, and when this process has to wait for it.
     """
 
@@ -56,7 +55,7 @@ class Beside:
     def wait(self) -> None:
         """Wait until it has done its work."""
         if self._process is not None and self._process.poll() is None:
-            self._notice("compiling the loops, in a second process (once a machine) …")
+            self._notice("compiling the rest, in a second process (once a machine) …")
             self._process.wait()
 
 

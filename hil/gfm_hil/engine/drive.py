@@ -346,6 +346,8 @@ def _ticks_of(bench: Bench) -> Callable[..., ReturnReason]:
 
 def _records(bench: Bench) -> ControllerRecords:
     c = bench.controller
+    if bench.external is None:
+        c.find_inner_tick()
     return ControllerRecords(c.ctl, c.laws, c.states, c.est)
 
 

@@ -33,8 +33,8 @@ from gfm_runtime.controller import (
     measured,
     move_references,
     next_law,
-    sense,
 )
+from gfm_runtime.inner_tick import sense
 from gfm_runtime.signals import NY, NY_INNER
 from gfm_runtime.states import READY, RUNNING
 

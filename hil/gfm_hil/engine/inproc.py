@@ -43,6 +43,8 @@ class Stack(NamedTuple):
 
 def stack(benches: Sequence[Bench]) -> Stack:
     """The records of all benches in common arrays, of which each bench then has its part."""
+    for b in benches:
+        b.controller.find_inner_tick()
     if len(benches) == 1:
         (b,) = benches
         c = b.controller
@@ -337,4 +339,4 @@ def rows(
 def compile_loop(benches: Sequence[Bench]) -> None:
     """Compile (or load from cache) the loop without running a tick."""
     room = rows(len(benches), 1, benches[0].inner, benches[0].options)
-    run_ticks(benches[0].plant.records, stack(benches), *room, 0, 0)
+    run_ticks(benches[0].plant.typed, stack(benches), *room, 0, 0)

@@ -90,12 +90,14 @@ class Bench:
         Raises ValueError: it is not in SAFE.
         """
         c = self.controller
-        state, changes = int(c.ctl["state"][0]), int(c.ctl["changes"][0])
+        state, changes, inner_tick = (
+            int(c.ctl[name][0]) for name in ("state", "changes", "inner_tick")
+        )
         if state != SAFE:
             raise ValueError(f"reset: the controller is {STATES[state]}, not SAFE")
         c.ctl[:], c.laws[:], c.states[:], c.est[:] = self._controller
         c.asked, c.gains = self._asked, {}
-        c.ctl["state"], c.ctl["changes"] = READY, changes
+        c.ctl["state"], c.ctl["changes"], c.ctl["inner_tick"] = READY, changes, inner_tick
         c.ctl["joins"] = self.plant.net["joins"]
         c.ctl["aligns"] = self.inner == COUNTS
         self.u[:] = _commands(self.start, self.inner)

@@ -12,8 +12,8 @@ from llvmlite import binding, ir
 from numba import types
 from numba.core import config
 
-from gfm_hil.realtime.atomics import intrinsic, load32, load64
-from gfm_runtime.compiled import inlined
+from gfm_hil.realtime.atomics import load32, load64
+from gfm_runtime.compiled import inlined, intrinsic
 
 _AT_ONCE = 16  # bytes
 _ONES = np.uint32(0xFFFFFFFF)

@@ -10,7 +10,7 @@ from numba.core.cgutils import pack_array, raw_memcpy
 from gfm_plant.atomics import load_acquire as load_acquire
 from gfm_plant.atomics import pause as pause
 from gfm_plant.atomics import store_release as store_release
-from gfm_plant.layout import intrinsic as intrinsic
+from gfm_runtime.compiled import intrinsic
 
 _WORD = ir.IntType(64)
 _BYTES = ir.IntType(8).as_pointer()

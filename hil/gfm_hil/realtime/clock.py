@@ -8,10 +8,9 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from gfm_hil.realtime.atomics import intrinsic
 from gfm_hil.realtime.atomics import pause as pause
 from gfm_plant.atomics import yield_processor as yield_processor
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, intrinsic
 
 _MONOTONIC, _ABSTIME = 1, 1  # CLOCK_MONOTONIC, TIMER_ABSTIME of time.h on Linux
 _NS = 1_000_000_000

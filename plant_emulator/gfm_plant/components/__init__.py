@@ -8,7 +8,6 @@ from typing import Any, get_args
 
 from pydantic import Field
 
-from gfm_plant.by_address import call_at
 from gfm_plant.components.bergeron_line import BergeronLine
 from gfm_plant.components.capacitor_bank import CapacitorBank
 from gfm_plant.components.constant_power import ConstantPowerLoad
@@ -22,6 +21,7 @@ from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
 from gfm_plant.parameters import Options
+from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import compiled, inlined, inlined_as
 
 
@@ -146,4 +146,4 @@ def components_act(plant: Any, act: int, c: int) -> None:
 def call_components(plant: Any, act: int, c: int) -> None:
     """Call ``components_act`` by its address, of a plant that has components."""
     if plant.net[0].n_dynamic > 0:
-        call_at(plant.net[0].components, plant, act, c)
+        call_at(plant.net[0].components, plant.net[0].records, act, c)

@@ -114,8 +114,8 @@ def test_the_first_run_in_memory_says_what_it_compiles_and_a_second_process_help
         ).stderr
         for _ in range(2)
     )  # fmt: skip
-    assert "the operating point" in first and "the loop of both sides" not in first
-    assert list(tmp_path.rglob("*_run_ticks*.nbc"))
+    assert "the operating point" in first and "the plant's period" not in first
+    assert list(tmp_path.rglob("*whole_period*.nbc"))
     assert second == ""
 
 

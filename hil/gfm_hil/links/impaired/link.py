@@ -23,7 +23,7 @@ from gfm_hil.links.impaired.stage import (
 )
 from gfm_hil.links.port import Port, port_function
 from gfm_hil.links.pump import ported
-from gfm_hil.realtime.atomics import intrinsic
+from gfm_runtime.compiled import intrinsic
 
 
 class ImpairedLink:

@@ -13,8 +13,7 @@ from llvmlite import ir
 from numba import njit, types
 
 from gfm_hil.links.port import Port, free_port_function
-from gfm_hil.realtime.atomics import intrinsic
-from gfm_runtime.compiled import FREE
+from gfm_runtime.compiled import FREE, intrinsic
 
 #: elements of a port's handle: zmq_send, zmq_recv and the socket, as addresses; 0 once closed
 _SEND, _RECEIVE, _SOCKET = range(3)
