@@ -69,13 +69,9 @@ def _linearise(
     z: NDArray[np.float64], d: NDArray[np.complex128], par: Record, P: float, V: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what must vanish at z = (x, u), (11,): f and the misses of p, V, v_dc; and d/dz."""
-    residual = np.empty(N_X + N_U)  # the same in every column, as a nudge of 1e-30 is nothing
-    jacobian = np.empty((N_X + N_U, N_X + N_U))
-    for j in range(N_X + N_U):
-        nudged = z.astype(complex)
-        nudged[j] += _STEP * 1j
-        x, u = nudged[:N_X], nudged[N_X:]
-        y = g(x, u)
-        value = np.concatenate([f(x, u, d, par), [y[1] - P, y[4] - V, y[0] - 1.0]])
-        residual, jacobian[:, j] = value.real, value.imag / _STEP
-    return residual, jacobian
+    nudged = z[:, None] + 1j * _STEP * np.eye(N_X + N_U)
+    x, u = nudged[:N_X], nudged[N_X:]
+    y = g(x, u)
+    value = np.concatenate([f(x, u, d, par), [y[1] - P, y[4] - V, y[0] - 1.0]])
+    # the values are the same in every column, as a nudge of 1e-30 is nothing
+    return value[:, 0].real, value.imag / _STEP

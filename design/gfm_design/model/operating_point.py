@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gfm_plant import Network, NoEquilibrium, plant_equilibrium
 from gfm_plant.circuit import GROUND
-from gfm_plant.model import DELTA, N_X, V_DC, f, g
+from gfm_plant.model import DELTA, N_X, V_DC, compiled_f, g
 from gfm_plant.names import SENSED
 from gfm_plant.records import Record
 from gfm_plant.wiring import Wiring
@@ -328,7 +328,7 @@ class _ConverterEquilibrium:
         x, u, y, x_law = self._unpack(z, omega_g)
         x[DELTA] -= theta
         u_law, x_next = self._law(x_law, ref, y)
-        dx = f(x, u, np.array([omega_g, V_g]), self.par)
+        dx = compiled_f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = dx[self._steady]
         u[2] = abs(_internal(law, x, u, self._command(x, u), limited=False))

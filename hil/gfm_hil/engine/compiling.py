@@ -5,7 +5,7 @@ run of an installation on a machine compiles for minutes, and those after it onl
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ from gfm_hil.realtime import prevent_idle
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
+from gfm_plant.names import WAYS
 from gfm_plant.ways import find_ways
 from gfm_runtime.compiled import wheel_code
 from gfm_runtime.deferred import garbage_kept
@@ -116,7 +117,8 @@ def _shares(
     The first one also compiles the operating point."""
     period = [Set(_PERIOD, lambda: _find_ways(found()[0]))] if "plant" in roles else []
     if scenario.in_process:
-        first, second = [_both(found)], period
+        sensors = Set("the sensors", lambda: _find_ways(found()[0], ("sample",)))
+        first, second = [_both(found), sensors], period
     else:
         first, second = period, [_role(role, found) for role in sorted(roles)]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
@@ -132,8 +134,8 @@ def _shares(
     return first, second
 
 
-def _find_ways(bench: Bench) -> None:
-    find_ways(bench.plant.typed, bench.plant.wiring)
+def _find_ways(bench: Bench, names: Collection[str] = WAYS) -> None:
+    find_ways(bench.plant.typed, bench.plant.wiring, names)
 
 
 def _find_event_ways(bench: Bench) -> None:
