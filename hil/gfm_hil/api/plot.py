@@ -238,7 +238,8 @@ def stability_map(stability: StabilityMap) -> Axes:
     axes.set_xscale("log" if stability.values[0] > 0.0 else "linear")
     axes.set_yscale("log")
     axes.set(xlabel=stability.gain, ylabel="short-circuit ratio")
-    axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
+    if not look().paper:
+        axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
     if np.isnan(stability.sigma).any():
         axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
     return axes
@@ -397,8 +398,9 @@ def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
     for axes, label in zip(panels, labels, strict=True):
         dress(axes)
         axes.set_ylabel(label, fontsize=rc("axes.labelsize", 9.5))
-    size = rc("axes.titlesize", 9.5)
-    panels[0].set_title(title, loc="left", fontsize=size, color="#222222", wrap=True)
+    if not look().paper:  # which has captions
+        size = rc("axes.titlesize", 9.5)
+        panels[0].set_title(title, loc="left", fontsize=size, color="#222222", wrap=True)
     panels[-1].set_xlabel("frequency [Hz]", fontsize=rc("axes.labelsize", 9.5))
     if look().paper and not look().ax:  # its labels may be wider than the panels
         both = [one.get_legend_handles_labels() for one in panels]

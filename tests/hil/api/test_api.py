@@ -94,6 +94,8 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
         hz, gain = curve.get_data()
         expected = loop.loop_gain(curve.get_label(), 2 * np.pi * hz)
         assert np.allclose(gain, 20 * np.log10(np.abs(expected)))
+    assert plot.bode(loop, "E_u")[0].get_title(loc="left")
+    assert plot.bode(loop, "E_u", style="paper")[0].get_title(loc="left") == ""
     hz, phase = plot.bode(loop, "E_u")[1].lines[0].get_data()
     gain_margin, phase_margin = (axes.lines[1] for axes in plot.bode(loop, "E_u"))
     f, there = phase_margin.get_data()
