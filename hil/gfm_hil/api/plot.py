@@ -81,6 +81,11 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     return _finish([gain, phase], f"{_title(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
 
 
+def _dress(axes: Axes, title: str) -> None:
+    """``dress`` for a figure of one panel: without its title in a paper, which has captions."""
+    dress(axes, "" if look().paper else title)
+
+
 def _title(loop: ClosedLoop) -> str:
     """The law, and the scenario if it is known."""
     return f"{title_of(loop)}, {loop.where}" if loop.where else title_of(loop)
@@ -196,7 +201,7 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    dress(axes, title)
+    _dress(axes, title)
     if isinstance(loop, NetworkLoop):
         axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     return axes
@@ -218,12 +223,14 @@ def root_locus(sweep: GainSweep) -> Axes:
         near = sweep.poles[int(np.argmin(np.abs(sweep.values - sweep.own)))]
         label = f"near the law's {sweep.own:g}"
         axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
-        axes.legend(fontsize=rc("legend.fontsize", 8), loc="upper left")
+        place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1)} if look().paper else {}
+        axes.legend(fontsize=rc("legend.fontsize", 8), **({"loc": "upper left"} | place))
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
+    axes.autoscale_view()  # of these scales
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    dress(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
+    _dress(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
     return axes
 
 
@@ -238,7 +245,7 @@ def stability_map(stability: StabilityMap) -> Axes:
     axes.set_xscale("log" if stability.values[0] > 0.0 else "linear")
     axes.set_yscale("log")
     axes.set(xlabel=stability.gain, ylabel="short-circuit ratio")
-    if not look().paper:
+    if not look().paper:  # which has captions
         axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
     if np.isnan(stability.sigma).any():
         axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
@@ -266,7 +273,7 @@ def certificate(found: CertifiedLaws) -> Axes:
     if found.certificate.void:
         axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
     grids = found.grids
-    dress(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
+    _dress(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
     return axes
 
 
@@ -287,7 +294,7 @@ def clearing_times(times: Sequence[ClearingTime], scr: Sequence[float]) -> Axes:
             axes.plot(x[some], y[some], mark, color=COLOURS[0], ms=5, label=name)
     axes.set(xlabel="short-circuit ratio", ylabel="clearing time [s]", ylim=(0.0, None))
     axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
-    dress(axes, f"{times[0].law}: {times[0].title}")
+    _dress(axes, f"{times[0].law}: {times[0].title}")
     return axes
 
 

@@ -741,7 +741,7 @@ def complex_plane(
     axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
     axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
     axes.set(xlabel=f"Re {of}".rstrip(), ylabel=f"Im {of}".rstrip())
-    dress(axes, title)
+    dress(axes, "" if look().paper else title)
     axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="upper right")
     return axes
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
@@ -107,6 +108,8 @@ def with_look(draw: Callable[..., Any]) -> Callable[..., Any]:
         if style not in STYLES:
             raise UserError(f"style = {style!r}: {allowed(style, STYLES)}")
         theirs = () if ax is None else tuple(np.ravel(np.asarray(ax, dtype=object)))
+        if not all(hasattr(one, "plot") for one in theirs):
+            raise UserError(f"ax = {ax!r}: must be axes of matplotlib")
         asked = Look(
             theirs, _pair("xlim", xlim, "from < to", lambda a, b: a < b),
             _pair("size", size, "width and height in inches, above 0", lambda a, b: min(a, b) > 0),
@@ -172,7 +175,8 @@ def save(axes: Axes | Sequence[Axes], path: str | Path, *formats: str) -> list[P
         path: of the files without suffix, or of one with.
         formats: of ``pdf``, ``svg``, ``pgf``, ``png`` and ``csv``; the suffix of ``path`` if none
             is given, or else pdf, svg and csv. The CSV has a row a point: panel, curve, x, y, as
-            drawn, so that a curve of many ticks has the least and the largest value of each pixel.
+            drawn, so that a curve of many ticks has the least and the largest value of each pixel;
+            and the value, where colours show one.
 
     Returns:
         The files.
@@ -206,17 +210,52 @@ def save(axes: Axes | Sequence[Axes], path: str | Path, *formats: str) -> list[P
 def _write_csv(file: Path, axes: Sequence[Axes]) -> None:
     with replacing(file) as part, part.open("w", encoding="utf-8", newline="") as text:
         writer = csv.writer(text)
-        writer.writerow(("panel", "curve", "x", "y"))
-        for k, panel in enumerate(axes):
-            name = panel.get_ylabel() or panel.get_title(loc="left") or str(k + 1)
-            for line in panel.lines:
-                label = str(line.get_label())
-                label = "" if label.startswith("_") else label  # matplotlib's own numbers
-                if line.get_transform() != panel.transData:  # a line across the panel
-                    continue
-                points: Any = line.get_data()
-                for x, y in zip(*points, strict=True):
-                    writer.writerow((name, label, f"{x:.9g}", f"{y:.9g}"))
+        rows = [
+            (panel.get_ylabel() or panel.get_title(loc="left") or str(k + 1), label, columns)
+            for k, panel in enumerate(axes)
+            for label, columns in _points(panel)
+        ]
+        coloured = any(len(columns) == 3 for *_, columns in rows)
+        writer.writerow(("panel", "curve", "x", "y", *["value"] * coloured))
+        for name, label, columns in rows:
+            label = "" if label.startswith("_") else label  # matplotlib's own numbers
+            no_value = [""] * (coloured and len(columns) == 2)
+            for point in zip(*columns, strict=True):
+                writer.writerow((name, label, *(f"{x:.9g}" for x in point), *no_value))
+
+
+def _points(panel: Axes) -> Iterator[tuple[str, Sequence[Any]]]:
+    """The labels of a panel's curves, and their columns: x and y, and the value that the colour of
+    a point or of a cell shows."""
+    from matplotlib.collections import PathCollection, QuadMesh
+    from matplotlib.patches import StepPatch
+
+    for line in panel.lines:
+        if line.get_transform() == panel.transData:  # else it goes across the panel
+            points: Any = line.get_data()
+            yield str(line.get_label()), points
+    for drawn in panel.collections:
+        values: NDArray[np.float64] = np.ma.filled(
+            np.ma.asarray(drawn.get_array(), float), np.nan
+        ).ravel()
+        if isinstance(drawn, QuadMesh):
+            edges = np.asarray(drawn.get_coordinates())
+            x, y = np.meshgrid(_middles(edges[0, :, 0]), _middles(edges[:, 0, 1]))
+            yield str(drawn.get_label()), (x.ravel(), y.ravel(), values)
+        elif isinstance(drawn, PathCollection):
+            yield str(drawn.get_label()), (*np.asarray(drawn.get_offsets()).T, values)
+    for patch in panel.patches:
+        if isinstance(patch, StepPatch):
+            values, edges, _ = patch.get_data()
+            yield str(patch.get_label()), (edges[:-1], values)
+
+
+def _middles(edges: NDArray[np.float64]) -> list[float]:
+    """The points between which matplotlib has put the edges of cells, halfway."""
+    found = [float(edges[0] + edges[1]) / 2]
+    for edge in edges[1:-1]:
+        found.append(float(2 * edge) - found[-1])
+    return found
 
 
 def figure_of(axes: Sequence[Axes]) -> Figure:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import AsinhNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -25,17 +26,16 @@ def draw_sigma(
     a line; grey where there is no operating point."""
     axes.set_facecolor(_NOWHERE)
     # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
-    shown = np.arcsinh(sigma) / np.arcsinh(_SPAN)
-    mesh = axes.pcolormesh(x, y, shown, cmap="RdBu_r", vmin=-1, vmax=1, shading="nearest")
-    finite = np.nan_to_num(shown, nan=1.0)
+    decades = AsinhNorm(1.0, -_SPAN, _SPAN)
+    mesh = axes.pcolormesh(x, y, sigma, cmap="RdBu_r", norm=decades, shading="nearest")
+    finite = np.nan_to_num(np.arcsinh(sigma), nan=1.0)
     if finite.min() < 0.0 < finite.max():
         axes.contour(x, y, finite, levels=[0.0], colors="k", linewidths=1.2)
-    ticks = np.array([-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0])
+    ticks = [-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0]
     figure = axes.get_figure()
     assert figure is not None
-    bar = figure.colorbar(mesh, ax=axes, ticks=list(np.arcsinh(ticks) / np.arcsinh(_SPAN)))
-    bar.ax.set_yticklabels([f"{t:g}" for t in ticks])
-    bar.set_label("largest σ [1/s]")
+    bar = figure.colorbar(mesh, ax=axes, ticks=ticks, format="%g", label="largest σ [1/s]")
+    bar.minorticks_off()
 
 
 def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:

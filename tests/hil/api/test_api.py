@@ -179,6 +179,7 @@ def test_a_figure_follows_what_its_caller_has_set(tmp_path):
         ({"xlim": (2, 1)}, r"xlim = \(2, 1\): must be two numbers, from < to"),
         ({"size": 3.5}, "size = 3.5: must be two numbers"),
         ({"ax": axes[0]}, "ax: the plot has 6 panels, and ax is 1"),
+        ({"ax": 3}, "ax = 3: must be axes of matplotlib"),
         ({"signals": ["pp"]}, "signal = 'pp': was not recorded"),
     ):
         with pytest.raises(gfmhil.UserError, match=said):

@@ -1,5 +1,6 @@
 """gfmhil design sweep and map: where a loop is stable, and what is refused."""
 
+import csv
 import json
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 import gfmhil
 from gfm_hil.cli.main import main
+from gfmhil import plot
 from gfmhil.design import loop_margins, stability_map, sweep
 
 
@@ -34,6 +36,26 @@ def test_a_map_has_a_sweep_in_each_row():
     assert found.scr == pytest.approx([2.0, 2.0 * 4 ** (1 / 3), 2.0 * 4 ** (2 / 3), 8.0])
     assert (found.sigma[:, 0] < 0.0).all()
     assert (found.sigma[:, -1] > 0.0).all()
+
+
+def test_a_figure_s_csv_has_what_its_colours_show(tmp_path):
+    found = stability_map("mimo-gfm", "k_34", 1.0, 50.0, scr=(2.0, 8.0), points=4)
+    locus = sweep("mimo-gfm", "k_34", 1.0, 50.0, points=4)
+    poles = [
+        [s.real, s.imag / (2 * np.pi), value]
+        for value, some in zip(locus.values, locus.poles, strict=True)
+        for s in some
+    ]
+    x, y = np.meshgrid(found.values, found.scr)
+    cells = np.transpose([x.ravel(), y.ravel(), found.sigma.ravel()])
+    for figure, points in (
+        (plot.stability_map(found), cells), (plot.root_locus(locus, style="paper"), poles)
+    ):  # fmt: skip
+        (file,) = plot.save(figure, tmp_path / "figure.csv")
+        with file.open(encoding="utf-8", newline="") as text:
+            rows = [row for row in csv.DictReader(text) if row["value"]]
+        told = [[float(row[name]) for name in ("x", "y", "value")] for row in rows]
+        np.testing.assert_allclose(told, points, rtol=1e-8, atol=1e-12)
 
 
 def test_both_commands_print_and_draw(capsys, tmp_path):
