@@ -194,6 +194,10 @@ def _wrap_lines(text: str, room: float) -> str:
     return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in unbroken)
 
 
+def _rating(S_n: float) -> str:
+    return f"{S_n / 1e6:g} MVA" if S_n >= 1e6 else f"{S_n / 1e3:g} kVA"
+
+
 def _in_words(
     axes: Axes, x: float, y: float, width: float, name: str, plant: Plant, law: str
 ) -> None:
@@ -202,7 +206,7 @@ def _in_words(
     pu = parameters.pu(plant.real_factors())
     _wire(axes, (x, y), (x + 0.35, y))
     _bridge(axes, x + 0.35, y)
-    elements = [f"{parameters.S_n / 1e3:g} kVA"]
+    elements = [_rating(parameters.S_n)]
     elements += [f"$L_f$ {pu['L_f']:.3g}", f"$C_f$ {pu['C_f']:.3g}"]
     if plant.lcl is not None:
         elements.append(f"$L_2$ {plant.lcl.L:.3g}")
@@ -315,7 +319,7 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
     _capacitor(axes, _TERMINAL, y)
     axes.plot([_TERMINAL], [y], "o", ms=3.5, color=_INK)
     title = f"{name}: {law}" if name else law
-    axes.text(0.0, y + 0.47, f"{title}, {parameters.S_n / 1e3:g} kVA", fontsize=8.5, color=_INK)
+    axes.text(0.0, y + 0.47, f"{title}, {_rating(parameters.S_n)}", fontsize=8.5, color=_INK)
     second, line = plant.lcl, f"$L_g$ {pu['L_g']:.3g}\n$R_g$ {pu['R_g']:.2g}"
     if second is not None:
         own = f"$L_2$ {second.L:.3g}\n$R_2$ {second.R:.2g}"

@@ -121,6 +121,10 @@ def _map(options: argparse.Namespace) -> int:
     console = terminal(highlight=False)
     console.print(f"[bold]{found.law}[/] · {scenario.title}")
     console.print(_map_table(found))
+    console.print(
+        f"{min(_ROWS, len(found.scr))} of {len(found.scr)} grids, for each of which "
+        f"{len(found.values)} values were tried"
+    )
     if options.out:
         console.print(f"figure: {options.out}", soft_wrap=True)
     return 0
@@ -134,5 +138,5 @@ def _map_table(found: StabilityMap) -> Table:
         share = f"{100 * len(stable) / len(found.values):.0f} %"
         ends = [float(stable.min()), float(stable.max())] if len(stable) else [None, None]
         rows.append([float(found.scr[i]), *ends, share])
-    heads = ["short-circuit ratio", f"least stable {found.gain}", "greatest", "stable values"]
+    heads = ["short-circuit ratio", f"least stable {found.gain} tried", "greatest", "stable values"]
     return Table(heads, rows, text=0)
