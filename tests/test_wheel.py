@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -48,27 +49,61 @@ def test_the_wheel_is_for_one_python_and_machine_and_its_metadata_is_good(built)
     assert not [name for name in names if name.endswith((".so", ".pyc", ".nbi", ".nbc"))]
 
 
-def test_the_sdist_builds_the_wheel_for_every_python(tmp_path):
-    _done(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path)
-    (sdist,) = tmp_path.glob("*.tar.gz")
+@pytest.fixture(scope="module")
+def without_code(tmp_path_factory):
+    """The wheel for every Python, built from the sdist."""
+    folder = tmp_path_factory.mktemp("source")
+    _done(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder)
+    (sdist,) = folder.glob("*.tar.gz")
     _done(sys.executable, "-m", "twine", "check", "--strict", sdist)
     with tarfile.open(sdist) as archive:
-        archive.extractall(tmp_path / "out", filter="data")
-    (source,) = (tmp_path / "out").iterdir()
-    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+        archive.extractall(folder / "out", filter="data")
+    (source,) = (folder / "out").iterdir()
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    assert wheel.name.endswith("-py3-none-any.whl")
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def test_the_sdist_builds_the_wheel_for_every_python(without_code):
+    assert without_code.name.endswith("-py3-none-any.whl")
+
+
+def _installed(python: str | Path, folder: Path, wheel: Path) -> Path:
+    """The Python of a new environment with a wheel and what it needs."""
+    _done(python, "-m", "venv", folder)
+    new = folder / "bin" / "python"
+    lock = ROOT / "requirements" / "container.txt"
+    _done(new, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", lock)
+    _done(new, "-m", "pip", "install", "--quiet", "--no-deps", wheel)
+    _done(new, "-m", "pip", "check")
+    return new
+
+
+def _newest_python() -> str | None:
+    """The newest other Python that pyproject.toml claims and this machine has."""
+    for minor in range(14, sys.version_info.minor, -1):
+        environment = {**os.environ, "PYENV_VERSION": f"3.{minor}"}  # where pyenv has them
+        ask = [f"python3.{minor}", "-c", "import sys; print(sys.executable)"]
+        with suppress(FileNotFoundError, subprocess.CalledProcessError):
+            return subprocess.check_output(ask, env=environment, text=True).strip()
+    return None
+
+
+def test_the_newest_python_runs_it(without_code, tmp_path):
+    newest = _newest_python()
+    if newest is None:
+        pytest.skip("this machine has no newer Python than the tests")
+    python = _installed(newest, tmp_path / "venv", without_code)
+    cache = str(tmp_path / "cache")
+    command = [python, "-P", "-m", "gfm_hil", "run", "pref_step", "--link", "inproc"]
+    said = _done(*command, "-o", tmp_path / "run", NUMBA_CACHE_DIR=cache)
+    assert "completed" in said and "compiling the loop" in said
 
 
 def test_in_a_fresh_environment_the_first_run_compiles_nothing(built, tmp_path):
-    _done(sys.executable, "-m", "venv", tmp_path / "venv")
-    python = tmp_path / "venv" / "bin" / "python"
-    lock = ROOT / "requirements" / "container.txt"
-    _done(python, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", lock)
-    _done(python, "-m", "pip", "install", "--quiet", "--no-deps", built)
-    _done(python, "-m", "pip", "check")
+    python = _installed(sys.executable, tmp_path / "venv", built)
     cache, gfmhil = tmp_path / "cache", [python, "-P", "-m", "gfm_hil"]
     said = _done(*gfmhil, "run", "pref_step", "-o", tmp_path / "run", NUMBA_CACHE_DIR=str(cache))
     assert "completed" in said and "compiling" not in said

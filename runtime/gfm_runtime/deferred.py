@@ -238,7 +238,9 @@ class _Flags(Flags):
 class _Arguments(tuple[Any, ...]):
     """Types of arguments, which numba writes out for each step of a compilation."""
 
-    _written = cached_property(tuple.__repr__)
+    @cached_property
+    def _written(self) -> str:
+        return super().__repr__()
 
     def __repr__(self) -> str:
         return self._written
