@@ -83,6 +83,9 @@ def cell_text(file: LawFile, key: str) -> str:
     return text or "0"
 
 
+_OF_LOOP = {"references", "T_s"}  # what ``Law.closed_loop`` takes that no scenario has
+
+
 @dataclass(frozen=True, repr=False)
 class Law:
     """A grid-forming law, u = u_0 + Phi(s) (Y_ref − y) − Psi(s) y (Fig. 6 of the paper).
@@ -253,7 +256,8 @@ class Law:
                 others keep theirs.
             ideal: the continuous loop, neither sampled nor delayed; not of a network.
             more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
-                instead of those of the scenario.
+                instead of those of the scenario; and keys of the scenario with ``__`` for the dot,
+                as ``run`` takes them, e.g. ``plant__grid__scr=3.0``.
 
         Raises:
             UserError: no such scenario, or there is no operating point.
@@ -263,8 +267,11 @@ class Law:
         from gfm_design.model.closed_loop import ClosedLoop
         from gfm_hil.studies.linear_loop import loop_under
 
-        if isinstance(on, str | Path):
-            on = load_scenario(on)
+        changes = {key: more.pop(key) for key in more.keys() - _OF_LOOP}
+        if isinstance(on, str | Path) or (changes and isinstance(on, Scenario)):
+            on = load_scenario(on, **changes)
+        elif changes:
+            raise UserError(f"{', '.join(changes)}: no scenario that it could change")
         try:
             if not isinstance(on, Scenario):
                 return ClosedLoop.of(self.built(), on, ideal=ideal, **more)

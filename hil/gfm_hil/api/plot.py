@@ -54,8 +54,8 @@ _LEAST = 0.005  # a part below this in every mode is left out
 @with_look
 def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     """Draw gain [dB] and phase [degrees] of L over Hz, see ``ClosedLoop.loop_gain``, with the
-    least margins of each loop: of the phase where the gain crosses 0 dB, of the gain where the
-    phase crosses an odd multiple of 180 degrees.
+    least margins of each loop, if all together are stable: of the phase where the gain crosses
+    0 dB, of the gain where the phase crosses an odd multiple of 180 degrees.
 
     Args:
         at: channels of u or y at which one loop is cut; each command that acts if none is given.
@@ -70,15 +70,18 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
         _curve(gain, hz, dB, k, symbol_of(name))
         _curve(phase, hz, degrees, k, "_")
         margins.append((hz, dB, degrees))
+    stable = loop.sigma() < 0.0
     for k, found in enumerate(margins):
-        _mark_margins(gain, phase, *found, k)
+        if stable:
+            _mark_margins(gain, phase, *found, k)
     if phase.get_legend_handles_labels()[1]:
         phase.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     gain.axhline(0.0, color=GREY, lw=0.8)
     gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
     phase.axhline(-180.0, color=GREY, lw=0.8)
     _tick_degrees(phase)
-    return _finish([gain, phase], f"{_title(loop)}: L, one loop cut", "|L| [dB]", "∠L [°]")
+    cut = "one loop cut" if stable else "one loop cut; the closed loop is unstable"
+    return _finish([gain, phase], f"{_title(loop)}: L, {cut}", "|L| [dB]", "∠L [°]")
 
 
 def _dress(axes: Axes, title: str) -> None:

@@ -56,8 +56,8 @@ def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Clo
 
 
 def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
-    """The first law whose linear loop at the start is unstable, and its fastest growing mode in
-    words; None if there is none.
+    """The first law whose linear loop at the start is unstable, and its modes that grow in words,
+    the fastest first; None if there is none.
 
     Without a network, the laws to which the run changes are checked too; with one, the law is "".
     A law without an operating point is skipped.
@@ -68,13 +68,18 @@ def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
         under = scenario.model_copy(update={"law": law})
         try:
             loop = scenario_loop(under)[0] if alone else network_loop(scenario)
-            worst = max(loop.modes(), key=lambda mode: mode.sigma)
+            grow = [mode for mode in loop.modes() if mode.sigma > _GROWS]
         except (UserError, ValueError, ArithmeticError, ModuleNotFoundError):
             continue
-        if worst.sigma > _GROWS:
-            hz = f"{worst.frequency_hz:.4g} Hz" if worst.frequency_hz else "real"
+        if grow:
+            each = [
+                (f"{mode.frequency_hz:.4g} Hz" if mode.frequency_hz else "real")
+                + f", {mode.sigma:+.3g} 1/s"
+                for mode in sorted(grow, key=lambda mode: -mode.sigma)
+            ]
             of = f" of {title}" if title else ""
-            words = f"the linear loop{of} has an unstable mode: {hz}, {worst.sigma:+.3g} 1/s"
+            modes = "an unstable mode" if len(each) == 1 else f"{len(each)} unstable modes"
+            words = f"the linear loop{of} has {modes}: {'; '.join(each)}"
             return law, words + (_current_loop_too_fast(under) if alone else "")
     return None
 

@@ -18,7 +18,8 @@ from gfmhil import plot
 
 def test_a_run_in_memory_has_the_bits_of_one_in_a_folder(tmp_path, capsys):
     run = gfmhil.run("pref_step", law="vsg-2", duration=2.5)
-    assert capsys.readouterr() == ("", "")
+    out, err = capsys.readouterr()
+    assert out == "" and all("compiling" in line for line in err.splitlines())
     scenario = load_scenario("pref_step", law="vsg-2", duration=2.5, link__type="inproc",
                              mode="lockstep")  # fmt: skip
     other = run_scenario(scenario, tmp_path / "run")
@@ -89,12 +90,21 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
     rig = load_scenario("rig_pref_step")
     assert np.array_equal(loop.A, law.closed_loop(rig).A)
     assert np.array_equal(loop.A, law.closed_loop(rig.plant, references=REFERENCES).A)
+    weak = {"scr": 3.0, "x_over_r": 6.0}
+    changed = law.closed_loop(load_scenario("rig_pref_step", plant__grid=weak))
+    assert np.array_equal(law.closed_loop("rig_pref_step", plant__grid=weak).A, changed.A)
+    with pytest.raises(gfmhil.UserError, match="duration: no scenario that it could change"):
+        law.closed_loop(duration=1.0)
     assert loop.T_s == 1e-4 and law.closed_loop(ideal=True).T_s is None
     for curve in plot.bode(loop, "E_u", "V")[0].lines[:2]:
         hz, gain = curve.get_data()
         expected = loop.loop_gain(curve.get_label(), 2 * np.pi * hz)
         assert np.allclose(gain, 20 * np.log10(np.abs(expected)))
-    assert plot.bode(loop, "E_u")[0].get_title(loc="left")
+    assert "unstable" not in plot.bode(loop, "E_u")[0].get_title(loc="left")
+    grown = gfmhil.Law.load("vsg-2").with_gains(k_34=50.0).closed_loop("pref_step")
+    gain, phase = plot.bode(grown, "E_u")
+    assert gain.get_title(loc="left").endswith("the closed loop is unstable")
+    assert len(phase.lines) == 2  # its curve and -180 degrees: no margin
     assert plot.bode(loop, "E_u", style="paper")[0].get_title(loc="left") == ""
     hz, phase = plot.bode(loop, "E_u")[1].lines[0].get_data()
     gain_margin, phase_margin = (axes.lines[1] for axes in plot.bode(loop, "E_u"))

@@ -84,7 +84,7 @@ def test_drive(page):
     assert "token" not in page.driver.current_url
     moves(page)
 
-    page.write("#set-P_ref", "0.8")
+    page.write("#set-P_ref", "0,8")  # as it is written in half of the world
     page.write("#set-ramp", "0.1")
     page.click("#apply")
     assert "P_ref = 0.8 at tick" in wait_for(lambda: said(page, "Set-points").strip("…"))
@@ -114,6 +114,9 @@ def test_a_refused_command_says_why(page):
     why = "P_ref = 9.0: must lie in [-2, 2] p.u."
     wait_for(lambda: why in said(page, "Set-points"))
     assert why in page.text("#log .refused")
+    page.write("#set-P_ref", "0.1.2")
+    page.click("#apply")
+    wait_for(lambda: "'0.1.2'" in said(page, "Set-points"))
     assert page.text("#now-P_ref") == "0.500"
 
 

@@ -40,11 +40,12 @@ def chosen_law(options: argparse.Namespace) -> LawFile:
     return file.model_copy(update={"inner": named_inner(options.inner)})
 
 
-def problem_title(file: LawFile, on: Scenario | None = None, converter: str | None = None) -> str:
-    """The name of a law, and which problem its gamma is that of if it is not the paper's."""
+def problem_title(file: LawFile, on: Scenario | None = None, *more: Any) -> str:
+    """The name of a law, and which problem its gamma is that of if it is not the paper's; arguments
+    as of ``problem_name``."""
     if on is None and file.inner is None:
         return file.name
-    return f"{file.name}, {design.problem_name(file, on, converter)}"
+    return f"{file.name}, {design.problem_name(file, on, *more)}"
 
 
 def add_judged_on(command: argparse.ArgumentParser) -> None:
@@ -238,14 +239,14 @@ def _tune(options: argparse.Namespace) -> int:
         "seed": found.seed,
     }
     said = _bound(found, result) if options.full_order else ""
+    more = options.converter, options.weights, read_numbers(options.scr, "--scr")
     if options.out:
-        more = options.converter, options.weights, read_numbers(options.scr, "--scr")
         problem = None if on is None else design.problem_name(law.file, on, *more)
         design.write_law(Path(options.out), law.file, named, result, problem=problem)
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(problem_title(law.file, on, options.converter), channels)
+    print_channels(problem_title(law.file, on, *more), channels)
     lines = [
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"

@@ -15,7 +15,6 @@ from gfm_hil.recording.run import bases
 from gfm_hil.scenario import INPROC, Scenario
 from gfm_hil.scenario.events import EVENTS
 from gfm_runtime import LawError, law_file, law_titles
-from gfm_runtime.signals import group
 from gfm_runtime.states import STATES
 
 _EVENTS = 500  # newest events that are sent to pages
@@ -75,7 +74,6 @@ class WatchedRun:
             "states": STATES,
             "labels": self.record.laws,
             "laws": [*law_titles(s.laws()).items()],
-            "limits": {r.name: [r.low, r.high] for r in group("ref")},
             "bases": si_bases(bases(s)),
             "events": {name: kind.model_json_schema() for name, kind in EVENTS.items()},
             "choices": _choices(s),
@@ -90,7 +88,9 @@ class WatchedRun:
             raise UserError("the run is over")
         if self._operator is None:
             if self.record.scenario.link.type == INPROC:
-                raise UserError("a run in one process (link inproc) takes no commands")
+                raise UserError(
+                    "a run in one process (link inproc) takes no commands; start it with --link shm"
+                )
             self._operator = Operator(self.record.folder)
         return self._operator.command(event, by)
 

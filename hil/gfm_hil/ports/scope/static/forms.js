@@ -1,6 +1,6 @@
 // Forms for events of any kind, made from the schemas that check them.
 
-import { make } from "./text.js";
+import { make, number, numberInput } from "./text.js";
 
 // The schema of a value that may be left out, without the alternative null.
 function whole(schema, root) {
@@ -9,8 +9,6 @@ function whole(schema, root) {
   return { ...schema, ...($ref ? root.$defs[$ref.split("/").at(-1)] : found),
     description: schema.description ?? found.description };
 }
-
-const number = (text) => (text.trim() === "" || Number.isNaN(+text) ? text : +text);
 
 // An input for a value: its element, and what it says; undefined: left out.
 function input(id, name, schema, needed, choices, root) {
@@ -28,8 +26,9 @@ function input(id, name, schema, needed, choices, root) {
       selected: word === String(usual) }, word)));
     return { element: list, read: () => (words ? list.value : list.value === "true") };
   }
-  const text = make("input", { id, placeholder: usual ?? (needed ? "" : "–"), autocomplete: "off",
-    ...(type === "number" ? { type: "number", step: "any", inputmode: "decimal" } : { type: "text" }) });
+  const about = { id, placeholder: usual ?? (needed ? "" : "–") };
+  const text = type === "number" ? numberInput(about)
+    : make("input", { ...about, type: "text", autocomplete: "off" });
   const told = { array: (given) => given.split(",").map(number),
     object: (given) => Object.fromEntries(given.split(",").map((part) => {
       const [key, value = ""] = part.split("=");

@@ -1,7 +1,7 @@
 // The knobs: set-points, grid, law, reset. They only send requests; the run decides.
 
 import { fields, fits } from "./forms.js";
-import { make, symbol, value } from "./text.js";
+import { make, number, numberInput, symbol, value } from "./text.js";
 
 const SETPOINTS = [["P_ref", 0.1], ["Q_ref", 0.1], ["V_ref", 0.01]];
 const OWN = new Set(["reference", "law", "reset"]); // with sections of their own
@@ -42,12 +42,12 @@ export class Knobs {
     return answer.ok;
   }
 
-  field(name, { step, unit, initial, min, max }) {
-    const input = make("input", { type: "number", step: "any", inputmode: "decimal", id: `set-${name}`,
-      ...(min === undefined ? {} : { min, max }) });
+  field(name, { step, unit, initial }) {
+    const input = numberInput({ id: `set-${name}` });
     if (initial !== undefined) input.value = initial;
     const by = (sign) => () => {
-      const from = input.value === "" ? this.now[name] ?? 0 : +input.value;
+      const given = number(input.value);
+      const from = typeof given === "number" ? given : this.now[name] ?? 0;
       input.value = +(Math.round(from / step + sign) * step).toFixed(6);
       input.dispatchEvent(new Event("input", { bubbles: true }));
     };
@@ -78,15 +78,13 @@ export class Knobs {
   }
 
   setpoints() {
-    const rows = SETPOINTS.map(([name, step]) => {
-      const [min, max] = this.about.limits[name];
-      return this.row(symbol(name), name, `now-${name}`, { step, unit: "p.u.", min, max });
-    });
-    rows.push(this.row("over", "ramp", "", { step: 0.1, unit: "s", initial: 0, min: 0 }));
+    const rows = SETPOINTS.map(([name, step]) =>
+      this.row(symbol(name), name, `now-${name}`, { step, unit: "p.u." }));
+    rows.push(this.row("over", "ramp", "", { step: 0.1, unit: "s", initial: 0 }));
     const section = this.section("Set-points", this.form("Apply", "apply", rows, async () => {
       const given = SETPOINTS.map(([name]) => name).filter((name) => this.inputs[name].value !== "");
-      const event = { type: "reference", ramp_s: +this.inputs.ramp.value };
-      for (const name of given) event[name] = +this.inputs[name].value;
+      const event = { type: "reference", ramp_s: number(this.inputs.ramp.value) || 0 };
+      for (const name of given) event[name] = number(this.inputs[name].value);
       if (await this.send(section, event)) for (const name of given) this.inputs[name].value = "";
     }));
     return section;

@@ -325,7 +325,7 @@ function permit() {
   if (!knobs) return;
   let text = "";
   if (!look.live) text = "The run is over: look back, play it, measure in it.";
-  else if (!about.commands) text = "A run in one process (link inproc) takes no commands.";
+  else if (!about.commands) text = "A run in one process (link inproc) takes no commands. Start it with --link shm.";
   else if (!control) text = "Looking only. Open the address with the token to control the run.";
   get("permission").textContent = text;
   get("permission").hidden = !text;

@@ -23,6 +23,20 @@ export function seconds(t, step) {
   return (milli ? t * 1e3 : t).toFixed(digits).replace("-", "−") + (milli ? " ms" : " s");
 }
 
+// The number that an operator has typed, with a decimal point or comma; else the text, for the run
+// to refuse.
+export function number(text) {
+  const plain = text.trim().replace(/^([+-]?\d*),(\d+)$/, "$1.$2");
+  return plain === "" || Number.isNaN(+plain) ? text : +plain;
+}
+
+// A field for a number. Browsers drop the comma from fields of type "number" where the language has
+// a point: 0,1 became 1.
+export function numberInput(attributes) {
+  return make("input", { type: "text", inputmode: "decimal", class: "number", autocomplete: "off",
+    ...attributes });
+}
+
 export function span(s) {
   if (s < 0.9995e-3) return `${+(s * 1e6).toPrecision(3)} µs`;
   return s < 0.9995 ? `${+(s * 1e3).toPrecision(3)} ms` : `${+s.toPrecision(4)} s`;
