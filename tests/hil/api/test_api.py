@@ -91,8 +91,8 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
     assert np.array_equal(loop.A, law.closed_loop(rig).A)
     assert np.array_equal(loop.A, law.closed_loop(rig.plant, references=REFERENCES).A)
     weak = {"scr": 3.0, "x_over_r": 6.0}
-    changed = law.closed_loop(load_scenario("rig_pref_step", plant__grid=weak))
-    assert np.array_equal(law.closed_loop("rig_pref_step", plant__grid=weak).A, changed.A)
+    changed = law.closed_loop(load_scenario("pref_step", plant__grid=weak))
+    assert np.array_equal(law.closed_loop("pref_step", plant__grid=weak).A, changed.A)
     with pytest.raises(gfmhil.UserError, match="duration: no scenario that it could change"):
         law.closed_loop(duration=1.0)
     assert loop.T_s == 1e-4 and law.closed_loop(ideal=True).T_s is None
