@@ -108,7 +108,7 @@ def summarise(
     summary = {
         "title": scenario.title,
         "status": outcome.status,
-        "reason": outcome.reason,
+        "reason": reason_of(outcome, trips),
         "stopped": was_stopped(log),
         "expected": scenario.expect,
         "unmet": unmet(scenario, outcome, log, done),
@@ -192,6 +192,13 @@ def _instructions(counted: ColumnLike) -> dict[str, int]:
     return {
         name: round(found.percentile(q)) for name, q in (("least", 0), ("p50", 50), ("most", 100))
     }
+
+
+def reason_of(outcome: Outcome, trips: Sequence[Mapping[str, Any]]) -> str:
+    """Why a run ended; of one that the operator ended also why it was tripped or safe by then."""
+    if outcome.status != "interrupted" or not trips or trips[-1]["until"] < math.inf:
+        return outcome.reason
+    return f"{outcome.reason}; since {trips[-1]['t']:g} s: {trips[-1]['reason']}"
 
 
 def _trips(

@@ -334,7 +334,7 @@ class Steps:
             self._new_folder(),
             controller_command=setting.controller_command,
         )
-        if run.summary["reason"] == "stopped by the operator":
+        if run.summary["reason"].startswith("stopped by the operator"):
             raise KeyboardInterrupt
         if before is not None and not _same(before.signals, run.signals):
             raise UserError(

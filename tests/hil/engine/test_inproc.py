@@ -1,6 +1,7 @@
 """Both sides in one process: a steady state stays, events have their effects, reasons of ends."""
 
 import math
+import re
 from importlib import resources
 
 import numpy as np
@@ -244,11 +245,20 @@ def test_a_measurement_out_of_range_leads_to_the_safe_state(run):
     assert (done.signals["state"][:-1] == 2).all()
 
 
-def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
+_TRIPS = {
+    "plant": {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}},
+    "events": [at(0.02, type="grid-phase-jump", degrees=20.0)], "after_trip": "wait",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "why"), [({}, ""), (_TRIPS, r"; since 0\.02\d* s: over-current: .*")]
+)
+def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path, content, why):
     from gfm_hil.engine.setup import make_bench
     from gfm_hil.run.run_folder import finish
 
-    scenario = make(duration=2.0)
+    scenario = make(duration=2.0, **content)
     bench = make_bench(scenario)
     parts = {role: RolePart.create(tmp_path, role, scenario.ticks) for role in ROLES}
     timeline = Timeline(bench, tmp_path / "events_both.jsonl", ROLES)
@@ -259,7 +269,7 @@ def test_an_operator_who_stops_the_run_keeps_what_there_is(make, tmp_path):
     (tmp_path / "scenario.toml").write_text("")
     done = finish(scenario, tmp_path, bench.controller.labels, 0.0)
     assert done.summary["status"] == "interrupted"
-    assert done.summary["reason"] == "stopped by the operator"
+    assert re.fullmatch("stopped by the operator" + why, done.summary["reason"])
     assert len(done.signals["t"]) == done.summary["ticks"] == CHUNK
     assert not np.isnan(done.signals["true_p"]).any()
 
