@@ -158,7 +158,8 @@ def _check_rest(s: SampledRecording, event: float, scenario: Scenario, f_n: floa
                 f"{name}: a phase is missing, swapped or reversed: the negative sequence has "
                 f"{back:.3g} p.u. before the event, the positive one {ahead:.3g}"
             )
-    wanted = {"V": (1.0, _NEAR_V, "V_n, unit or scale"), "f": (1.0, _NEAR_F, "unit or f_n"),
+    wanted = {"V": (1.0, _NEAR_V, "V_n, unit or scale"),
+              "f": (1.0, _NEAR_F, f"its unit; 1 p.u. of this test is {f_n:g} Hz"),
               "p": (scenario.references.P_ref, _NEAR_P,
                     "S_n, unit, scale, sign, or the order of the phases of i")}  # fmt: skip
     for name, (want, near, which) in wanted.items():

@@ -274,7 +274,8 @@ class Conformity:
 
 #: of the verdicts that are neither pass nor fail, for who signs
 _MEANINGS: dict[str, str] = {
-    CANNOT: "Cannot judge: there is no run, or it ended before the window did; this is no pass.",
+    CANNOT: "Cannot judge: there is no run, it ended before the window did, or a recording lacks "
+    "the signal; this is no pass.",
     LIMITED: "Limited: the declared droop asks for more than the declared power, so that the "
     "clause judges the limit of power and not the droop.",
     CONSISTENT: "Consistent with itself: the limit is made of what was measured on this converter, "
