@@ -15,7 +15,7 @@ from numba import from_dtype, types
 from numba.core import cgutils
 from numpy.typing import NDArray
 
-from gfm_plant.names import ADDRESSES
+from gfm_plant.names import WAYS
 from gfm_runtime.compiled import intrinsic
 
 MOST_CONTACTS = 8
@@ -232,11 +232,16 @@ def _header(scalars: list[tuple[Any, ...]], arrays: _Arrays) -> np.dtype[np.void
     return np.dtype([*scalars, *counts], align=True)
 
 
+_MOST_WORDS = 7 * 16  # of a tuple of so many arrays
+
 net_dtype = _header(
     [
         ("omega_b", "f8"),  # rad/s
         ("T_s", "f8"),
-        *((name, "i8") for name in ADDRESSES),
+        *((name, "i8") for name in WAYS),
+        # the address of the records themselves, as a tuple of arrays, and that tuple
+        ("records", "i8"),
+        ("in_memory", "i8", (_MOST_WORDS,)),
         ("conversions", "i8"),  # of the A/D at the phases in a period
         ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then

@@ -75,8 +75,5 @@ WAYS = (
 """Functions that a plant calls by addresses in its records, see `ways`; 0: it does not call that
 one."""
 
-ADDRESSES = ("records", *WAYS)
-"""In a plant's records; the first one is that of the records themselves."""
-
 THE_GRID, FIRST_LINE = "\0grid", "\0line"
 """In ``Network.elsewhere``, which no name is: the grid, and the line of the first converter."""

@@ -20,7 +20,7 @@ from gfm_plant.contacts import OWN_PATH, join
 from gfm_plant.emulator import plant_start, reconnect
 from gfm_plant.layout import CHECK_SIDES, Record, head
 from gfm_plant.model import DELTA
-from gfm_plant.names import ADDRESSES
+from gfm_plant.names import WAYS
 from gfm_plant.phases import convert_nothing
 from gfm_plant.port import pack_port
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
@@ -55,15 +55,23 @@ class Network:
     at_least: float = 0.0
     fastest: float = 0.0
 
-    def __post_init__(self) -> None:
-        self._in_memory = in_memory(self.typed)
-        self.net["records"] = self._in_memory.ctypes.data
-
     @property
     def typed(self) -> PlantRecords:
         """The same memory as the compiled functions take it; what they call by address may not be
         known yet."""
-        return PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+        records = PlantRecords(self.par, self.st, head(self.net), head(self.now), self.parts)
+        words = in_memory(records)  # what is called by address takes them from there
+        place = self.net["in_memory"][0, : len(words)]
+        place[:] = words
+        self.net["records"] = place.ctypes.data
+        return records
+
+    def keep_addresses(self, ways: Sequence[int]) -> None:
+        """Put addresses of this process, those of ``WAYS`` and of its own memory, in the place of
+        those that came with another plant's memory."""
+        for name, address in zip(WAYS, ways, strict=True):
+            self.net[name] = address
+        _ = self.typed
 
     @cached_property
     def records(self) -> PlantRecords:
@@ -102,11 +110,10 @@ class Network:
 
     def restore(self, kept: Network) -> None:
         """Take the wiring, the parameters and the instant of a copy."""
-        addresses = [int(self.net[name][0]) for name in ADDRESSES]
+        ways = [int(self.net[name][0]) for name in WAYS]
         for record, old in zip(self.memory, kept.memory, strict=True):
             _bytes(record)[:] = _bytes(old)
-        for name, address in zip(ADDRESSES, addresses, strict=True):
-            self.net[name] = address
+        self.keep_addresses(ways)
         self.wiring, self.fastest = kept.wiring, kept.fastest
 
     def without_current(self, k: int, ticks: int) -> NDArray[np.float64]:

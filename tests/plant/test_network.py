@@ -24,7 +24,7 @@ from gfm_plant.circuit import Shunt
 from gfm_plant.components import Machine
 from gfm_plant.grid import fault, line_breaker, phase_jump
 from gfm_plant.model import DELTA, V_DC
-from gfm_plant.names import ADDRESSES, TRIPS
+from gfm_plant.names import TRIPS, WAYS
 
 pytestmark = pytest.mark.full  # compiles the plant for several converters
 
@@ -275,7 +275,7 @@ def test_what_faults_and_components_call_is_compiled_for_plants_that_have_them()
     assert fed.records.net is not None and go(plain, start(plain, 1.0, 0.1), 1) is None
 
     def called(plant: Network) -> set[str]:
-        return {name for name in ADDRESSES if plant.net[0][name]}
+        return {name for name in WAYS if plant.net[0][name]}
 
     assert called(plain) == {"step", "advance", "sample"}
     assert called(fed) == {"step", "advance", "sample", "components"}

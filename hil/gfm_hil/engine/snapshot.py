@@ -22,7 +22,7 @@ from gfm_hil.core.files import open_file, replacing
 from gfm_hil.core.roles import Role
 from gfm_hil.recording.run import read_scenario
 from gfm_hil.scenario import Scenario
-from gfm_plant.names import ADDRESSES
+from gfm_plant.names import WAYS
 from gfm_runtime.assembly import SPARE
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
             plant, own_net = bench.plant, bench.plant.net.copy()
             for name, record in _memory(bench).items():
                 put_back(where, kept, name, record)
-            for name in ADDRESSES:  # those of this process
-                plant.net[name] = own_net[name]
+            plant.keep_addresses([int(own_net[name][0]) for name in WAYS])
         kept, c = _read(_file(own, "controller"), where), bench.controller
         if (kept.get("laws", np.zeros(0)).tobytes()) != c.laws.tobytes():
             raise UserError(
