@@ -195,7 +195,7 @@ def _instructions(counted: ColumnLike) -> dict[str, int]:
 
 
 def reason_of(outcome: Outcome, trips: Sequence[Mapping[str, Any]]) -> str:
-    """Why a run ended; of one that the operator ended also why it was tripped or safe by then."""
+    """The reason for a run's end; after the operator ended it, also for a trip in force by then."""
     if outcome.status != "interrupted" or not trips or trips[-1]["until"] < math.inf:
         return outcome.reason
     return f"{outcome.reason}; since {trips[-1]['t']:g} s: {trips[-1]['reason']}"
