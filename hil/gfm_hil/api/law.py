@@ -257,7 +257,7 @@ class Law:
             ideal: the continuous loop, neither sampled nor delayed; not of a network.
             more: ``references`` (V_dcref, P_ref, omega_g, Q_ref, V_ref) in p.u. and ``T_s`` in s,
                 instead of those of the scenario; and keys of the scenario with ``__`` for the dot,
-                as ``run`` takes them, e.g. ``plant__grid__scr=3.0``.
+                as ``run`` takes them, e.g. ``plant__grid={"scr": 3.0, "x_over_r": 6.0}``.
 
         Raises:
             UserError: no such scenario, or there is no operating point.
