@@ -24,6 +24,7 @@ from gfm_hil.results.figures import (
     complex_plane,
     draw_panel,
     dress,
+    dress_alone,
     headline,
     pyplot_panels,
     symbol,
@@ -82,11 +83,6 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
     _tick_degrees(phase)
     cut = "one loop cut" if stable else "one loop cut; the closed loop is unstable"
     return _finish([gain, phase], f"{_title(loop)}: L, {cut}", "|L| [dB]", "∠L [°]")
-
-
-def _dress(axes: Axes, title: str) -> None:
-    """``dress`` for a figure of one panel: without its title in a paper, which has captions."""
-    dress(axes, "" if look().paper else title)
 
 
 def _title(loop: ClosedLoop) -> str:
@@ -204,7 +200,7 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    _dress(axes, title)
+    dress_alone(axes, title)
     if isinstance(loop, NetworkLoop):
         axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     return axes
@@ -233,7 +229,7 @@ def root_locus(sweep: GainSweep) -> Axes:
     axes.set_yscale("symlog", linthresh=1.0)
     axes.autoscale_view()  # of these scales
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    _dress(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
+    dress_alone(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
     return axes
 
 
@@ -276,7 +272,7 @@ def certificate(found: CertifiedLaws) -> Axes:
     if found.certificate.void:
         axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
     grids = found.grids
-    _dress(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
+    dress_alone(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
     return axes
 
 
@@ -297,7 +293,7 @@ def clearing_times(times: Sequence[ClearingTime], scr: Sequence[float]) -> Axes:
             axes.plot(x[some], y[some], mark, color=COLOURS[0], ms=5, label=name)
     axes.set(xlabel="short-circuit ratio", ylabel="clearing time [s]", ylim=(0.0, None))
     axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
-    _dress(axes, f"{times[0].law}: {times[0].title}")
+    dress_alone(axes, f"{times[0].law}: {times[0].title}")
     return axes
 
 

@@ -96,6 +96,11 @@ def dress(axes: Axes, title: str = "", label: str = "") -> None:
         axes.spines[side].set_color(GREY)
 
 
+def dress_alone(axes: Axes, title: str) -> None:
+    """``dress`` for a figure of one panel: without its title in a paper, which has captions."""
+    dress(axes, "" if look().paper else title)
+
+
 def draw_panel(
     axes: Axes,
     title: str,
@@ -741,7 +746,7 @@ def complex_plane(
     axes.plot(-1.0, 0.0, "+", color="k", ms=10, label="−1")
     axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
     axes.set(xlabel=f"Re {of}".rstrip(), ylabel=f"Im {of}".rstrip())
-    dress(axes, "" if look().paper else title)
+    dress_alone(axes, title)
     axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="upper right")
     return axes
 
