@@ -224,4 +224,5 @@ class Controller:
         stage, (21,) and (7,) with counts."""
         if not self.ctl["inner_tick"][0]:
             self.find_inner_tick()
+        y = np.ascontiguousarray(y, np.float64)
         control(self.ctl, self.laws, self.states, self.est, y, u)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core.errors import TypingError
 from numpy.typing import NDArray
 
 from gfm_runtime.compiled import FREE, callback, intrinsic
@@ -44,7 +45,12 @@ def in_memory(records: tuple[Any, ...]) -> NDArray[np.int64]:
 
 @intrinsic
 def on_stack(typingctx: Any, records: Any) -> Any:
-    """Copy a tuple of arrays to the stack, inside compiled functions; returns its address."""
+    """Copy a tuple of arrays to the stack, inside compiled functions; returns its address.
+
+    Who is called knows the arrays as ``in_memory`` puts them there: others would be misread.
+    """
+    if any(one.layout != "C" or one.dtype == types.float32 for one in records):
+        raise TypingError("arrays without gaps, of records or of float64")
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         with builder.goto_entry_block():  # numba's own ``alloca_once`` fills it with zeros there

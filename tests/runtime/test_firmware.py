@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from gfm_hil.cli import main
 from gfm_runtime import BuiltLaw, LawError, LawSet, get_law, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.controller import control
 from gfm_runtime.firmware import REALS, SHIPPED, STYLES, check, export, golden, make_modules
 from gfm_runtime.firmware.c_text import choose_parts, literal, plain
 from gfm_runtime.firmware.golden import INIT, RESET, SPOIL, SPOIL_STAGE, SWITCH
@@ -66,7 +65,7 @@ def columns(rows: Any, real: str, *prefixes: str) -> list[Any]:
     ],
 )
 def test_golden_rows_are_what_the_controller_does(name, real):
-    """Rows against ``control``, the tick of the bench: u, states, refusals, changes."""
+    """Rows against the tick of the bench: u, states, refusals, changes."""
     law = (LAWS | STAGED)[name]
     modules = make_modules({name: law}, T_S, real)
     rows = golden(modules, 2 * SHIPPED)
@@ -103,7 +102,7 @@ def test_golden_rows_are_what_the_controller_does(name, real):
             state["offset"][1] = np.nan
         elif op == SPOIL_STAGE:
             state["away"][0] = np.nan
-        control(bench.ctl, bench.laws, bench.states, bench.est, ys[k], u)
+        bench.step(ys[k], u)
         state = bench.states[int(bench.ctl["active"][0])]
         assert (bench.ctl["state"][0] == RUNNING) == (result == OK)
         np.testing.assert_array_equal(us[k], u)

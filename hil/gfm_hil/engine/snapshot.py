@@ -79,6 +79,7 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
             )
         for name in _OWN:
             put_back(where, kept, name, _bytes(getattr(c, name)))
+        c.ctl["inner_tick"] = 0  # an address of the process that kept it
         put_back(where, kept, "told", bench.u)
         request = int(c.ctl["request"][0])
         c.asked = c.names[request if request >= 0 else int(c.ctl["active"][0])]
