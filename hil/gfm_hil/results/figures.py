@@ -350,6 +350,12 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
     from PIL import Image  # matplotlib needs it too
 
     with replacing(path) as part:
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        engine.execute(figure)
+        figure.set_layout_engine(
+            "none"
+        )  # with one, the figure is drawn once more before it is saved
         figure.savefig(part, dpi=110, format="png")
         if few_colours:
             with Image.open(part) as picture:
@@ -357,11 +363,9 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
             few.save(part, "PNG", optimize=True)
 
 
-def draw_run(
-    folder: Path, scenario: Scenario, signals: Columns, timing: Columns, summary: dict[str, Any]
-) -> Picture | None:
-    """Draw one run into its folder: signals.png, waveforms.png and, in real time, timing.png, which
-    is returned; a page shows the others as ``panels_of_run`` and ``panels_of_waves``."""
+def draw_run(folder: Path, scenario: Scenario, signals: Columns, summary: dict[str, Any]) -> None:
+    """Draw one run into signals.png and waveforms.png of its folder; a page shows them as
+    ``panels_of_run`` and ``panels_of_waves``."""
     if "true_p" in signals:
         figure = _figure(SIZE)
         draw_signals(figure, scenario, signals, summary)
@@ -370,9 +374,6 @@ def draw_run(
         figure = _figure(SIZE_WAVES)
         if draw_waveforms(figure, scenario, signals, summary):
             _save(figure, folder / "waveforms.png", few_colours=True)
-    if summary["mode"] == "realtime" and summary["round_trip_us"]:
-        return draw_timing(folder, scenario, timing, summary)
-    return None
 
 
 SIZE = (10.5, 7.4)  # inches, of the six panels of a run
@@ -695,8 +696,7 @@ def draw_comparison(
     """Draw several runs into a file, see ``draw_laws``."""
     figure = _figure(SIZE_LAWS if len(quantities) == 4 else SIZE)
     draw_laws(figure, scenario, runs, events, quantities)
-    with replacing(path) as part:
-        figure.savefig(part, dpi=110)
+    _save(figure, path)
 
 
 # Figures for a notebook, drawn with pyplot.

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gfm_hil.core.beside import beside
 from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.recording.waveforms import NEEDS
 from gfm_hil.results.curves import POINTS, PackedCurves, Panel
@@ -129,23 +130,35 @@ def write_report(run: Run | NetworkRun) -> None:
     network only the figures that they share, and one report of all."""
     # a second of imports, which the sides' processes do without
     from gfm_hil.results.diagram import draw_diagram
-    from gfm_hil.results.figures import SHARED, draw_comparison, draw_run, panels_of_network
+    from gfm_hil.results.figures import (
+        SHARED,
+        draw_comparison,
+        draw_run,
+        draw_timing,
+        panels_of_network,
+    )
 
     folder, scenario = run.folder, run.scenario
     assert folder is not None
     if isinstance(run, NetworkRun):
-        draw_comparison(folder / "converters.png", scenario, run.columns, run.events, SHARED)
+        common = folder / "converters.png"
+        drawn = beside(draw_comparison, common, scenario, run.columns, run.events, SHARED)
         diagram = draw_diagram(folder, scenario, PAGE)
         write_together(
             folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
             [*panels_of_network(run)] if len(run.flows) > 1 else [],
         )  # fmt: skip
+        drawn()
         return
-    timing = draw_run(folder, scenario, run.columns, run.timing, run.summary)
+    drawn = beside(draw_run, folder, scenario, run.columns, run.summary)
+    timing = None
+    if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
+        timing = draw_timing(folder, scenario, run.timing, run.summary)
     chapter = _chapter("", run, POINTS, timing)
     content = {"chapters": [chapter], "shared": [], "kind": ""}
     diagram = draw_diagram(folder, scenario)
     _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
+    drawn()
 
 
 def write_together(

@@ -30,7 +30,7 @@ def test_a_run_of_any_length_is_drawn_without_a_warning(ticks, make, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ResourceWarning)  # from another test
-        draw_run(tmp_path, make(), recording(ticks), {}, {**RUN, "events": events(5)})
+        draw_run(tmp_path, make(), recording(ticks), {**RUN, "events": events(5)})
     (picture,) = tmp_path.iterdir()
     assert picture.name == "signals.png" and picture.stat().st_size > 20_000
 
@@ -42,7 +42,7 @@ def test_a_controller_that_died_leaves_a_gap_not_a_warning(make, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.simplefilter("ignore", ResourceWarning)  # from another test
-        draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
+        draw_run(tmp_path, make(), signals, {**RUN, "events": []})
 
 
 def test_a_trip_is_marked_and_no_curve_hides_another(make):
@@ -58,7 +58,7 @@ def test_a_trip_is_marked_and_no_curve_hides_another(make):
 
 def test_a_controller_alone_has_no_picture_of_the_plant(make, tmp_path):
     signals = {"t": np.zeros(9), "ref_P_ref": np.zeros(9)}
-    draw_run(tmp_path, make(), signals, {}, {**RUN, "events": []})
+    draw_run(tmp_path, make(), signals, {**RUN, "events": []})
     assert not [*tmp_path.iterdir()]
 
 
