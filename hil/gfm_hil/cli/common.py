@@ -69,6 +69,23 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     add_inner(command)
     add_counts(command)
     command.add_argument("--seed", type=int, help="override seed of the sensors' noise")
+    add_settings(command)
+
+
+def add_settings(command: argparse.ArgumentParser) -> None:
+    """The option that overrides any key of a scenario."""
+    command.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", type=_setting,
+        help="override any key of the scenario, e.g. plant.grid.V_g=0.95; may be repeated",
+    )  # fmt: skip
+
+
+def settings(options: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
+    """What --set changes, and what the user calls it, both as for ``load_scenario``."""
+    keys = {name.replace(".", "__"): (name, value) for name, value in options.settings}
+    return {key: value for key, (_, value) in keys.items()}, {
+        key: f"--set {name}" for key, (name, _) in keys.items()
+    }
 
 
 def add_inner(command: argparse.ArgumentParser) -> None:
@@ -108,8 +125,16 @@ def by_converter(option: str, given: Sequence[str], parts: Sequence[str]) -> dic
 
 def link_option(text: str) -> tuple[str, Any]:
     """KEY=VALUE with the value as in TOML, or as text where it is none."""
+    key, value = _setting(text)
+    if not key.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text!r}: must be KEY=VALUE")
+    return key, value
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """``link_option`` of a key that may have dots."""
     key, equals, value = text.partition("=")
-    if not (key.isidentifier() and equals):
+    if not (re.fullmatch(r"[A-Za-z_][\w-]*(\.[A-Za-z_][\w-]*)*", key) and equals):
         raise argparse.ArgumentTypeError(f"{text!r}: must be KEY=VALUE")
     try:
         return key, tomllib.loads(f"x = {value}")["x"]
@@ -174,19 +199,28 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
                 f"--endpoint {name}={ends[name]}: for gfmhil plant; here a scenario names it, as"
                 f" network.converters.{name}.link.endpoint"
             )
-    return load_scenario(
-        options.scenario,
-        OPTIONS | gets | {f"link__options__{key}": f"--option {key}" for key, _ in options.option},
-        converter=options.converter if gets else None,
-        mode=options.mode,
-        link__type=options.link,
-        link__endpoint=None if named and options.converter is not None else ends.get(""),
-        duration=options.duration,
-        seed=options.seed,
-        inner=options.inner,
-        counts=options.counts,
+    own = {
+        "mode": options.mode,
+        "link__type": options.link,
+        "link__endpoint": None if named and options.converter is not None else ends.get(""),
+        "duration": options.duration,
+        "seed": options.seed,
+        "inner": options.inner,
+        "counts": options.counts,
         **{f"link__options__{key}": value for key, value in options.option},
         **more,
+    }
+    changed, names = settings(options)
+    return load_scenario(
+        options.scenario,
+        {
+            **OPTIONS,
+            **gets,
+            **{f"link__options__{key}": f"--option {key}" for key, _ in options.option},
+            **names,
+        },
+        converter=options.converter if gets else None,
+        **own | changed,
     )
 
 

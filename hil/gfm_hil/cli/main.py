@@ -163,7 +163,9 @@ def _unknown(parser: argparse.ArgumentParser, words: list[str]) -> Exception:
         place = "after --scenario" if "--scenario" in known else "before all options"
         close = f"; a law's file comes after --law, a scenario's {place}"
     elif "=" in first and not first.startswith("-"):
-        close = "; a scenario's file says such values, an option changes what --help lists"
+        close = "; an option changes what --help lists"
+        if "--set" in known:
+            close = "; a key of the scenario comes after --set, e.g. --set references.P_ref=0.8"
     return UserError(f"{' '.join(words)}: {parser.prog} does not know it{close}")
 
 

@@ -108,6 +108,14 @@ def test_poles_and_a_step(capsys, tmp_path):
     assert "after P_ref" in capsys.readouterr().out
 
 
+def test_any_key_of_the_scenario_is_set(capsys):
+    weak = {"scr": 1.5, "x_over_r": 10}
+    words = [w for key, value in weak.items() for w in ("--set", f"plant.grid.{key}={value}")]
+    out = said(capsys, "poles", "--law", "vsg-2", *words)
+    poles = Law.load("vsg-2").closed_loop("pref_step", plant__grid=weak).poles()
+    assert out["modes"][0]["sigma"] == pytest.approx(poles.real.max(), rel=1e-9)
+
+
 STAGED = ("--law", "vsg-2", "--inner", "virtual-stator")
 
 

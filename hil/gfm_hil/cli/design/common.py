@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.cli.common import OPTIONS, add_inner
+from gfm_hil.cli.common import OPTIONS, add_inner, add_settings, settings
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import Scenario, load_scenario
 
@@ -30,6 +30,7 @@ def add_loop_options(command: argparse.ArgumentParser) -> Any:
         help="scenario file or shipped name: plant, references, T_s; pref_step by default",
     )  # fmt: skip
     add_converter_option(command)
+    add_settings(command)
     command.add_argument("--json", action="store_true", help="as JSON")
     return where
 
@@ -57,10 +58,10 @@ def save_figure(path: Path, draw: Callable[[], object]) -> None:
 
 
 def chosen_scenario(given: str, options: argparse.Namespace) -> Scenario:
-    """A scenario with the law and the inner stage of --law and --inner; in a network those of
-    --converter. Raises UserError: as ``load_scenario``; --converter does not name a converter of
-    the network."""
-    names = {**OPTIONS, "converter": "--converter"}
-    return load_scenario(
-        given, names, converter=options.converter, law=options.law, inner=options.inner
-    )
+    """A scenario with the law and the inner stage of --law and --inner, in a network those of
+    --converter, and what --set changes. Raises UserError: as ``load_scenario``; --converter does
+    not name a converter of the network."""
+    changed, names = settings(options)
+    names = {**OPTIONS, "converter": "--converter", **names}
+    own = {"law": options.law, "inner": options.inner}
+    return load_scenario(given, names, converter=options.converter, **own | changed)

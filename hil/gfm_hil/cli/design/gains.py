@@ -15,7 +15,7 @@ from gfm_design.norms.performance import WeightedChannel
 from gfm_design.tuning.paper import EVALUATIONS
 from gfm_hil.api import design
 from gfm_hil.api.law import Law
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, watching
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, add_settings, watching
 from gfm_hil.cli.design.common import add_converter_option, chosen_scenario
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -55,14 +55,17 @@ def add_judged_on(command: argparse.ArgumentParser) -> None:
         help="scenario file or shipped name: its sampled loop in place of the paper's problem",
     )
     add_converter_option(command)
+    add_settings(command)
 
 
 def judged_on(options: argparse.Namespace) -> Scenario | None:
-    """The scenario of --scenario, under --law and --inner. Raises UserError: as
+    """The scenario of --scenario, under --law, --inner and --set. Raises UserError: as
     ``chosen_scenario``; --converter is missing, or without --scenario."""
     if options.scenario is None:
         if options.converter is not None:
             raise UserError(f"--converter {options.converter}: needs --scenario with a network")
+        if options.settings:
+            raise UserError(f"--set {options.settings[0][0]}: needs --scenario")
         return None
     if options.converter is None and (names := load_scenario(options.scenario).converters):
         raise UserError(f"--scenario {options.scenario}: --converter names the one of {names}")
