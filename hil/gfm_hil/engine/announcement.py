@@ -62,11 +62,17 @@ def running_roles(folder: Path) -> list[Role]:
     return [role for role in ROLES if read_announcement(folder, role) is not None]
 
 
+def members(folder: Path) -> list[Path]:
+    """The folders of a network's converters; none if the folder is not of a network."""
+    if not (folder / "scenario.toml").is_file():
+        return []
+    return sorted(path.parent for path in folder.glob("*/scenario.toml"))
+
+
 def not_running(folder: Path) -> UserError:
     """The error that no run is going on in a folder."""
-    converters = sorted(path.parent.name for path in folder.glob("*/scenario.toml"))
-    if converters and (folder / "scenario.toml").is_file():
+    if names := [member.name for member in members(folder)]:
         return UserError(
-            f"{folder}: is of a network; name the folder of a converter: one of {converters}"
+            f"{folder}: is of a network; name the folder of a converter: one of {names}"
         )
     return UserError(f"{folder}: no run is going on there")

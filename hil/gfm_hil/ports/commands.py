@@ -10,7 +10,13 @@ import zmq
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.identity import Identity, local
 from gfm_hil.core.roles import Role
-from gfm_hil.engine.announcement import LARGEST, not_running, read_announcement, running_roles
+from gfm_hil.engine.announcement import (
+    LARGEST,
+    members,
+    not_running,
+    read_announcement,
+    running_roles,
+)
 from gfm_hil.recording.live import LiveRun
 from gfm_hil.scenario.events import EVENTS
 from gfm_plant import TRIP_REASONS
@@ -24,18 +30,22 @@ class Operator:
     progress there.
 
     Args:
-        folder: the run folder.
+        folder: the run folder; that of a network reaches what its converters share: its grid,
+            lines, loads and breakers, the notes and the stop.
         through: what passes the commands on, for the log of the run.
 
     Attributes:
-        run: all that it has recorded.
+        run: all that it has recorded; of a network's folder the converter by which the plant is
+            reached.
     """
 
     def __init__(self, folder: Path, through: str = "python") -> None:
-        self._folder, self._local = folder, local(through)
-        self._context, self.run = zmq.Context(), LiveRun(folder)
-        if not running_roles(folder):
+        reached = (place for place in (folder, *members(folder)) if running_roles(place))
+        self._folder, self._local = next(reached, folder), local(through)
+        if self._folder == folder and not running_roles(folder):
             raise not_running(folder)
+        self._network = folder if self._folder != folder else None
+        self._context, self.run = zmq.Context(), LiveRun(self._folder)
 
     def close(self) -> None:
         """Close the sockets."""
@@ -55,7 +65,10 @@ class Operator:
         kind = event.get("type", "")
         if not isinstance(kind, str):
             raise UserError(f"type = {str(kind)[:60]}: must be the name of an event")
-        return self._ask(EVENTS[kind].side if kind in EVENTS else "plant", event, by)
+        side = EVENTS[kind].side if kind in EVENTS else "plant"
+        if self._network is not None and side == "controller":
+            raise not_running(self._network)
+        return self._ask(side, event, by)
 
     def tell(self, event: dict[str, Any], by: Identity | None = None) -> dict[str, Any]:
         """The former name of ``command``, for one version."""
@@ -79,8 +92,10 @@ class Operator:
         anything is left out.
 
         The loop only appends rows, so that reading them does not disturb it. Raises UserError: the
-        recording is damaged.
+        recording is damaged; the folder is of a network.
         """
+        if self._network is not None:
+            raise not_running(self._network)
         found: dict[str, Any] = {}
         run = self.run
         if done := run.done("plant"):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from gfm_hil.results.figures import Picture
 
 PAGE = "report.html"
+_COMMANDS = 200  # that a report shows
 _OF_ALL = 40_000  # points of a panel times runs, so that a page of many runs stays small
 
 EVENT_COLUMNS = (
@@ -155,7 +156,9 @@ def write_report(run: Run | NetworkRun) -> None:
     if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
         timing = draw_timing(folder, scenario, run.timing, run.summary)
     chapter = _chapter("", run, POINTS, timing)
-    content = {"chapters": [chapter], "shared": [], "kind": ""}
+    content = {
+        "chapters": [chapter], "shared": [], "kind": "", "commands": _commands({"": run}),
+    }  # fmt: skip
     diagram = draw_diagram(folder, scenario)
     _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
     drawn()
@@ -203,6 +206,7 @@ def write_together(
         "runs": Table([kind, "controlled by", "status", "reason", "misses"], rows, text=4),
         "shared": [*panels_of_all(scenario, columns, events, most)] if columns else [],
         "flows": of_network,
+        "commands": _commands(runs),
     }
     ticks = max((run.ticks for run in known.values()), default=0)
     if not diagram:
@@ -292,6 +296,26 @@ def _events(events: Sequence[dict[str, Any]]) -> Table:
     if len(events) > len(columns):
         rows = [list(row) for row in zip(*rows, strict=True)]
     return Table(rows[0] if rows else (), rows[1:])
+
+
+def _commands(runs: Mapping[str, Run]) -> Table:
+    """What operators did, each command once, with the converters whose logs have it."""
+    found: dict[tuple[float, str, str], list[str]] = {}
+    for name, run in runs.items():
+        for line in run.events:
+            if "operator" not in line:
+                continue
+            what = "stop" if line["event"] == "end" else line.get("label") or line["event"]
+            by = line["operator"]
+            who = (by.get(key) for key in ("through", "name", "certificate", "peer"))
+            found.setdefault((line["t"], what, ", ".join(filter(None, who))), []).append(name)
+    rows = [
+        [f"{t:g}", what, *([", ".join(names)] if len(runs) > 1 else []), who]
+        for (t, what, who), names in sorted(found.items())
+    ]
+    heads = ["t [s]", "command", *(["in the log of"] if len(runs) > 1 else []), "by"]
+    more = f"{len(rows) - _COMMANDS} more are in events.jsonl." if len(rows) > _COMMANDS else ""
+    return Table(heads, rows[:_COMMANDS], caption=more, text=None)
 
 
 def events_table(events: Sequence[dict[str, Any]]) -> Table:

@@ -162,17 +162,18 @@ def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_pat
 def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path):
     folder = tmp_path / "run"
     with started(folder, content(duration=150.0, link=over("zmq"), events=[])) as process:
-        with pytest.raises(UserError, match=r"is of a network; name the folder of a converter"):
-            Operator(folder)
-        a, b = Operator(folder / "A"), Operator(folder / "B")
+        a, b, both = Operator(folder / "A"), Operator(folder / "B"), Operator(folder)
         told = b.command({"type": "reference", "P_ref": 0.35})
-        closed = b.command({"type": "breaker", "name": "step", "closed": True})
+        closed = both.command({"type": "breaker", "name": "step", "closed": True})
+        for own in (both.snapshot, lambda: both.command({"type": "reference", "P_ref": 0.35})):
+            with pytest.raises(UserError, match=r"is of a network; name the folder of a conv"):
+                own()
         with pytest.raises(UserError, match="name = 'stop': must be one of"):
             a.command({"type": "breaker", "name": "stop", "closed": True})
         wait_for(lambda: has_run(folder / "A", closed["tick"] + 100), process)
-        a.stop()
+        both.stop()
         code, *_ = end(process)
-        a.close(), b.close()
+        a.close(), b.close(), both.close()
     assert code == 130 and summary(folder)["stopped"]
     for name in "AB":
         assert (

@@ -9,6 +9,8 @@ import pytest
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.recording.columns import symbol_of
+from gfm_hil.recording.run import Run
+from gfm_hil.results.report import _commands
 
 from ...support.page import unpacked
 from ...support.processes import wait_for
@@ -31,6 +33,19 @@ def test_it_is_in_words(report):
     assert "controller: 12 lost, 1 crc; plant: none" in text and "{'" not in text
     assert "2026-11-24 03:15:21 UTC" in text
     assert text.count('class="plot"') == 9 and '<p class="scroll diagram"><svg' in text
+
+
+def test_it_says_which_operator_did_what(tmp_path):
+    scope = {"through": "scope", "name": "Ann", "peer": "10.0.0.7:40390"}
+    step = {"tick": 50, "t": 0.005, "event": "breaker", "label": "town off", "operator": scope}
+    planned = {"tick": 60, "t": 0.006, "event": "reference", "label": "P_ref = 0.4"}
+    end = {"tick": 90, "t": 0.009, "event": "end", "reason": "x", "operator": {"through": "xcp"}}
+    runs = [Run(None, {}, {}, events=[planned, step, *more]) for more in ([end], [])]
+    both = _commands(dict(zip("AB", runs, strict=True)))
+    assert both.rows == [
+        ["0.005", "town off", "A, B", "scope, Ann, 10.0.0.7:40390"], ["0.009", "stop", "A", "xcp"],
+    ]  # fmt: skip
+    assert _commands({"": runs[1]}).rows == [["0.005", "town off", "scope, Ann, 10.0.0.7:40390"]]
 
 
 @pytest.fixture(scope="module")
