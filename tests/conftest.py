@@ -124,6 +124,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     if hasattr(config, "workerinput"):  # a worker, which must not start workers
         return
     config.option.loadscopereorder = False  # see longest_first
+    if getattr(config.option, "maxworkerrestart", 0) is None:
+        config.option.maxworkerrestart = "0"  # a test kills each, or all wait for ever
     if chosen(config) <= {FAST, "full"} and getattr(config.option, "numprocesses", 0) is None:
         workers = min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
         config.option.numprocesses, config.option.dist = workers, "loadfile"
