@@ -11,7 +11,7 @@ def beside(work: Callable[..., object], *arguments: Any) -> Callable[[], None]:
     """Begin work that only writes files, on another processor if one may be had.
 
     A process with other threads is not forked: a lock that one of them has would never be released
-    in the copy.
+    in the copy. That of a progress bar only writes to the terminal, which ``work`` does not.
 
     Returns:
         What waits until it has ended, and raises what ``work`` raises.
@@ -20,7 +20,8 @@ def beside(work: Callable[..., object], *arguments: Any) -> Callable[[], None]:
     def here() -> None:
         work(*arguments)
 
-    if threading.active_count() > 1 or (os.cpu_count() or 1) < 2:
+    others = (t for t in threading.enumerate() if type(t).__module__ != "rich.live")
+    if [*others] != [threading.main_thread()] or (os.cpu_count() or 1) < 2:
         return here
     process = get_context("fork").Process(target=_quietly, args=(here,))
     process.start()
@@ -34,7 +35,10 @@ def beside(work: Callable[..., object], *arguments: Any) -> Callable[[], None]:
 
 
 def _quietly(work: Callable[[], None]) -> None:
+    """End this process after the work, without a word and without what others do at an exit."""
+    code = 1
     try:
         work()
-    except BaseException:
-        os._exit(1)
+        code = 0
+    finally:
+        os._exit(code)

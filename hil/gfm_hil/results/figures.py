@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree import ElementTree
@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.core.beside import beside
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.columns import (
@@ -363,17 +364,24 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
             few.save(part, "PNG", optimize=True)
 
 
-def draw_run(folder: Path, scenario: Scenario, signals: Columns, summary: dict[str, Any]) -> None:
-    """Draw one run into signals.png and waveforms.png of its folder; a page shows them as
-    ``panels_of_run`` and ``panels_of_waves``."""
-    if "true_p" in signals:
+def draw_run(
+    folder: Path, scenario: Scenario, signals: Columns, summary: dict[str, Any]
+) -> list[Callable[[], None]]:
+    """Begin to draw one run into signals.png and waveforms.png of its folder; a page shows them as
+    ``panels_of_run`` and ``panels_of_waves``. Returns what waits until each is there."""
+
+    def signals_png() -> None:
         figure = _figure(SIZE)
         draw_signals(figure, scenario, signals, summary)
         _save(figure, folder / "signals.png")
-    if signals.keys() >= {*NEEDS}:
+
+    def waveforms_png() -> None:
         figure = _figure(SIZE_WAVES)
         if draw_waveforms(figure, scenario, signals, summary):
             _save(figure, folder / "waveforms.png", few_colours=True)
+
+    waits = [beside(signals_png)] if "true_p" in signals else []
+    return waits + ([beside(waveforms_png)] if signals.keys() >= {*NEEDS} else [])
 
 
 SIZE = (10.5, 7.4)  # inches, of the six panels of a run

@@ -143,15 +143,15 @@ def write_report(run: Run | NetworkRun) -> None:
     assert folder is not None
     if isinstance(run, NetworkRun):
         common = folder / "converters.png"
-        drawn = beside(draw_comparison, common, scenario, run.columns, run.events, SHARED)
+        wait = beside(draw_comparison, common, scenario, run.columns, run.events, SHARED)
         diagram = draw_diagram(folder, scenario, PAGE)
         write_together(
             folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
             [*panels_of_network(run)] if len(run.flows) > 1 else [],
         )  # fmt: skip
-        drawn()
+        wait()
         return
-    drawn = beside(draw_run, folder, scenario, run.columns, run.summary)
+    drawn = draw_run(folder, scenario, run.columns, run.summary)
     timing = None
     if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
         timing = draw_timing(folder, scenario, run.timing, run.summary)
@@ -161,7 +161,8 @@ def write_report(run: Run | NetworkRun) -> None:
     }  # fmt: skip
     diagram = draw_diagram(folder, scenario)
     _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
-    drawn()
+    for wait in drawn:
+        wait()
 
 
 def write_together(

@@ -14,18 +14,29 @@ def fail():
     raise ValueError("no room")
 
 
-def test_it_is_done_in_another_process_unless_this_one_has_threads(tmp_path, monkeypatch):
-    monkeypatch.setattr(threading, "active_count", lambda: 1)
-    beside(write_its_process, tmp_path / "pid")()
+@pytest.fixture
+def alone(monkeypatch):
+    """The tests' own threads are not counted."""
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread()])
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+
+
+def test_it_is_done_in_another_process(alone, tmp_path):
+    wait = beside(write_its_process, tmp_path / "pid")
+    wait()
     assert int((tmp_path / "pid").read_text()) != os.getpid()
-    monkeypatch.setattr(threading, "active_count", lambda: 2)
-    beside(write_its_process, tmp_path / "pid")()
+
+
+def test_a_process_with_threads_is_not_forked(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), object()])
+    wait = beside(write_its_process, tmp_path / "pid")
+    wait()
     assert int((tmp_path / "pid").read_text()) == os.getpid()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_its_error_is_raised_here(threads, monkeypatch, capfd):
-    monkeypatch.setattr(threading, "active_count", lambda: threads)
+@pytest.mark.parametrize("processors", [1, 2])
+def test_its_error_is_raised_here(processors, alone, monkeypatch, capfd):
+    monkeypatch.setattr(os, "cpu_count", lambda: processors)
     wait = beside(fail)
     with pytest.raises(ValueError, match="no room"):
         wait()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from gfm_hil.results.figures import draw_comparison, draw_run, draw_signals
+from gfm_hil.results.figures import draw_comparison, draw_signals
+from gfm_hil.results.figures import draw_run as begin_to_draw
 
 RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 0, "ticks": 0}
 
@@ -19,6 +20,11 @@ def recording(ticks: int) -> dict[str, np.ndarray]:
     controller = ("ref_P_ref", "ref_Q_ref")
     plant = (*(f"true_{n}" for n in names), "u_E_u", "u_i_u")
     return {"t": t, **{n: wave.copy() for n in (*plant, *controller)}}
+
+
+def draw_run(*arguments) -> None:
+    for wait in begin_to_draw(*arguments):
+        wait()
 
 
 def events(count: int) -> list[dict[str, object]]:
