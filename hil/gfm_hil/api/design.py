@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_design.margins.all_margins import Margins
 from gfm_design.margins.all_margins import margins as _margins
 from gfm_design.misses.tolerance import LatencyTolerance
 from gfm_design.misses.tolerance import latency_tolerance as _latency_tolerance
 from gfm_design.model.closed_loop import least_stable
+from gfm_design.norms.hinf import Unstable
 from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel, read_weights
 from gfm_design.tuning import paper as search
 from gfm_design.tuning.full_order import FullOrder, full_order
@@ -39,6 +41,7 @@ Weights = str | Path | Sequence[Weight] | None
 
 _PAPERS_GRID = HomeGrid().model_dump(mode="json")
 _AT = 1e-4  # relative: a gain this close to its bound is at it
+_SAME = 1e-4  # relative: a norm this close to another is the same
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,9 @@ class Tuning:
     Attributes:
         law: the law with its new gains; run it, draw its loop, save it.
         gamma: of that law.
+        before: of the gains that the search began with; None if the loop is unstable there.
         gains: those that changed, and those that are tied to them.
+        unmoved: the largest channels, if no free gain moves them.
         evaluations, seconds: what the search took.
         seed: what makes it repeatable.
         problem: the problem that was solved.
@@ -88,7 +93,9 @@ class Tuning:
 
     law: Law
     gamma: Gamma
+    before: Gamma | None
     gains: dict[str, float]
+    unmoved: list[WeightedChannel]
     evaluations: int
     seconds: float
     seed: int
@@ -243,9 +250,37 @@ def tune(
         raise UserError(str(missing)) from None
     named = problem.law.named(found.values)
     tuned = law.with_gains(name or f"{law.name}-tuned", **named)
-    each = (loop.channels(problem.weights) for loop in problem.all_loops(found.values))
-    channels = Gamma(tuned.name, search.worst_channels(each))
-    return Tuning(tuned, channels, named, found.evaluations, found.seconds, found.seed, problem)
+    after = _gamma_of(tuned.name, problem, found.values)
+    try:
+        before = _gamma_of(law.name, problem, np.array([gain.start for gain in problem.gains]))
+    except Unstable:
+        before = None
+    fixed = _unmoved(problem, found.values, after)
+    took = found.evaluations, found.seconds, found.seed
+    return Tuning(tuned, after, before, named, fixed, *took, problem)
+
+
+def _unmoved(
+    problem: search.PaperProblem, values: NDArray[np.float64], now: Gamma
+) -> list[WeightedChannel]:
+    """The largest channels, if each is the same with any of the gains a hundredth away."""
+    found = [c for c in now.channels if c.norm >= (1.0 - _SAME) * now.value]
+    for k, gain in enumerate(problem.gains):
+        away = values[k] * 1.01 if 0.0 < abs(values[k] * 1.01) <= gain.high else values[k] * 0.99
+        near = values.copy()
+        near[k] = away or 0.01 * gain.high
+        try:
+            there = {(c.i, c.j): c.norm for c in _gamma_of(now.law, problem, near).channels}
+        except Unstable:
+            return []
+        found = [c for c in found if abs(there[c.i, c.j] - c.norm) <= 1e-9 * c.norm]
+    return found
+
+
+def _gamma_of(name: str, problem: search.PaperProblem, values: NDArray[np.float64]) -> Gamma:
+    """gamma at a problem's free gains. Raises Unstable: a loop has none."""
+    each = (loop.channels(problem.weights) for loop in problem.all_loops(values))
+    return Gamma(name, search.worst_channels(each))
 
 
 def _check_search(evaluations: int, starts: int | None, seed: int, decay: float) -> None:

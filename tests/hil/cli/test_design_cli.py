@@ -71,6 +71,18 @@ def test_tune_names_the_gain_at_its_bound(capsys):
     assert out["at_bounds"] == {"k_qp": 0.1}
 
 
+def test_tune_says_what_gamma_was_and_which_channel_no_gain_moves(capsys):
+    """q follows Q_ref in droop-3 with a gain that is not free, and W_41 is large at rest."""
+    options = ("--starts", "1", "--evaluations", "320", "--quiet")
+    out = said(capsys, "tune", "--law", "vsg-2", *options)
+    start = said(capsys, "gamma", "--law", "vsg-2")["gamma"]
+    assert out["gamma_before"] == pytest.approx(start, rel=1e-5) and out["unmoved"] == []
+    assert main(["design", "tune", "--law", "droop-3", *options]) == 0
+    said_of_it = capsys.readouterr().out
+    assert "γ = 987.98, before the search 987.98" in said_of_it
+    assert "no free gain moves W_41 T_41, the largest" in said_of_it
+
+
 def test_a_weight_that_is_largest_at_infinite_frequency_is_named(capsys):
     assert main(["design", "gamma", "--law", "droop-5"]) == 0  # P_ref acts on omega_u at once
     out = capsys.readouterr().out

@@ -130,14 +130,14 @@ _W = {1: "P_ref", 2: "ω_g"}
 _Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
 
 
-def print_channels(name: str, channels: Sequence[WeightedChannel]) -> None:
-    """gamma and its channels as a table."""
+def print_channels(name: str, channels: Sequence[WeightedChannel], more: str = "") -> None:
+    """gamma, with ``more`` behind it, and its channels as a table."""
     rows = [
         [f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", "∞" if np.isinf(c.omega) else c.omega]
         for c in channels
     ]
     console = terminal(highlight=False)
-    console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}")
+    console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}{more}")
     console.print(Table(("channel", "‖W T‖∞", "at [rad/s]"), rows, text=None))
     for c in channels:
         if np.isinf(c.omega):
@@ -234,9 +234,11 @@ def _tune(options: argparse.Namespace) -> int:
     result = {
         "law": law.name,
         **design.channels_as_json(channels),
+        "gamma_before": None if found.before is None else found.before.value,
         "gamma_full_order": None,
         "gains": named,
         "at_bounds": found.at_bounds,
+        "unmoved": [f"W_{c.i}{c.j}" for c in found.unmoved],
         "seconds": found.seconds,
         "evaluations": found.evaluations,
         "seed": found.seed,
@@ -249,8 +251,10 @@ def _tune(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(result, indent=2))
         return 0
-    print_channels(problem_title(law.file, on, *more), channels)
+    began = "unstable" if found.before is None else f"{found.before.value:.6g}"
+    print_channels(problem_title(law.file, on, *more), channels, f", before the search {began}")
     lines = [
+        *(f"no free gain moves W_{c.i}{c.j} T_{c.i}{c.j}, the largest" for c in found.unmoved),
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
         + (f"; law file: {options.out}" if options.out else ""),
