@@ -3,12 +3,16 @@
 A file of its own, so that no other rig takes the processors meanwhile.
 """
 
+import os
+import signal
+
 import pytest
 
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_events
+from gfm_plant.names import NO_FRESH_U
 
-from ...support.processes import wait_for
+from ...support.processes import roles_of, wait_for
 from ...support.scope import HAS_BROWSER, Browser, rig
 
 pytestmark = [
@@ -133,4 +137,8 @@ def test_four_converters_of_a_network(tmp_path):
         assert page.js(f"{box} return box.scrollWidth <= box.clientWidth")
         assert breaker(page, "step") == "true" and all(flow(page, name) > 0.05 for name in "ABCD")
         wait_for(lambda: page.js(f"{tip}.width") > 5 and page.js(f"{tip}.x") < 40)  # at the left
+        os.kill(roles_of(four.folder / "D")["controller"], signal.SIGKILL)
+        assert wait_for(lambda: "tripped" in page.text("[data-converter=D] .head"))
+        wait_for(lambda: page.text("#state") == "tripped")
+        assert page.text("#reason") in ("the controller's process is gone", NO_FRESH_U)
         assert page.complaints() == []

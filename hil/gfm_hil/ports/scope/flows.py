@@ -93,4 +93,7 @@ def _newest(run: WatchedRun) -> dict[str, Any]:
     state = run.record.columns.get("state")
     if state is not None and 0 <= (code := float(state[done - 1 : done][0])) < len(STATES):
         newest["state"] = STATES[int(code)]
+    trip = run.record.columns.get("true_trip")
+    if trip is not None and newest.get("state") != "SAFE" and trip[done - 1 : done][0] > 0:
+        newest["state"] = "tripped"  # of a controller that is dead or was stopped
     return newest | {"misses": pyramid.misses(done)}

@@ -2,10 +2,11 @@
 
 import { value } from "./text.js";
 
-const BOX = 204, FIRST = BOX + 66, COLUMN = 150, TOP = 22; // pixels
+const BOX = 220, FIRST = BOX + 66, COLUMN = 150, TOP = 22; // pixels
 // A narrow page, whose nodes are below each other: its width, a line's, and what words need, at least.
 const NARROW = 356, LANE = 22, WORDS = 230;
 const LEAST = 5e-4; // p.u.; a smaller power has no arrow
+const BAD = new Set(["SAFE", "tripped"]);
 const SPACE = "http://www.w3.org/2000/svg";
 
 function svg(tag, attributes = {}, ...children) {
@@ -91,13 +92,13 @@ export class Diagram {
   converter(name, law, x, y, shown) {
     const at = this.narrow ? x + 36 : 1, width = this.narrow ? this.right - 1 - at : BOX;
     const numbers = text(at + 9, y + 2, "–", "flow"), more = text(at + 9, y + 17, "", "flow");
+    const about = `${name} \u00b7 ${law}`, head = text(at + 9, y - 12, about, "head");
     const box = svg("rect", { x: at, y: y - 26, width, height: 50, rx: 5 });
     const link = svg("a", { href: `?of=${encodeURIComponent(name)}`, class: "converter",
       "data-converter": name, ...(shown ? { "aria-current": "page" } : {}) },
-    svg("title", {}, `${name} under ${law}`), box, text(at + 9, y - 12, `${name} \u00b7 ${law}`, "head"),
-    numbers, more);
+    svg("title", {}, `${name} under ${law}`), box, head, numbers, more);
     this.element.append(line(this.narrow ? at : BOX + 1, y, x, y), link);
-    this.converters.set(name, { link, numbers, more });
+    this.converters.set(name, { link, about, head, numbers, more });
     this.breaker(name, this.narrow ? x + 18 : BOX + 34, y);
   }
 
@@ -155,11 +156,12 @@ export class Diagram {
       arrow.setAttribute("display", Math.abs(P) < LEAST ? "none" : "inline");
     }
     for (const [name, now] of Object.entries(converters)) {
-      const { link, numbers, more } = this.converters.get(name);
+      const { link, about, head, numbers, more } = this.converters.get(name);
       link.dataset.state = now.state ?? "";
+      head.textContent = about + (BAD.has(now.state) ? ` \u00b7 ${now.state}` : "");
       numbers.textContent = `P ${value(now.p, "p.u.")}  Q ${value(now.q, "p.u.")}`;
       more.textContent = `V ${value(now.V, "p.u.")}  ${value(now.omega_u, "Hz")} Hz` +
-        (now.misses ? `  ${now.misses} missed` : "");
+        (now.misses ? `  ${now.misses < 1e4 ? now.misses : `${Math.round(now.misses / 1e3)}k`} missed` : "");
     }
     for (const [name, is] of Object.entries(closed)) {
       const mark = this.breakers.get(name);

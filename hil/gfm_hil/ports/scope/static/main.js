@@ -288,7 +288,7 @@ function words(frame) {
   get("misses").parentElement.classList.toggle("some", frame.misses > 0);
   get("miss-rate").textContent = frame.live ? `${missRate(frame)}/s` : "";
   for (const strip of strips) strip.tell(frame);
-  const running = about.states[frame.state] ?? "";
+  const running = stateOf(frame);
   if (frame.live) state(running || "running", running);
   else state(summary && summary.status !== "over" ? `over: ${summary.status}` : "over",
     summary?.status ?? "over");
@@ -306,15 +306,21 @@ function missRate({ head, misses }) {
   return head > from ? +((misses - before) / ((head - from) * about.T_s)).toPrecision(2) : 0;
 }
 
+// Of a converter whose controller is dead or was stopped: that its bridge has tripped.
+function stateOf(frame) {
+  const own = about.states[frame.state] ?? "";
+  return frame.trip > 0 && own !== "SAFE" ? "tripped" : own;
+}
+
 function state(text, kind) {
   if (get("state").textContent !== text) get("state").textContent = text;
   get("state").dataset.state = kind;
 }
 
-// The reason for which the run is in SAFE, or how it ended if not regularly.
+// The reason for which the run is in SAFE or has tripped, or how it ended if not regularly.
 function why() {
   const frame = look.frame;
-  const safe = frame && about.states[frame.state] === "SAFE";
+  const safe = frame && ["SAFE", "tripped"].includes(stateOf(frame));
   const last = events.events.findLast((e) => e.reason);
   reason = summary?.reason || (safe && last?.reason) || "";
   if (get("reason").textContent !== reason) get("reason").textContent = reason;
