@@ -177,6 +177,9 @@ def test_the_first_page_is_about_the_recording(place: Path, waves: Columns) -> N
     facts = dict(made.about("page"))
     assert facts["part"] == f"{PART}; not judged: +10"
     assert not facts.keys() & {"law", "inner stage"}
+    others = facts["not run"].split(", ")
+    assert len(others) == len([*load_cases(["ercot"])]) - 1
+    assert TEST not in others and all(one.startswith("ercot/") for one in others)
     assert "about what was recorded" in explain_counts(made, "page")
 
 

@@ -41,17 +41,17 @@
     c.setLineDash([4 * px, 3 * px]);
     c.strokeStyle = c.fillStyle = "#888";
     c.textAlign = "left";
-    let free = left;
+    const free = [left, left, left];  // of three rows of labels
     for (const [t, label] of of.events) {
       c.beginPath();
       c.moveTo(x(t), top);
       c.lineTo(x(t), top + height);
       c.stroke();
       const room = c.measureText(label).width + 8 * px, late = x(t) + room > left + width;
-      const from = x(t) - (late ? room : 0);
-      if (from < free) continue;  // it would cover the label before it
-      c.fillText(label, from + 4 * px, top + 10 * px);
-      free = from + room;
+      const from = x(t) - (late ? room : 0), row = free.findIndex((at) => from >= at);
+      if (row < 0) continue;  // it would cover the labels before it
+      c.fillText(label, from + 4 * px, top + (10 + 12 * row) * px);
+      free[row] = from + room;
     }
     c.lineWidth = 1.5 * px;
     of.limits.forEach(([ts, vs, colour, number], k) => {

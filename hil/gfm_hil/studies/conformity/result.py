@@ -24,7 +24,7 @@ from gfm_hil.results.report import finite
 from gfm_hil.results.table import shown
 from gfm_hil.studies.conformity.criteria.base import KNOWN, UnderTest
 from gfm_hil.studies.conformity.execute import PartResult, slug
-from gfm_hil.studies.conformity.sets import Case
+from gfm_hil.studies.conformity.sets import Case, shipped_sets
 from gfm_hil.studies.conformity.verdict import (
     CANNOT,
     CONSISTENT,
@@ -190,9 +190,20 @@ class Conformity:
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),
+            *([("not run", self._left_out())] if self._left_out() else []),
             ("machine", self.machine),
             ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
         ]
+
+    def _left_out(self) -> str:
+        """The other tests of the shipped sets of which some were run."""
+        ran = {case.path for case in self.cases}
+        left = (
+            f"{name}/{path.stem}" for name, folder in shipped_sets().items()
+            if any(path.parent == folder for path in ran)
+            for path in sorted(folder.glob("*.toml")) if path not in ran
+        )  # fmt: skip
+        return ", ".join(left)
 
     def write(self, folder: Path, notice: Callable[[str], None] = lambda text: None) -> None:
         """Write report.html, report.pdf, results.json and junit.xml, and with several laws a report

@@ -42,7 +42,7 @@ export class Events {
     ctx.textAlign = "left";
     ctx.textBaseline = "alphabetic";
     ctx.font = `${10.5 * ratio}px system-ui, sans-serif`;
-    let free = -Infinity;
+    const free = [-Infinity, -Infinity, -Infinity]; // of three rows of labels
     for (const e of this.events) {
       if (UNMARKED.has(e.event)) continue;
       const left = Math.round(u.valToPos(e.t - origin, "x", true)) + 0.5;
@@ -59,9 +59,10 @@ export class Events {
       const wide = ctx.measureText(text).width;
       const room = left + wide + 8 * ratio < bbox.left + bbox.width;
       const from = room ? left + 4 * ratio : left - 4 * ratio - wide;
-      if (first && from > free) {
-        ctx.fillText(text, from, bbox.top + bbox.height - 5 * ratio);
-        free = from + wide + 6 * ratio;
+      const row = first ? free.findIndex((at) => from > at) : -1;
+      if (row >= 0) {
+        ctx.fillText(text, from, bbox.top + bbox.height - (5 + 12 * row) * ratio);
+        free[row] = from + wide + 6 * ratio;
       }
     }
     ctx.restore();

@@ -46,7 +46,10 @@ function input(id, name, schema, needed, choices, root) {
 // The fields of a schema that the run has something for: rows, and what they say as one object.
 export function fields(id, schema, choices, root = schema) {
   const inputs = new Map(), rows = [];
-  for (const [name, of] of Object.entries(schema.properties)) {
+  // first what it is about, then what must be said
+  const place = ([name]) => (choices[name] ? 0 : schema.required?.includes(name) ? 1 : 2);
+  const all = Object.entries(schema.properties).sort((a, b) => place(a) - place(b));
+  for (const [name, of] of all) {
     if (["type", "t", "tick"].includes(name) || choices[name]?.length === 0) continue;
     const one = whole(of, root);
     const needed = schema.required?.includes(name) ?? false;

@@ -79,7 +79,7 @@ function begin(message) {
   about ??= { byName: Object.fromEntries(message.channels.map((c) => [c.name, {}])) };
   Object.assign(about, message);
   addSingles(message.channels);
-  document.title = `${[about.converter, about.title].filter(Boolean).join(" · ")} · gfmhil scope`;
+  document.title = `${whole()} · gfmhil scope`;
   get("title").textContent = about.title;
   const { converter, converters } = about;
   get("converter").replaceChildren(...converters.map((name) => make("option", { value: name }, name)));
@@ -344,9 +344,14 @@ function permit() {
 get("converter").onchange = ({ target }) => location.assign(`?of=${encodeURIComponent(target.value)}`);
 
 new Layouts(present, arrange);
-get("png").onclick = () => savePicture(strips, about.title,
+// The converter that the page shows, and the run.
+function whole() {
+  return [about.converter, about.title].filter(Boolean).join(" · ");
+}
+
+get("png").onclick = () => savePicture(strips, whole(),
   ["state", "law", "time"].map((id) => get(id).textContent).join(" · "), look.done);
-get("csv").onclick = () => saveTable(strips, about.byName, look.frame, about.T_s, about.title);
+get("csv").onclick = () => saveTable(strips, about.byName, look.frame, about.T_s, whole());
 
 setInterval(() => {
   get("rate").textContent = pictures ? `${pictures} fps` : "";
