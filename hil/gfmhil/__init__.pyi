@@ -1,3 +1,5 @@
+from gfm_hil.api.clearing_map import ClearingMap as ClearingMap
+from gfm_hil.api.clearing_map import clearing_map as clearing_map
 from gfm_hil.api.law import Law as Law
 from gfm_hil.api.law import laws as laws
 from gfm_hil.api.network_case import NetworkCase as NetworkCase

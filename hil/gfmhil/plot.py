@@ -3,6 +3,7 @@
 from gfm_hil.api.plot import (
     bode,
     certificate,
+    clearing_map,
     clearing_times,
     impedance,
     nyquist,
@@ -19,6 +20,7 @@ __all__ = [
     "admittance",
     "bode",
     "certificate",
+    "clearing_map",
     "clearing_times",
     "impedance",
     "nfp",

@@ -189,12 +189,12 @@ class Law:
         content["name"] = name or f"{self.name.removesuffix('-changed')}-changed"
         return Law.from_toml(toml_text(content))
 
-    def with_inner(self, inner: str, name: str | None = None, **changed: Any) -> Law:
+    def with_inner(self, inner: str | None, name: str | None = None, **changed: Any) -> Law:
         """The same law with an inner stage between it and the bridge.
 
         Args:
             inner: name of a shipped stage (``virtual-stator``, ``cascaded``,
-                ``threshold-impedance``), path of a file, or ``none``.
+                ``threshold-impedance``), path of a file, or ``none``; None: its own stage.
             name: of the new law; ``<name>-changed`` if None.
             changed: keys of the stage, e.g. ``I_max=1.1``, ``priority="q"``,
                 ``power={"P_max": 1.0, "P_min": -1.0}``.
@@ -202,7 +202,7 @@ class Law:
         Raises:
             LawError: no such stage or key, or a value that is not allowed.
         """
-        spec = named_inner(inner)
+        spec = self.file.inner if inner is None else named_inner(inner)
         if spec is None and changed:
             raise LawError("inner", f"none has no keys; given are {[*changed]}")
         content = self.file.model_dump(mode="json", exclude_none=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
+from gfm_hil.api.clearing_map import SCR
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import symbol_of
 from gfm_hil.results.figures import (
@@ -40,6 +41,7 @@ from gfm_runtime.signals import U_NAMES, Y_NAMES
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from gfm_hil.api.clearing_map import ClearingMap
     from gfm_hil.api.sweeps import GainSweep, StabilityMap
 
 Vector = NDArray[np.float64]
@@ -276,22 +278,67 @@ def certificate(found: CertifiedLaws) -> Axes:
     return axes
 
 
+#: how a clearing time is marked, by what a longer fault does
+_ENDS = {"o": "falls out of step", "x": "is tripped", "^": "bears longer ones"}
+
+
 @with_look
 def clearing_times(times: Sequence[ClearingTime], scr: Sequence[float]) -> Axes:
     """Draw results of ``gfmhil.clearing_time`` over the short-circuit ratios of their grids, s: a
     cross where a longer fault ends by the protection, an arrow where the longest tried is borne."""
-    (axes,) = pyplot_panels(1, (6.6, 3.6))
     order = np.argsort(scr)
-    x, y = np.asarray(scr, float)[order], np.array([times[k].seconds for k in order])
+    return _clearing_curve([times[k] for k in order], np.asarray(scr)[order], SCR)
+
+
+@with_look
+def clearing_map(found: ClearingMap) -> list[Axes]:
+    """Draw ``gfmhil.clearing_map``: what is borne, s, over one quantity as a curve; over two as
+    cells, the first to the right and the second upwards; with a panel for each value of a third.
+    The marks are those of ``clearing_times``."""
+    names, (x, *others) = [*found.over], [np.array(values) for values in found.over.values()]
+    if not others:
+        return [_clearing_curve(found.times, x, names[0])]
+    y, *third = others
+    layers = [f"{names[2]} = {z:g}" for z in third[0]] if third else [""]
+    panels = pyplot_panels(len(layers), (6.6, 1.0 + 3.0 * len(layers)))
+    shape = len(x), len(y), len(layers)
+    seconds = found.seconds.reshape(shape)
+    kinds = np.array([_end(one) for one in found.times]).reshape(shape)
+    for k, (axes, layer) in enumerate(zip(panels, layers, strict=True)):
+        cells = seconds[:, :, k].T
+        mesh = axes.pcolormesh(x, y, cells, shading="nearest", vmin=0.0, vmax=seconds.max() or 1.0)
+        for mark, meaning in _ENDS.items():
+            up, right = np.nonzero(np.isin(kinds[:, :, k].T, mark))
+            if len(up):
+                axes.plot(x[right], y[up], mark, color="w", mec="k", mew=0.7, ms=5, label=meaning)
+        axes.set(ylabel=_QUANTITY.get(names[1], names[1]))
+        dress_alone(axes, ", ".join(filter(None, (f"{found.law}: {found.title}", layer))))
+    panels[-1].set(xlabel=_QUANTITY.get(names[0], names[0]))
+    figure = figure_of(panels)
+    figure.colorbar(mesh, ax=panels, label="clearing time [s]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
+                  fontsize=rc("legend.fontsize", 8), frameon=False)  # fmt: skip
+    return panels
+
+
+_QUANTITY = {SCR: "short-circuit ratio"}
+
+
+def _end(time: ClearingTime) -> str:
+    return "^" if not time.loss else "o" if time.loss in OF_ANGLE else "x"
+
+
+def _clearing_curve(times: Sequence[ClearingTime], x: Vector, quantity: str) -> Axes:
+    """Clearing times over a quantity that ascends, with marks."""
+    (axes,) = pyplot_panels(1, (6.6, 3.6))
+    y, kinds = np.array([one.seconds for one in times]), np.array([_end(one) for one in times])
     axes.plot(x, y, color=COLOURS[0], lw=rc("lines.linewidth", 1.2))
-    kinds = np.array(["^" if not times[k].loss else "o" if times[k].loss in OF_ANGLE else "x"
-                      for k in order])  # fmt: skip
-    names = {"o": "falls out of step", "x": "is tripped", "^": "bears longer ones"}
-    for mark, name in names.items():
+    for mark, name in _ENDS.items():
         some = kinds == mark
         if some.any():
             axes.plot(x[some], y[some], mark, color=COLOURS[0], ms=5, label=name)
-    axes.set(xlabel="short-circuit ratio", ylabel="clearing time [s]", ylim=(0.0, None))
+    label = _QUANTITY.get(quantity, quantity)
+    axes.set(xlabel=label, ylabel="clearing time [s]", ylim=(0.0, None))
     axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
     dress_alone(axes, f"{times[0].law}: {times[0].title}")
     return axes

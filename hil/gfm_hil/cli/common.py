@@ -134,7 +134,7 @@ def link_option(text: str) -> tuple[str, Any]:
 def _setting(text: str) -> tuple[str, Any]:
     """``link_option`` of a key that may have dots."""
     key, equals, value = text.partition("=")
-    if not (re.fullmatch(r"[A-Za-z_][\w-]*(\.[A-Za-z_][\w-]*)*", key) and equals):
+    if not (re.fullmatch(r"[A-Za-z_][\w-]*(\.[\w-]+)*", key) and equals):
         raise argparse.ArgumentTypeError(f"{text!r}: must be KEY=VALUE")
     try:
         return key, tomllib.loads(f"x = {value}")["x"]

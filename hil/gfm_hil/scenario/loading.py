@@ -79,9 +79,10 @@ def load_scenario(
             it.
         converter: of a network: the one that gets ``law`` and ``inner`` of ``changed``. Without it
             all converters get them, so that none may name its own.
-        changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``;
-            None leaves the file's value. A link other than the file's drops the file's endpoint
-            and options. The link ``inproc`` implies lockstep unless a ``mode`` is given.
+        changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``, or
+            ``events__0__V_g=0.2`` of the first event; None leaves the file's value. A link other
+            than the file's drops the file's endpoint and options. The link ``inproc`` implies
+            lockstep unless a ``mode`` is given.
 
     Raises:
         UserError: one line per mistake, each with its path, the value and what is allowed.
@@ -117,14 +118,29 @@ def load_scenario(
         table: Any = content
         *parents, last = key.split("__")
         for parent in parents:
-            table = table.setdefault(parent, {}) if isinstance(table, dict) else None
-        if isinstance(table, dict):  # else the check reports what the file has instead
+            if isinstance(table, list):
+                table = table[_place(key, parent, table, options)]
+            else:
+                table = table.setdefault(parent, {}) if isinstance(table, dict) else None
+        if isinstance(table, list):
+            table[_place(key, last, table, options)] = value
+        elif isinstance(table, dict):  # else the check reports what the file has instead
             table[last] = value
     named = {
-        tuple(key.split("__")): f"{options.get(key, key.replace('__', '.'))} {value}"
+        tuple(
+            int(p) if p.isdigit() else p for p in key.split("__")
+        ): f"{options.get(key, key.replace('__', '.'))} {value}"
         for key, value in overrides.items()
     }
     return check_scenario(content, where, named)
+
+
+def _place(key: str, part: str, entries: list[Any], options: Mapping[str, str]) -> int:
+    """The place that a part of an override's key names. Raises UserError: there is none."""
+    if not part.isdigit() or int(part) >= len(entries):
+        name = options.get(key, key.replace("__", "."))
+        raise UserError(f"{name}: {part!r} must be one of {len(entries)} entries, counted from 0")
+    return int(part)
 
 
 def _of_converter(
@@ -214,7 +230,7 @@ def _inside(table: Any, *keys: str) -> dict[str, Any]:
 def check_scenario(
     content: dict[str, Any],
     where: str,
-    overrides: Mapping[tuple[str, ...], str] = MappingProxyType({}),
+    overrides: Mapping[tuple[str | int, ...], str] = MappingProxyType({}),
 ) -> Scenario:
     """The scenario of a dict, with its laws and its plant tried out.
 

@@ -89,12 +89,9 @@ def clearing_time(
         UserError: the scenario has a network, or no such event; a number cannot be; there is no
             operating point to begin at.
     """
-    at, T_s = _event_of(scenario), scenario.T_s
+    T_s = scenario.T_s
     within = T_s if within is None else within
-    limits = (("longest", longest, 2 * T_s), ("after", after, 0.1), ("within", within, T_s))
-    for name, value, least in limits:
-        if not least <= value <= _MOST_S:
-            raise UserError(f"{name} = {value:g} s: must lie in [{least:g}, {_MOST_S:g}]")
+    at = event_to_clear(scenario, longest, after, within)
     trials = dict[int, Trial]()  # by ticks
     runs = 2 + math.ceil(math.log2(max(longest / within, 1.0)))
 
@@ -119,8 +116,14 @@ def clearing_time(
     return ClearingTime(scenario.law, scenario.title, trials[low].duration, lost, loss, ordered)
 
 
-def _event_of(scenario: Scenario) -> int:
-    """The place of what is to be cleared among the events."""
+def event_to_clear(scenario: Scenario, longest: float, after: float, within: float) -> int:
+    """The place of what is to be cleared among the events. Raises UserError: as
+    ``clearing_time``."""
+    T_s = scenario.T_s
+    limits = (("longest", longest, 2 * T_s), ("after", after, 0.1), ("within", within, T_s))
+    for name, value, least in limits:
+        if not least <= value <= _MOST_S:
+            raise UserError(f"{name} = {value:g} s: must lie in [{least:g}, {_MOST_S:g}]")
     if scenario.network is not None:
         raise UserError("network: the clearing time is that of one converter on its grid")
     some = [k for k, event in enumerate(scenario.events) if getattr(event, "duration", None)]

@@ -114,11 +114,33 @@ def test_what_is_lost_without_the_fault_has_no_equilibrium():
         (["--scenario", "pref_step"], "events: one must have a duration, a fault or a sag; 0 have"),
         (["--longest", "100"], "longest = 100 s: must lie in [0.0002, 60]"),
         (["--scenario", "three_share_a_load"], "network: the clearing time is that of one"),
+        (["--over", "events.1.V_g=0,0.1"], "events.1.V_g: '1' must be one of 1 entries, counted"),
+        (["--over", "inner.I_mx=1.1,1.2"], "law file: inner.I_mx = 1.1: unknown key; did you mean"),
+        (["--scenario", "pref_step", "--scr", "2"], "events: one must have a duration"),
+        (["--scr", "4,2"], "scr = [4.0, 2.0]: must be finite and ascending values"),
+        (["--out", "x.png"], "--out: the figure is one over --scr or --over"),
     ],
 )
 def test_what_has_no_clearing_time_is_refused_in_one_line(options, said, capsys):
     assert main(["design", "clearing", *options]) == 2
     assert capsys.readouterr().err.startswith(f"gfmhil: {said}")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_map_has_the_clearing_times_of_its_places(workers):
+    over = {"scr": (2.0, 6.0), "events.0.V_g": (0.0, 0.1), "inner.I_max": (1.1, 1.5)}
+    how = {"longest": 1.0, "after": 1.0, "within": 5e-3}
+    made = gfmhil.clearing_map("vsg-2", over=over, workers=workers, **how)
+    assert made.seconds.shape == (2, 2, 2) and len(made.to_pandas()) == 8
+    law = gfmhil.Law.load("vsg-2").with_inner("virtual-stator", I_max=1.1)
+    own = load_scenario("deep_sag").model_copy(update={"inner": None})
+    one = gfmhil.clearing_time(law, own, plant__grid__scr=6.0, events__0__V_g=0.0, **how)
+    assert 0.0 < one.seconds < 1.0
+    assert made.seconds[1, 0, 0] == one.seconds
+    # more current, a shallower sag or a weaker grid that is braked less: it is borne for longer
+    assert (np.diff(made.seconds, axis=1) >= 0.0).all()
+    assert (np.diff(made.seconds, axis=2) >= 0.0).all()
 
 
 def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
@@ -130,3 +152,9 @@ def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
         ["2", "0.3", "borne"], ["4", "0.3", "borne"]
     ]  # fmt: skip
     assert figure.stat().st_size > 5000
+    options += ["--over", "events.0.V_g=0.1,0.3", "--over", "inner.I_max=1.2"]
+    assert main(["design", "clearing", "--law", "droop-5", *options]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [row[:4] for row in rows if row[3:4] == ["0.3"]] == [
+        [scr, V_g, "1.2", "0.3"] for scr in ("2", "4") for V_g in ("0.1", "0.3")
+    ]
