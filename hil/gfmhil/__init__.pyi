@@ -1,5 +1,3 @@
-from gfm_hil.api.clearing_map import ClearingMap as ClearingMap
-from gfm_hil.api.clearing_map import clearing_map as clearing_map
 from gfm_hil.api.law import Law as Law
 from gfm_hil.api.law import laws as laws
 from gfm_hil.api.network_case import NetworkCase as NetworkCase
@@ -16,15 +14,20 @@ from gfm_hil.api.runs import run as run
 from gfm_hil.api.runs import run_network as run_network
 from gfm_hil.api.studies import campaign as campaign
 from gfm_hil.api.studies import certify as certify
-from gfm_hil.api.studies import clearing_time as clearing_time
 from gfm_hil.api.studies import conform as conform
 from gfm_hil.api.studies import identify as identify
 from gfm_hil.api.studies import judge_recording as judge_recording
 from gfm_hil.api.studies import scan as scan
+from gfm_hil.api.transients import TransientMap as TransientMap
+from gfm_hil.api.transients import attraction as attraction
+from gfm_hil.api.transients import attraction_map as attraction_map
+from gfm_hil.api.transients import clearing_map as clearing_map
+from gfm_hil.api.transients import clearing_time as clearing_time
 from gfm_hil.core.errors import UserError as UserError
 from gfm_hil.recording.foreign import grid_profile as grid_profile
 from gfm_hil.scenario import Scenario as Scenario
 from gfm_hil.scenario import load_scenario as load_scenario
+from gfm_hil.studies.attraction import Attraction as Attraction
 from gfm_hil.studies.campaign.result import CampaignResult as CampaignResult
 from gfm_hil.studies.certificate import CertifiedLaws as CertifiedLaws
 from gfm_hil.studies.clearing import ClearingTime as ClearingTime

@@ -1,6 +1,7 @@
 """Figures of linear loops and of frequency scans, with matplotlib."""
 
 from gfm_hil.api.plot import (
+    attraction_map,
     bode,
     certificate,
     clearing_map,
@@ -18,6 +19,7 @@ from gfm_hil.studies.scan_figures import admittance, nfp, nyquist_on_grid, passi
 
 __all__ = [
     "admittance",
+    "attraction_map",
     "bode",
     "certificate",
     "clearing_map",

@@ -6,6 +6,7 @@ gives a ``NetworkLoop``.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
-from gfm_hil.api.clearing_map import SCR
+from gfm_hil.api.transients import SCR
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import symbol_of
 from gfm_hil.results.figures import (
@@ -41,8 +42,9 @@ from gfm_runtime.signals import U_NAMES, Y_NAMES
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from gfm_hil.api.clearing_map import ClearingMap
     from gfm_hil.api.sweeps import GainSweep, StabilityMap
+    from gfm_hil.api.transients import TransientMap
+    from gfm_hil.studies.attraction import Attraction
 
 Vector = NDArray[np.float64]
 
@@ -291,33 +293,61 @@ def clearing_times(times: Sequence[ClearingTime], scr: Sequence[float]) -> Axes:
 
 
 @with_look
-def clearing_map(found: ClearingMap) -> list[Axes]:
+def clearing_map(found: TransientMap[ClearingTime]) -> list[Axes]:
     """Draw ``gfmhil.clearing_map``: what is borne, s, over one quantity as a curve; over two as
     cells, the first to the right and the second upwards; with a panel for each value of a third.
     The marks are those of ``clearing_times``."""
-    names, (x, *others) = [*found.over], [np.array(values) for values in found.over.values()]
-    if not others:
-        return [_clearing_curve(found.times, x, names[0])]
-    y, *third = others
+    if len(found.over) == 1:
+        ((name, x),) = found.over.items()
+        return [_clearing_curve(found.found, np.array(x), name)]
+    seconds = found.values("seconds")
+    panels = _cells(found, seconds, "clearing time [s]", float(seconds.max()) or 1.0)
+    kinds = np.array([_end(one) for one in found.found])
+    places = np.array([*itertools.product(*found.over.values())])
+    layers = [*found.over.values()][2] if len(found.over) > 2 else (None,)
+    for axes, layer in zip(panels, layers, strict=True):
+        here = True if layer is None else places[:, 2] == layer
+        for mark, meaning in _ENDS.items():
+            x, y = places[np.isin(kinds, mark) & here, :2].T
+            axes.plot(x, y, mark, color="w", mec="k", mew=0.7, ms=5, label=meaning)
+    figure_of(panels).legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
+        fontsize=rc("legend.fontsize", 8), frameon=False,
+    )  # fmt: skip
+    return panels
+
+
+@with_look
+def attraction_map(found: TransientMap[Attraction]) -> list[Axes]:
+    """Draw ``gfmhil.attraction_map``, degrees: over one quantity the jumps from which the converter
+    comes back; over two and three the smallest from which it does not, as ``clearing_map``."""
+    low, high = found.values("low"), found.values("high")
+    if len(found.over) > 1:
+        return _cells(found, np.minimum(-low, high), "comes back from jumps below [deg]", 180.0)
+    (axes,) = pyplot_panels(1, (6.6, 3.6))
+    ((name, x),) = found.over.items()
+    axes.fill_between(x, low, high, color=COLOURS[0], alpha=0.25, lw=0, label="comes back")
+    for edge in (low, high):
+        axes.plot(x, edge, "o-", color=COLOURS[0], lw=rc("lines.linewidth", 1.2), ms=4)
+    axes.set(xlabel=_QUANTITY.get(name, name), ylabel="jump of the grid's angle [deg]")
+    axes.set(ylim=(-185.0, 185.0), yticks=range(-180, 181, 60))
+    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+    dress_alone(axes, f"{found.law}: {found.title}")
+    return [axes]
+
+
+def _cells(found: TransientMap[Any], values: NDArray[Any], label: str, most: float) -> list[Axes]:
+    """A map over two quantities, or a panel for each value of a third, with its colours."""
+    names, (x, y, *third) = [*found.over], [np.array(values) for values in found.over.values()]
     layers = [f"{names[2]} = {z:g}" for z in third[0]] if third else [""]
     panels = pyplot_panels(len(layers), (6.6, 1.0 + 3.0 * len(layers)))
-    shape = len(x), len(y), len(layers)
-    seconds = found.seconds.reshape(shape)
-    kinds = np.array([_end(one) for one in found.times]).reshape(shape)
+    values = values.reshape(len(x), len(y), len(layers))
     for k, (axes, layer) in enumerate(zip(panels, layers, strict=True)):
-        cells = seconds[:, :, k].T
-        mesh = axes.pcolormesh(x, y, cells, shading="nearest", vmin=0.0, vmax=seconds.max() or 1.0)
-        for mark, meaning in _ENDS.items():
-            up, right = np.nonzero(np.isin(kinds[:, :, k].T, mark))
-            if len(up):
-                axes.plot(x[right], y[up], mark, color="w", mec="k", mew=0.7, ms=5, label=meaning)
+        mesh = axes.pcolormesh(x, y, values[:, :, k].T, shading="nearest", vmin=0.0, vmax=most)
         axes.set(ylabel=_QUANTITY.get(names[1], names[1]))
         dress_alone(axes, ", ".join(filter(None, (f"{found.law}: {found.title}", layer))))
     panels[-1].set(xlabel=_QUANTITY.get(names[0], names[0]))
-    figure = figure_of(panels)
-    figure.colorbar(mesh, ax=panels, label="clearing time [s]")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
-                  fontsize=rc("legend.fontsize", 8), frameon=False)  # fmt: skip
+    figure_of(panels).colorbar(mesh, ax=panels, label=label)
     return panels
 
 

@@ -14,11 +14,10 @@ from gfm_hil.core.files import check_empty
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.scenario.schema import laws_digest
-from gfm_hil.studies import clearing, unit_fit
+from gfm_hil.studies import unit_fit
 from gfm_hil.studies.campaign.execute import run_campaign
 from gfm_hil.studies.campaign.result import CampaignResult
 from gfm_hil.studies.certificate import CertifiedLaws, certify_laws
-from gfm_hil.studies.clearing import ClearingTime
 from gfm_hil.studies.conformity import recorded
 from gfm_hil.studies.conformity.execute import execute, external_controller, make_jobs
 from gfm_hil.studies.conformity.hashes import file_hashes
@@ -294,36 +293,6 @@ def measure_unit(
             changes = {**changes, "law": file}
         scenario = load_scenario(on, in_process=True, **changes)
         return unit_fit.measure_unit(scenario, degrees, seconds)
-
-
-def clearing_time(
-    law: str | Path | Law | None = None,
-    on: str | Path | Scenario = "deep_sag",
-    *,
-    longest: float = clearing.LONGEST_S,
-    after: float = clearing.AFTER_S,
-    within: float | None = None,
-    watch: Watch = SILENT,
-    **changes: Any,
-) -> ClearingTime:
-    """How long the fault or the sag of a scenario may last before its converter is lost.
-
-    Args:
-        law: name, law file or ``Law``; the scenario's own if None.
-        on: scenario of one converter, with one event that has a ``duration``.
-        longest, after, within, watch: as for ``gfm_hil.studies.clearing.clearing_time``.
-        changes: keys of the scenario, as for ``run``, e.g. ``plant__grid__scr=2.0``.
-
-    Raises:
-        UserError: one line a mistake, or no operating point.
-        LawError: the law is none.
-    """
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        scenario = load_scenario(on, in_process=True, **changes)
-        made = clearing.clearing_time(scenario, longest, after, within, watch)
-    return replace(made, law=law.name) if isinstance(law, Law) else made
 
 
 def certify(

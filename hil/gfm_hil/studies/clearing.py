@@ -60,6 +60,11 @@ class ClearingTime:
     loss: str
     trials: tuple[Trial, ...]
 
+    def row(self) -> dict[str, Any]:
+        """``seconds``, ``lost``, ``loss``, and the number of ``runs``."""
+        found = {name: getattr(self, name) for name in ("seconds", "lost", "loss")}
+        return {**found, "runs": len(self.trials)}
+
     def __repr__(self) -> str:
         borne = f"{self.seconds:.4g} s, then {self.loss}" if self.loss else f"{self.seconds:g} s"
         return f"<ClearingTime {self.law}: bears {borne}>"

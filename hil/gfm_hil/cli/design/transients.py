@@ -1,0 +1,137 @@
+"""gfmhil design clearing and attraction: how long a fault may last, and from which angles a
+converter comes back, at one place or over a map."""
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gfm_hil.api import plot
+from gfm_hil.api.transients import SCR, WITHIN_S, attraction_map, clearing_map
+from gfm_hil.cli.common import numbers, watching
+from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.terminal import terminal
+from gfm_hil.results.report import finite
+from gfm_hil.results.table import Table
+from gfm_hil.studies import attraction, clearing
+
+#: heads of what ``row`` has, and how it is told
+_CLEARING = (("seconds", "bears [s]", None), ("loss", "a longer one", "borne"))
+_ATTRACTION = (
+    ("low", "back from [deg]", None), ("high", "to [deg]", None),
+    ("below", "a larger jump back", "comes back"), ("above", "a larger one ahead", "comes back"),
+)  # fmt: skip
+
+
+def add(kinds: Any) -> None:
+    text = "how long the fault or the sag of a scenario may last before the converter is lost"
+    command = _add(kinds, "clearing", text, "deep_sag", clearing.AFTER_S)
+    command.add_argument(
+        "--longest", metavar="S", type=float, default=clearing.LONGEST_S,
+        help="tried (default: %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--within", metavar="S", type=float,
+        help=f"resolution; one tick by default, {WITHIN_S:g} of a map",
+    )  # fmt: skip
+    command.set_defaults(call=_clearing)
+    text = "from which jumps of the grid's angle a converter at rest comes back to where it was"
+    command = _add(kinds, "attraction", text, "pref_step", attraction.AFTER_S)
+    command.add_argument(
+        "--within", metavar="DEG", type=float, default=attraction.WITHIN,
+        help="resolution, degrees (default: %(default)s)",
+    )  # fmt: skip
+    command.set_defaults(call=_attraction)
+
+
+def _add(kinds: Any, name: str, text: str, scenario: str, after: float) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = kinds.add_parser(
+        name, help=text, description=f"{text}, by runs"
+    )
+    add_loop_options(command)
+    command.set_defaults(scenario=scenario)
+    command.add_argument(
+        "--scr", metavar="LIST", type=numbers, default=[],
+        help="short-circuit ratios by commas; that of the scenario by default",
+    )  # fmt: skip
+    command.add_argument(
+        "--over", metavar="KEY=LIST", type=_quantity, action="append", default=[],
+        help="values of a key of the scenario, e.g. references.P_ref=0.2,0.8, or of its inner"
+        " stage, as inner.I_max=1.1,1.2; may be repeated, with --scr for a map of up to three",
+    )  # fmt: skip
+    command.add_argument(
+        "--after", metavar="S", type=float, default=after,
+        help="how long a run goes on afterwards (default: %(default)s)",
+    )  # fmt: skip
+    command.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
+    add_figure(command)
+    return command
+
+
+def _quantity(text: str) -> tuple[str, list[float]]:
+    """KEY=LIST."""
+    name, equals, values = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be KEY=LIST, e.g. events.0.V_g=0.1,0.2")
+    return name, numbers(values)
+
+
+def _clearing(options: argparse.Namespace) -> int:
+    how = {"longest": options.longest, "after": options.after}
+    at_map = {**how, "within": options.within or WITHIN_S}
+    how["within"] = options.within
+    return _tell(options, _CLEARING, clearing.clearing_time, how, clearing_map, at_map,
+                 plot.clearing_map)  # fmt: skip
+
+
+def _attraction(options: argparse.Namespace) -> int:
+    how = {"within": options.within, "after": options.after}
+    return _tell(options, _ATTRACTION, attraction.attraction, how, attraction_map, how,
+                 plot.attraction_map)  # fmt: skip
+
+
+def _tell(
+    options: argparse.Namespace,
+    columns: Sequence[tuple[str, str, str | None]],
+    at_one: Callable[..., Any],
+    how: dict[str, Any],
+    at_map: Callable[..., Any],
+    how_map: dict[str, Any],
+    draw: Callable[..., object],
+) -> int:
+    """Find and print; exit code 0 also where nothing is borne."""
+    scenario = chosen_scenario(options.scenario, options)
+    over = ({SCR: options.scr} if options.scr else {}) | dict(options.over)
+    if options.out and not over:
+        raise UserError("--out: the figure is one over --scr or --over")
+    with watching(options.design) as watch:
+        if not over:
+            rows = [at_one(scenario, **how, watch=watch).row()]
+        else:
+            found = at_map(
+                None, scenario, over=over, workers=options.workers, watch=watch, **how_map
+            )
+            rows = found.rows()
+            if options.out:
+                save_figure(options.out, lambda: draw(found))
+    if options.json:
+        print(json.dumps(finite(rows), indent=2))
+        return 0
+    console = terminal(highlight=False)
+    console.print(f"[bold]{scenario.law}[/] · {scenario.title}")
+    heads = ["SCR" if name == SCR else name for name in over]
+    cells = [
+        [*(f"{row[name]:g}" for name in over), *(_cell(row[key], none) for key, _, none in columns),
+         row["runs"]]
+        for row in rows
+    ]  # fmt: skip
+    console.print(Table([*heads, *(head for _, head, _ in columns), "runs"], cells, text=0))
+    if options.out:
+        console.print(f"figure: {options.out}", soft_wrap=True)
+    return 0
+
+
+def _cell(value: Any, none: str | None) -> Any:
+    """A number, or a reason without its numbers; ``none`` if there is no reason."""
+    return value if none is None else value.partition(":")[0] or none
