@@ -22,7 +22,7 @@ from gfm_design.norms.performance import PAPER_WEIGHTS, Weight, WeightedChannel,
 from gfm_design.tuning import paper as search
 from gfm_design.tuning.full_order import FullOrder, full_order
 from gfm_design.tuning.gains import free_gains
-from gfm_design.tuning.synthesis import NotStabilised
+from gfm_design.tuning.synthesis import NotStabilised, Tuned
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
@@ -248,8 +248,12 @@ def tune(
         raise NotTuned(_in_the_way(none, problem, converter)) from None
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
+    return _tuning(law, name or f"{law.name}-tuned", problem, found)
+
+
+def _tuning(law: Law, name: str, problem: search.PaperProblem, found: Tuned) -> Tuning:
     named = problem.law.named(found.values)
-    tuned = law.with_gains(name or f"{law.name}-tuned", **named)
+    tuned = law.with_gains(name, **named)
     after = _gamma_of(tuned.name, problem, found.values)
     try:
         before = _gamma_of(law.name, problem, np.array([gain.start for gain in problem.gains]))

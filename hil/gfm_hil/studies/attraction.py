@@ -106,7 +106,7 @@ def check_attraction(scenario: Scenario, after: float, within: float) -> None:
 
 
 def _loss(scenario: Scenario, degrees: float, after: float) -> str:
-    """Why the converter does not come back after a jump; empty if it does."""
+    """The reason for which the converter does not come back after a jump; empty if it does."""
     content = scenario.model_dump(mode="json", exclude_unset=True)
     jump = {"type": "grid-phase-jump", "t": _BEFORE_S, "degrees": degrees}
     content |= {"events": [jump], "duration": _BEFORE_S + after}
