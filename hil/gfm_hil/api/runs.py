@@ -270,13 +270,21 @@ def recover(folder: str | Path) -> Run | NetworkRun:
     return run_folder.recover(folder, write_report)
 
 
-def merge(first: str | Path, second: str | Path, folder: str | Path) -> Run:
-    """One run folder from the two of a controller and a plant that were started separately.
+def merge(
+    first: str | Path, second: str | Path, folder: str | Path, *others: str | Path
+) -> Run | NetworkRun:
+    """One run folder from those of a controller and a plant that were started separately; of a
+    network from that of its plant, ``first``, and of the controllers of all its converters.
 
     Raises:
         UserError: a folder is not that of one side, they are not of the same run or of the same
             converter, or ``folder`` is in use or cannot be written.
     """
+    if converters_of(Path(first)):
+        controllers = [Path(one) for one in (second, *others)]
+        return NetworkRun.merge(Path(first), controllers, Path(folder), write_report)
+    if others:
+        raise UserError(f"{first}: is not of a network, whose folders may be more than two")
     return run_folder.merge_roles(Path(first), Path(second), Path(folder), write_report)
 
 

@@ -1,4 +1,4 @@
-"""gfmhil merge: one run folder from the two of a controller and a plant started separately."""
+"""gfmhil merge: one run folder from those of a plant and its controllers, started separately."""
 
 import argparse
 from pathlib import Path
@@ -11,17 +11,22 @@ from gfm_hil.results.report import PAGE
 def add(command: argparse.ArgumentParser) -> None:
     command.description = (
         "Merge the folders that gfmhil controller and gfmhil plant recorded of one run into one "
-        "run folder with all signals, metrics, figures and the report. The two are kept."
+        "run folder with all signals, metrics, figures and the report; of a network the folder of "
+        "the plant and those of all its controllers. They are kept."
     )
-    command.add_argument("first", type=Path, metavar="A", help="folder of one side")
-    command.add_argument("second", type=Path, metavar="B", help="folder of the other side")
+    command.add_argument("first", type=Path, metavar="A", help="folder of one side, or of a plant")
+    command.add_argument(
+        "others", type=Path, nargs="+", metavar="B",
+        help="folder of the other side, or of each controller",
+    )  # fmt: skip
     command.add_argument("-o", "--out", help="run folder; runs/merged-<time> by default")
     add_open(command)
 
 
 def call(options: argparse.Namespace) -> int:
     folder = new_folder(options.out, "merged")
-    run = merge(options.first, options.second, folder)
+    second, *others = options.others
+    run = merge(options.first, second, folder, *others)
     print_run(run, folder)
     show_page(options, folder / PAGE)
     return exit_code(run)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,7 +12,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import Run, Signals, nominal_frequency, read_scenario
-from gfm_hil.run.run_folder import Report, recover, save
+from gfm_hil.run.run_folder import Report, merge_roles, recover, save
 from gfm_hil.scenario import Scenario, write_scenario
 
 if TYPE_CHECKING:
@@ -83,6 +83,37 @@ class NetworkRun(Mapping[str, Run]):
         UserError, Unfinished: as ``run_folder.recover``."""
         scenario = read_scenario(folder)
         runs = {name: recover(place, report) for name, place in _places(folder, scenario).items()}
+        found = cls(scenario, runs, folder)
+        found.conclude(folder, report)
+        return found
+
+    @classmethod
+    def merge(
+        cls, plant: Path, controllers: Sequence[Path], folder: Path, report: Report | None = None
+    ) -> NetworkRun:
+        """One folder of a network from that of its plant and those of its controllers, which were
+        started separately. Raises UserError: they are not one folder for each converter, or as
+        ``run_folder.merge_roles``."""
+        scenario = read_scenario(plant)
+        places = _places(plant, scenario)
+        check_empty(folder)
+        of: dict[str | None, Path] = {}
+        for place in controllers:
+            name = read_scenario(place).converter
+            if name not in places or name in of:
+                again = f"as {of[name]} has" if name in of else f"none of {[*places]}"
+                raise UserError(f"{place}: has the controller of {name}, {again}")
+            of[name] = place
+        if missing := [name for name in places if name not in of]:
+            raise UserError(f"{plant}: the folder of the controller of {missing[0]} is missing")
+        runs = {
+            name: merge_roles(place, of[name], folder / name, report)
+            for name, place in places.items()
+        }
+        try:
+            write_scenario(folder, scenario)
+        except OSError as problem:
+            raise UserError(f"{folder}: {problem.strerror}") from None
         found = cls(scenario, runs, folder)
         found.conclude(folder, report)
         return found

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.recording.log import read_log
@@ -203,7 +204,7 @@ def by_hand(tmp_path: Path, file: Path, *more: str) -> dict[str, subprocess.Pope
     }
 
 
-def test_roles_started_by_hand_meet(tmp_path):
+def test_roles_started_by_hand_meet(tmp_path, refused):
     file = tmp_path / "two.toml"
     file.write_text(toml_text(content(link=over("zmq"), duration=0.3)), "utf-8")
     ended = {name: end(process) for name, process in by_hand(tmp_path, file).items()}
@@ -214,6 +215,17 @@ def test_roles_started_by_hand_meet(tmp_path):
     memory, found = gfmhil.run_network(content(duration=0.3))["B"], signals(tmp_path / "whole")
     for key, column in memory.columns.items():
         np.testing.assert_array_equal(found[key], column[:], err_msg=key)
+    plant, a, b = (str(tmp_path / name) for name in ("plant", "A", "B"))
+    for folders, said in (
+        ([a], "the folder of the controller of B is missing"),
+        ([a, a], "A: has the controller of A, as "),
+        ([a, b, plant], "plant: has the controller of None, none of ['A', 'B']"),
+    ):
+        assert said in refused("merge", plant, *folders, "--out", str(tmp_path / "none"))
+    assert main(["merge", plant, b, a, "--out", str(tmp_path / "network")]) == 0
+    network = gfmhil.NetworkRun.load(tmp_path / "network")
+    assert network.status == "completed" and (tmp_path / "network" / "report.html").is_file()
+    np.testing.assert_array_equal(network["B"].columns["true_p"][:], found["true_p"])
 
 
 def test_a_controller_of_another_scenario_is_refused(tmp_path):
