@@ -90,18 +90,19 @@ def read_dyr(path: str | Path) -> list[Record]:
         UserError: it cannot be read, has none of them, or a record is none; the message has the
             file, the line and the field.
     """
-    try:
-        text = read_file(Path(path)).decode("utf-8", "replace")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    found = [one for one in (_record(path, *r) for r in _records(path, text)) if one is not None]
+    found = [one for one in (_record(path, *r) for r in records(path)) if one is not None]
     if not found:
         raise UserError(f"{path}: no record of {' or '.join(MODELS)}")
     return found
 
 
-def _records(path: str | Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """The line at which each record begins, and its fields."""
+def records(path: str | Path) -> Iterator[tuple[int, list[str]]]:
+    """The line at which each record of a file begins, and its fields. Raises UserError: it cannot
+    be read, or its last record does not end."""
+    try:
+        text = read_file(Path(path)).decode("utf-8", "replace")
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
     begin, fields = 0, list[str]()
     for number, line in enumerate(text.splitlines(), 1):
         for quoted, bare, end in _TOKEN.findall(line.split("//")[0]):
@@ -138,7 +139,7 @@ def _record(path: str | Path, line: int, fields: list[str]) -> Record | None:
         raise UserError(f"{where}, flags: {own}: only {known} is a law here")
     numbers = {}
     for field, value in zip(model.numbers, given[len(flags) :], strict=True):
-        numbers[field] = _number(f"{where}, {field}", value)
+        numbers[field] = number(f"{where}, {field}", value)
         if field in model.above_0 and not numbers[field] > 0.0:
             raise UserError(f"{where}, {field}: {value} must be > 0")
         if field in model.at_0 and numbers[field]:
@@ -149,7 +150,8 @@ def _record(path: str | Path, line: int, fields: list[str]) -> Record | None:
     return Record(where, name, int(fields[0]), machine, numbers)
 
 
-def _number(where: str, text: str) -> float:
+def number(where: str, text: str) -> float:
+    """A number of a record. Raises UserError: it is none that a model has."""
     try:
         value = float(re.sub("[dD]", "e", text))
     except ValueError:

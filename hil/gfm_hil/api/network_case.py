@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from gfm_design.model.operating_point import node_voltages, operating_point
+from gfm_hil.api.dyr_machines import Machines, read_machines
 from gfm_hil.api.power_flow import PowerFlow, read_pandapower
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
@@ -84,14 +85,15 @@ def network_from(
     converters: Mapping[str | int, str | tuple[str, float]],
     slack: str = "machine",
     title: str = "",
+    dynamics: str | Path | None = None,
 ) -> NetworkCase:
     """Make a network of a power-flow case.
 
     Each bus with generators gets one synchronous machine of order 6 with a voltage regulator and a
-    governor, or the converter that is named for it, which has the rating and the operating point
-    of what it replaces, or a share of both beside a machine with the rest. Loads become constant
-    impedances that draw at the case's voltage what they draw there, the charging of transformers
-    capacitors at the buses.
+    governor, or what ``dynamics`` says, or the converter that is named for it, which has the rating
+    and the operating point of what it replaces, or a share of both beside a machine with the rest.
+    Loads become constant impedances that draw at the case's voltage what they draw there, the
+    charging of transformers capacitors at the buses.
 
     Args:
         case: a net of pandapower, the name of one of its cases (case9, case39, ...), or the path
@@ -101,6 +103,8 @@ def network_from(
             of the case's buses, is the network's base.
         slack: machine, or grid: what stands at the slack bus, if no converter does.
         title: of the scenario.
+        dynamics: dynamic data file of PSS/E (.dyr) with the machines and their controls, see
+            ``read_machines``.
 
     Raises:
         UserError: an unknown case, bus or law; a case that has no slack or does not converge; a
@@ -128,19 +132,25 @@ def network_from(
             )
     if slack not in ("machine", "grid"):
         raise UserError(f"slack = {slack!r}: must be machine or grid")
-    return _Build(flow, laws, slack == "grid").case()
+    machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
+    for name in machines.at:
+        if name not in names:
+            raise UserError(f"{dynamics}: bus {name}: is no bus of {flow.title}")
+    return _Build(flow, laws, slack == "grid", machines).case()
 
 
 class _Build:
     """A network of a solved case, being written; p.u. of the first converter from here on."""
 
-    def __init__(self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool) -> None:
-        self.flow, self.laws = flow, laws
+    def __init__(
+        self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool, machines: Machines
+    ) -> None:
+        self.flow, self.laws, self.machines = flow, laws, machines.at
         first, name = next((k, bus.name) for k, bus in enumerate(flow.buses) if bus.name in laws)
         self.S_b = laws[name][1] * self._rating(first)
         self.scale = flow.S_b / self.S_b
         self.grid = flow.slack if grid and flow.buses[flow.slack].name not in laws else None
-        self.ignored = list(flow.ignored)
+        self.ignored = [*flow.ignored, *machines.ignored]
         self.files: dict[str, dict[str, Any]] = {}
         self.par: Any = None  # the same for all, in p.u. of each
         self.network: dict[str, Any] = {} if self.grid is None else {"grid": self._node(self.grid)}
@@ -244,7 +254,7 @@ class _Build:
         R = float(_default("synchronous_machines", "R"))
         P = bus.machine.real * self.flow.S_b / S + R * abs(i) ** 2
         values = {"node": self._node(k), "S": share * S / self.S_b, "P": P, "V": abs(bus.V)}
-        values |= _MACHINE
+        values |= self.machines.get(bus.name, _MACHINE)
         self._put("synchronous_machines", f"G{bus.name}", values)
 
     def _converter(self, k: int, law: str, share: float) -> None:

@@ -29,6 +29,10 @@ def add(command: argparse.ArgumentParser) -> None:
         "--slack", choices=("machine", "grid"), default="machine",
         help="what stands at the slack bus (default: %(default)s)",
     )  # fmt: skip
+    read.add_argument(
+        "--dynamics", metavar="FILE",
+        help="dynamic data of PSS/E (.dyr): GENROU, SEXS, IEEET1, TGOV1, PSS1A and IEEEST",
+    )  # fmt: skip
     read.add_argument("-o", "--out", metavar="FOLDER", help="(default: the case's name)")
     read.set_defaults(call=call_import)
 
@@ -44,7 +48,7 @@ def call_import(options: argparse.Namespace) -> int:
             converters[bus] = (law, float(share)) if colon else law
         except ValueError:
             raise UserError(f"--converter {text}: {share!r} must be a number in (0, 1]") from None
-    case = network_from(options.case, converters, options.slack)
+    case = network_from(options.case, converters, options.slack, dynamics=options.dynamics)
     file = case.save(options.out or Path(options.case).stem)
     network, console = case.content["network"], terminal()
     console.print(", ".join(f"{len(parts)} {table.replace('_', ' ')}"

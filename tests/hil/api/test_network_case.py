@@ -139,3 +139,61 @@ def test_from_the_command_line(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "1 converters, 9 lines" in said and "p.u. from the power flow" in said
     assert (tmp_path / "net" / "network.toml").is_file()
+
+
+#: in the format of PSS/E, its numbers in the order of its manual
+DYNAMICS = """\
+1 'GENROU' 1 8.96 0.04 0.31 0.06 23.64 0.0 1.46 0.969 0.3608 0.569 0.2 0.0836 0.0 0.0 / the slack
+1 'IEEET1' 1 0.0 20.0 0.2 5.0 -5.0 1.0 0.314 0.063 0.35 0 3.0 0.2 4.0 0.5 /
+1 'TGOV1' 1 0.05 0.5 1.2 0.0 2.0 7.0 0.0 /
+2 'GENROU' 1 6.0 0.04 0.535 0.06
+  6.4 0.0 0.8958 0.8645 0.1198 0.1969 0.089 0.0521 0.1 0.2 /
+2 'SEXS' 1 0.1 10.0 100.0 0.05 0.0 5.0 /
+2 'IEEEST' 1 1 0 0 0 0 0 0 0 0.05 0.02 3.0 5.4 10.0 5.0 20.0 0.2 -0.2 0 0 /
+2 'EXDC2' 1 0 0 /
+"""
+
+
+def test_machines_of_a_dynamics_file_run(tmp_path):
+    file = tmp_path / "case9.dyr"
+    file.write_text(DYNAMICS)
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    one, two = (case.content["network"]["synchronous_machines"][f"G{k}"] for k in "12")
+    known = {"H": 23.64, "T_d10": 8.96, "T_q20": 0.06, "X_q1": 0.569, "X_2": 0.2, "X_l": 0.0836}
+    assert {key: one[key] for key in known} == known and "pss" not in one
+    assert one["avr"] == {
+        "type": "IEEET1", "T_R": 1e-3, "K_A": 20.0, "T_A": 0.2, "V_Rmax": 5.0, "V_Rmin": -5.0,
+        "K_E": 1.0, "T_E": 0.314, "K_F": 0.063, "T_F": 0.35, "E_1": 3.0, "S_E1": 0.2, "E_2": 4.0,
+        "S_E2": 0.5,
+    }  # fmt: skip
+    assert one["governor"] == {
+        "type": "TGOV1", "R": 0.05, "T1": 0.5, "V_max": 1.2, "V_min": 0.0, "T2": 2.0, "T3": 7.0,
+        "D_t": 0.0,
+    }  # fmt: skip
+    assert (two["avr"]["T_A"], two["avr"]["K"], "governor" in two) == (1.0, 100.0, False)
+    # its washout 20 · 10 s/(1 + 5 s), as ours is written
+    assert (two["pss"]["K_S"], two["pss"]["T5"], two["pss"]["T6"]) == (40.0, 5.0, 0.0)
+    for line in ("T_R = 0.001 s instead of 0", "its saturation is left out", "EXDC2 at bus 2 is"):
+        assert sum(line in said for said in case.ignored) in (1, 2), line
+    run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.5)
+    p = run["C3"].signals["p"]
+    assert run.status == "completed" and np.ptp(p) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("1.2 0.0 2.0 7.0 0.0 /", "1.2 /", "line 3: TGOV1 has 7 numbers, not 3"),
+        ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
+        ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
+        ("1 '", "77 '", "bus 77: is no bus of case9"),
+        ("GENROU", "GENSAL", "no record of GENROU"),
+    ],
+)
+def test_a_dynamics_file_that_is_none_is_one_line(old, new, line, tmp_path, capsys):
+    file = tmp_path / "wrong.dyr"
+    file.write_text(DYNAMICS.replace(old, new))
+    command = ["network", "import", "case9", "--converter", "3=droop-3", "--dynamics", str(file)]
+    assert main([*command, "-o", str(tmp_path / "net")]) == 2
+    said = capsys.readouterr()
+    assert line in said.err and len(said.err.splitlines()) == 1 and not said.out

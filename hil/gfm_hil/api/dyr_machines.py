@@ -1,0 +1,125 @@
+"""Machines and their controls of a dynamic data file of PSS/E (.dyr)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gfm_hil.api.dyr import number, records
+from gfm_hil.core.errors import UserError
+
+_SHORT = 1e-3  # s; takes the place of a time constant of 0 where ours must be positive
+
+Numbers = dict[str, float]
+#: keys of a table, and what is otherwise than in the record
+Made = tuple[dict[str, Any], list[str]]
+
+
+class Machines(NamedTuple):
+    """What a file says of the machines."""
+
+    at: Mapping[str, dict[str, Any]]  #: by the name of the bus: keys of ``synchronous_machines``
+    ignored: Sequence[str]  #: what it says and this has not, or has otherwise
+
+
+def read_machines(path: str | Path) -> Machines:
+    """Read the records of GENROU, and of its controls SEXS, IEEET1, TGOV1, PSS1A and IEEEST.
+
+    Raises:
+        UserError: the file cannot be read, has no machine, or a record is none; the message has the
+            file, the line and the field.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    ignored: list[str] = []
+    for line, fields in records(path):
+        where = f"{path}, line {line}"
+        if len(fields) < 3:
+            raise UserError(f"{where}: must be a bus, a model in quotes, a machine and numbers")
+        bus, model = fields[0], fields[1].upper()
+        if model not in _MODELS:
+            ignored.append(f"{model} at bus {bus} is not known here and left out.")
+            continue
+        key, names, make = _MODELS[model]
+        if key in found.setdefault(bus, {}):
+            ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
+            continue
+        if (count := len(fields) - 3) != len(names):
+            raise UserError(f"{where}: {model} has {len(names)} numbers, not {count}")
+        numbers = {
+            name: number(f"{where}, {name}", text)
+            for name, text in zip(names, fields[3:], strict=True)
+        }
+        found[bus][key], notes = make(numbers)
+        ignored += [f"{model} at bus {bus}: {note}." for note in notes]
+    machines = {}
+    for bus, parts in found.items():
+        own = parts.pop("machine", None)
+        if own is None:
+            ignored.append(f"The controls at bus {bus} are left out with their machine.")
+            continue
+        if "pss" in parts and "avr" not in parts:
+            ignored.append(f"The stabiliser at bus {bus} is left out with its exciter.")
+            parts.pop("pss")
+        machines[bus] = own | parts
+    if not machines:
+        raise UserError(f"{path}: no record of GENROU")
+    return Machines(machines, list(dict.fromkeys(ignored)))
+
+
+def _genrou(p: Numbers) -> Made:
+    saturates = p.pop("S_10"), p.pop("S_12")
+    return {**p}, ["its saturation is left out"] if any(saturates) else []
+
+
+def _sexs(p: Numbers) -> Made:
+    T_A = p.pop("T_A/T_B") * p["T_B"]
+    return _lagging({"type": "SEXS", "T_R": 0.0, "T_A": T_A, **p}, "T_R", "T_B", "T_E")
+
+
+def _ieeet1(p: Numbers) -> Made:
+    p.pop("switch")
+    return _lagging({"type": "IEEET1", **p}, "T_R", "T_A", "T_E", "T_F")
+
+
+def _tgov1(p: Numbers) -> Made:
+    return _lagging({"type": "TGOV1", **p}, "T1", "T3")
+
+
+def _stabiliser(p: Numbers) -> Made:
+    """Its washout is K_S T5 s/(1 + T6 s), ours K_S T5 s/(1 + T5 s)."""
+    notes = []
+    if p.pop("mode") != 1.0:
+        notes.append("acts on the speed here")
+    more = [p.pop(name, 0.0) for name in ("bus", "A3", "A4", "A5", "A6", "V_CU", "V_CL")]
+    if any(more[1:]):
+        notes.append("A3 to A6, V_CU and V_CL are left out")
+    lag = p["T6"] or _SHORT
+    p["K_S"], p["T5"], p["T6"] = p["K_S"] * p["T5"] / lag, lag, 0.0
+    return {"type": "PSS1A", **p}, notes
+
+
+def _lagging(content: dict[str, Any], *lags: str) -> Made:
+    """With time constants that are positive, as ours must be."""
+    zero = [name for name in lags if content[name] == 0.0]
+    return content | dict.fromkeys(zero, _SHORT), [f"{n} = {_SHORT:g} s instead of 0" for n in zero]
+
+
+_LEADS = ("T1", "T2", "T3", "T4", "T5", "T6", "K_S", "V_STmax", "V_STmin", "V_CU", "V_CL")
+#: by model: which part of a machine it is, its numbers in the order of a record, and what makes it
+_MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
+    "GENROU": (
+        "machine",
+        ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
+         "S_10", "S_12"),
+        _genrou,
+    ),
+    "SEXS": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max"), _sexs),
+    "IEEET1": (
+        "avr",
+        ("T_R", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F", "switch", "E_1",
+         "S_E1", "E_2", "S_E2"),
+        _ieeet1,
+    ),
+    "TGOV1": ("governor", ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"), _tgov1),
+    "PSS1A": ("pss", ("mode", "bus", "A1", "A2", *_LEADS), _stabiliser),
+    "IEEEST": ("pss", ("mode", "bus", "A1", "A2", "A3", "A4", "A5", "A6", *_LEADS), _stabiliser),
+}  # fmt: skip
