@@ -106,6 +106,11 @@ def _line(at: Path, errors: Sequence[Any], model: Any) -> str:
         # a file is always a table; only a message as a whole, in JSON, can be something else
         text = "must be a table" if path else "must be an object"
         text += f" with {', '.join(dict.fromkeys(keys))}" if keys else ""
+    if error["type"] == "string_pattern_mismatch":  # a pattern is not for people
+        *parents, last = error["loc"]
+        of = (m.model_fields.get(str(last)) for m in _models_at(model, parents))
+        words = [field.description for field in of if field is not None and field.description]
+        text = f"must be {words[0]}" if words else text
     needs = [text, *(_said(other).removeprefix("must be ") for other in errors[1:])]
     words = [w for e in errors if "expected" in e.get("ctx", {}) for w in
              _quoted(str(e["ctx"]["expected"]))]  # fmt: skip

@@ -81,7 +81,7 @@ MISTAKES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "a boolean number": ("T = 2.0 }", "T = true }",
         ("phi.34.T", "True", "number or an expression")),
     "a number for a name": ('name = "custom-1"', "name = 3", ("name", "3", "string")),
-    "bad name": ('name = "custom-1"', 'name = "a b"', ("name", "'a b'", "pattern")),
+    "bad name": ('name = "custom-1"', 'name = "a b"', ("name: must be lower case letters, digits", "'a b'")),
     "no type": ('type = "I", T = 2.0', "T = 2.0", ("phi.34.type", "missing")),
     "no factors": ('{ type = "I", T = 2.0 }', "[]", ("phi.34", "at least 1")),
     "too many factors": ('{ type = "I", T = 2.0 }',
