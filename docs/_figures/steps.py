@@ -115,8 +115,9 @@ def switchover() -> None:
     one = run(case)
     with tempfile.TemporaryDirectory() as place:
         shown = {**one.signals, **window(one, 0.8, 4.0)}
-        drawn = draw_run(Path(place), case, shown, {}, one.summary)
-        shutil.move(drawn[0].path, FIGURES / "switchover.png")
+        with draw_run(Path(place), case, shown, one.summary):
+            pass
+        shutil.move(Path(place) / "signals.png", FIGURES / "switchover.png")
     s = one.summary
     mantissa, exponent = f"{s['bump_pu'][0]:.1e}".split("e")
     write_table(

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def run(make: Make, tmp_path: Path) -> RunIt:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports without the figures of a run, which take most of their time."""
-    monkeypatch.setattr("gfm_hil.results.figures.draw_run", lambda *_: [])
+    monkeypatch.setattr("gfm_hil.results.figures.draw_run", lambda *_: nullcontext())
 
 
 @contextmanager

@@ -1,44 +1,51 @@
 """Work that a forked process does while this one goes on."""
 
 import os
+import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any
 
+from gfm_runtime.children import end_with_parent
 
-def beside(work: Callable[..., object], *arguments: Any) -> Callable[[], None]:
-    """Begin work that only writes files, on another processor if one may be had.
+
+@contextmanager
+def beside(work: Callable[..., object], *arguments: Any) -> Iterator[None]:
+    """Do work that only writes files, on another processor if one may be had, during a block; it is
+    done, or has ended, after the block.
 
     A process with other threads is not forked: a lock that one of them has would never be released
     in the copy. That of a progress bar only writes to the terminal, which ``work`` does not.
 
-    Returns:
-        What waits until it has ended, and raises what ``work`` raises.
+    Raises:
+        Exception: what ``work`` raises, after the block.
     """
-
-    def here() -> None:
-        work(*arguments)
-
     others = (t for t in threading.enumerate() if type(t).__module__ != "rich.live")
     if [*others] != [threading.main_thread()] or (os.cpu_count() or 1) < 2:
-        return here
-    process = get_context("fork").Process(target=_quietly, args=(here,))
+        yield
+        work(*arguments)
+        return
+    process = get_context("fork").Process(target=_quietly, args=(work, *arguments))
     process.start()
-
-    def wait() -> None:
+    try:
+        yield
+    except BaseException:
+        process.kill()
+        raise
+    finally:
         process.join()
-        if process.exitcode:  # once more, where its error can be told
-            here()
-
-    return wait
+    if process.exitcode:  # once more, where its error can be told
+        work(*arguments)
 
 
-def _quietly(work: Callable[[], None]) -> None:
+def _quietly(work: Callable[..., object], *arguments: Any) -> None:
     """End this process after the work, without a word and without what others do at an exit."""
+    end_with_parent(by=signal.SIGKILL)
     code = 1
     try:
-        work()
+        work(*arguments)
         code = 0
     finally:
         os._exit(code)

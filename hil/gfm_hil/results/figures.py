@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree import ElementTree
@@ -364,11 +365,12 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
             few.save(part, "PNG", optimize=True)
 
 
+@contextmanager
 def draw_run(
     folder: Path, scenario: Scenario, signals: Columns, summary: dict[str, Any]
-) -> list[Callable[[], None]]:
-    """Begin to draw one run into signals.png and waveforms.png of its folder; a page shows them as
-    ``panels_of_run`` and ``panels_of_waves``. Returns what waits until each is there."""
+) -> Iterator[None]:
+    """Draw one run into signals.png and waveforms.png of its folder during a block, see ``beside``;
+    a page shows them as ``panels_of_run`` and ``panels_of_waves``."""
 
     def signals_png() -> None:
         figure = _figure(SIZE)
@@ -380,8 +382,12 @@ def draw_run(
         if draw_waveforms(figure, scenario, signals, summary):
             _save(figure, folder / "waveforms.png", few_colours=True)
 
-    waits = [beside(signals_png)] if "true_p" in signals else []
-    return waits + ([beside(waveforms_png)] if signals.keys() >= {*NEEDS} else [])
+    with ExitStack() as stack:
+        if "true_p" in signals:
+            stack.enter_context(beside(signals_png))
+        if signals.keys() >= {*NEEDS}:
+            stack.enter_context(beside(waveforms_png))
+        yield
 
 
 SIZE = (10.5, 7.4)  # inches, of the six panels of a run

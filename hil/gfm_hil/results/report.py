@@ -143,26 +143,23 @@ def write_report(run: Run | NetworkRun) -> None:
     assert folder is not None
     if isinstance(run, NetworkRun):
         common = folder / "converters.png"
-        wait = beside(draw_comparison, common, scenario, run.columns, run.events, SHARED)
-        diagram = draw_diagram(folder, scenario, PAGE)
-        write_together(
-            folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
-            [*panels_of_network(run)] if len(run.flows) > 1 else [],
-        )  # fmt: skip
-        wait()
+        with beside(draw_comparison, common, scenario, run.columns, run.events, SHARED):
+            diagram = draw_diagram(folder, scenario, PAGE)
+            write_together(
+                folder, scenario, run.runs, run.events, "converter", "converters.png", diagram,
+                [*panels_of_network(run)] if len(run.flows) > 1 else [],
+            )  # fmt: skip
         return
-    drawn = draw_run(folder, scenario, run.columns, run.summary)
-    timing = None
-    if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
-        timing = draw_timing(folder, scenario, run.timing, run.summary)
-    chapter = _chapter("", run, POINTS, timing)
-    content = {
-        "chapters": [chapter], "shared": [], "kind": "", "commands": _commands({"": run}),
-    }  # fmt: skip
-    diagram = draw_diagram(folder, scenario)
-    _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
-    for wait in drawn:
-        wait()
+    with draw_run(folder, scenario, run.columns, run.summary):
+        timing = None
+        if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
+            timing = draw_timing(folder, scenario, run.timing, run.summary)
+        content = {
+            "chapters": [_chapter("", run, POINTS, timing)], "shared": [], "kind": "",
+            "commands": _commands({"": run}),
+        }  # fmt: skip
+        diagram = draw_diagram(folder, scenario)
+        _write_page(folder, scenario, content, diagram, POINTS, run.ticks, "signals.png", folder)
 
 
 def write_together(

@@ -1,5 +1,6 @@
 import os
 import threading
+import time
 
 import pytest
 
@@ -22,22 +23,34 @@ def alone(monkeypatch):
 
 
 def test_it_is_done_in_another_process(alone, tmp_path):
-    wait = beside(write_its_process, tmp_path / "pid")
-    wait()
+    with beside(write_its_process, tmp_path / "pid"):
+        pass
     assert int((tmp_path / "pid").read_text()) != os.getpid()
 
 
 def test_a_process_with_threads_is_not_forked(alone, tmp_path, monkeypatch):
     monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), object()])
-    wait = beside(write_its_process, tmp_path / "pid")
-    wait()
+    with beside(write_its_process, tmp_path / "pid"):
+        pass
     assert int((tmp_path / "pid").read_text()) == os.getpid()
 
 
 @pytest.mark.parametrize("processors", [1, 2])
 def test_its_error_is_raised_here(processors, alone, monkeypatch, capfd):
     monkeypatch.setattr(os, "cpu_count", lambda: processors)
-    wait = beside(fail)
-    with pytest.raises(ValueError, match="no room"):
-        wait()
+    with pytest.raises(ValueError, match="no room"), beside(fail):
+        pass
     assert capfd.readouterr().err == ""
+
+
+def test_nothing_is_left_of_it_after_an_error_in_the_block(alone, tmp_path):
+    def write_later() -> None:
+        (tmp_path / "pid").write_text(str(os.getpid()))
+        time.sleep(600.0)
+
+    with pytest.raises(KeyError), beside(write_later):
+        while not (tmp_path / "pid").is_file() or not (tmp_path / "pid").read_text():
+            time.sleep(0.01)
+        raise KeyError
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)

@@ -346,6 +346,7 @@ def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, att
     ticks, labels, read = 24_000, [], 0
     annotate = "matplotlib.axes.Axes.annotate"
     monkeypatch.setattr(annotate, lambda self, text, *_, **__: labels.append(text))
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # the figures are drawn in this process
     get = npz.Column.__getitem__
 
     def counting(self, rows):

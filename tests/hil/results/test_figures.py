@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from gfm_hil.results.figures import draw_comparison, draw_signals
-from gfm_hil.results.figures import draw_run as begin_to_draw
+from gfm_hil.results.figures import draw_run as drawn
 
 RUN = {"laws": ["a", "b"], "mode": "lockstep", "round_trip_us": None, "misses": 0, "ticks": 0}
 
@@ -23,8 +23,8 @@ def recording(ticks: int) -> dict[str, np.ndarray]:
 
 
 def draw_run(*arguments) -> None:
-    for wait in begin_to_draw(*arguments):
-        wait()
+    with drawn(*arguments):
+        pass
 
 
 def events(count: int) -> list[dict[str, object]]:
