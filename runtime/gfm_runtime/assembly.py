@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any
 
@@ -24,6 +24,10 @@ from gfm_runtime.tustin import DiscreteLaw, discretise
 
 SPARE = 2  # places for laws with other gains: one may be in force while the other is filled
 NO_END = 10.0  # p.u.; up to which a schedule's last stage is in force
+
+
+def _nothing() -> None:
+    """Of laws that no other controller shares."""
 
 
 class Controller:
@@ -81,6 +85,8 @@ class Controller:
         self.changed: list[dict[str, float]] = [{} for _ in self.discrete]
         self.labels += [f"other gains {k + 1}" for k in range(SPARE)]
         self.laws = np.concatenate([pack_law(d, real, omega_b) for d in self.discrete])
+        #: called before ``laws`` change, which other controllers may share
+        self.before_retuning: Callable[[], None] = _nothing
         self.states = np.zeros(len(self.laws), state_dtype(real))
         self.inner = INNER if any(d.law.inner is not None for d in self.discrete) else PLAIN
         counts = [d.law.counts is not None for d in self.discrete]
@@ -104,6 +110,7 @@ class Controller:
         other.labels, other.names = list(self.labels), list(self.names)
         other.discrete, other.changed = list(self.discrete), [dict(one) for one in self.changed]
         other.laws, other.states = self.laws.copy(), self.states.copy()
+        other.before_retuning = _nothing
         other.ctl, other.est = self.ctl.copy(), self.est.copy()
         other.ctl["ref"] = other.ctl["ref_target"] = np.asarray(references, dtype=float)
         return other
@@ -152,6 +159,7 @@ class Controller:
         """
         slot = len(self.laws) - SPARE
         slot += int(self.ctl["active"][0]) == slot
+        self.before_retuning()
         self.laws[slot], self.discrete[slot] = packed[0], discrete
         self.names[slot], self.changed[slot] = self.asked, dict(gains)
         self.ctl["request"], self.gains = slot, dict(gains)

@@ -5,6 +5,7 @@ each tick calls the same functions in the same order.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from gfm_hil.recording.parts import Kept, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
+from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.states import READY
 
@@ -35,8 +37,9 @@ _LINE = 64  # bytes of a line of the processor's cache
 class Stack(NamedTuple):
     """The controllers of a plant, one below the other."""
 
-    # their records: ctl and est of shape (N,), laws and states of shape (N, laws)
+    # their records: ctl and est of shape (N,), states of shape (N, laws), laws of (rows, laws)
     controllers: ControllerRecords
+    row: NDArray[np.int64]  # of its laws, by converter, (N,): those of equal laws share one
     y: NDArray[np.float64]  # measurements of the current tick, (N, 5) or (N, 11), p.u.
     u: NDArray[np.float64]  # inputs of the current tick, (N, 3) or (N, 4), p.u.
 
@@ -49,17 +52,40 @@ def stack(benches: Sequence[Bench]) -> Stack:
         (b,) = benches
         c = b.controller
         one = ControllerRecords(c.ctl, c.laws[None], c.states[None], c.est)
-        return Stack(one, b.y[None], b.u[None])
+        return Stack(one, np.zeros(1, np.int64), b.y[None], b.u[None])
     all_c = [b.controller for b in benches]
     most = max(len(c.laws) for c in all_c)
     ctl, est = _below([c.ctl for c in all_c], 1), _below([c.est for c in all_c], 1)
-    laws, states = _below([c.laws for c in all_c], most), _below([c.states for c in all_c], most)
+    states = _below([c.states for c in all_c], most)
+    laws, row = _share_laws(all_c, most)
     y, u = np.stack([b.y for b in benches]), np.stack([b.u for b in benches])
     for k, (b, c) in enumerate(zip(benches, all_c, strict=True)):
         n = len(c.laws)
-        c.ctl, c.est, c.laws, c.states = ctl[k], est[k], laws[k, :n], states[k, :n]
+        c.ctl, c.est, c.states = ctl[k], est[k], states[k, :n]
         b.y, b.u = y[k], u[k]
-    return Stack(ControllerRecords(ctl[:, 0], laws, states, est[:, 0]), y, u)
+    return Stack(ControllerRecords(ctl[:, 0], laws, states, est[:, 0]), row, y, u)
+
+
+def _share_laws(
+    controllers: Sequence[Controller], most: int
+) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Laws of all controllers, equal ones once so that many stay in the processor's cache, and the
+    row of each controller, which moves to one of its own before its gains change."""
+    dtype, rows = controllers[0].laws.dtype, dict[bytes, int]()
+    row = np.array([rows.setdefault(c.laws.tobytes(), len(rows)) for c in controllers])
+    whole = np.zeros((len(rows) + len(controllers), most * dtype.itemsize), np.uint8)
+    for content, k in rows.items():
+        whole[k, : len(content)] = np.frombuffer(content, np.uint8)
+    laws = whole.view(dtype)
+
+    def move(c: Controller, k: int, to: int) -> None:
+        whole[to] = whole[row[k]]
+        row[k], c.laws = to, laws[to, : len(c.laws)]
+
+    for k, c in enumerate(controllers):
+        c.laws = laws[row[k], : len(c.laws)]
+        c.before_retuning = partial(move, c, k, len(rows) + k)
+    return laws, row
 
 
 def _below(arrays: Sequence[NDArray[Any]], most: int) -> NDArray[Any]:
@@ -118,7 +144,7 @@ def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, ke
             trips += tripped
             mine, estimate = ctl[i : i + 1], est[i : i + 1]
             if not stands_still(plan, k):
-                answer(mine, laws[i], states[i], estimate, y[i], u[i], tripped != 0)
+                answer(mine, laws[stack.row[i]], states[i], estimate, y[i], u[i], tripped != 0)
             other = row_at(places.controller[i], widths[1], k - first)
             record_controller(other, mine, states[i], estimate)
             if len(plan) > 0:

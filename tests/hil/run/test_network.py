@@ -442,3 +442,26 @@ def test_a_load_of_constant_power_draws_it_at_any_voltage():
     assert before == pytest.approx(0.6, abs=0.01) and after == pytest.approx(before, abs=0.005)
     before, after = taken["loads"]
     assert after / before == pytest.approx(0.9**2, rel=0.03)
+
+
+@pytest.mark.processes
+def test_other_gains_of_one_converter_are_not_those_of_another_with_its_law(tmp_path):
+    """Equal laws share their records in process; over a link each controller has its own."""
+    gains = {"type": "gains", "t": 0.1, "converter": "B", "values": {"D_p": 0.02}}
+    members = {name: {"node": "bus", "law": "droop-3"} for name in "ABC"}
+    content = {
+        "title": "three alike", "duration": 0.3, "link": {"type": "zmq"},
+        "network": {
+            "converters": members,
+            "loads": {"base": {"node": "bus", "P": 1.2, "Q": 0.1},
+                      "step": {"node": "bus", "P": 0.6, "closed": False}},
+        },
+        "events": [gains, {"type": "breaker", "t": 0.15, "name": "step", "closed": True}],
+    }  # fmt: skip
+    one = gfmhil.run_network(content)
+    p = {name: run.signals["p"] for name, run in one.items()}
+    np.testing.assert_allclose(p["A"], p["C"], rtol=0, atol=1e-9)
+    assert abs(p["B"][-1] - p["A"][-1]) > 0.01
+    over = gfmhil.run_network(content, tmp_path / "run", link__type="zmq")
+    for name in "ABC":
+        np.testing.assert_array_equal(over[name].signals["p"], p[name])
