@@ -1,5 +1,6 @@
 """Critical clearing times against the equal-area criterion, and what else may end a run."""
 
+import json
 import math
 
 import numpy as np
@@ -153,6 +154,12 @@ def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
         ["2", "0.3", "borne"], ["4", "0.3", "borne"]
     ]  # fmt: skip
     assert figure.stat().st_size > 5000
+    assert main(["design", "clearing", "--law", "droop-5", *options, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["scr"], row["seconds"], row["law"]) for row in rows] == [
+        (2.0, 0.3, "droop-5"), (4.0, 0.3, "droop-5")
+    ]  # fmt: skip
+    assert rows[0]["trials"][0]["duration"] == 0.0 and rows[0]["runs"] == 2
     options += ["--over", "events.0.V_g=0.1,0.3", "--over", "inner.I_max=1.2"]
     assert main(["design", "clearing", "--law", "droop-5", *options]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]

@@ -4,6 +4,7 @@ converter comes back, at one place or over a map."""
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from gfm_hil.api import plot
@@ -107,16 +108,18 @@ def _tell(
         raise UserError("--out: the figure is one over --scr or --over")
     with watching(options.design) as watch:
         if not over:
-            rows = [at_one(scenario, **how, watch=watch).row()]
+            each = [at_one(scenario, **how, watch=watch)]
+            rows = [each[0].row()]
         else:
             found = at_map(
                 None, scenario, over=over, workers=options.workers, watch=watch, **how_map
             )
-            rows = found.rows()
+            each, rows = found.found, found.rows()
             if options.out:
                 save_figure(options.out, lambda: draw(found))
     if options.json:
-        print(json.dumps(finite(rows), indent=2))
+        all_of = [{SCR: None} | row | asdict(one) for row, one in zip(rows, each, strict=True)]
+        print(json.dumps(finite(all_of), indent=2))
         return 0
     console = terminal(highlight=False)
     console.print(f"[bold]{scenario.law}[/] · {scenario.title}")
