@@ -15,7 +15,7 @@ from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.workers import SILENT, Watch
 
 AFTER_S, WITHIN = 3.0, 1.0  # s, degrees
-ANOTHER_TURN = "comes to rest a turn away"
+ANOTHER_TURN = "rests a turn away"
 _MOST_S = 60.0
 _BEFORE_S = 0.1
 _HALF = 180.0  # degrees
