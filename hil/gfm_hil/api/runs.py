@@ -271,21 +271,21 @@ def recover(folder: str | Path) -> Run | NetworkRun:
 
 
 def merge(
-    first: str | Path, second: str | Path, folder: str | Path, *others: str | Path
+    first: str | Path, second: str | Path | Sequence[str | Path], folder: str | Path
 ) -> Run | NetworkRun:
     """One run folder from those of a controller and a plant that were started separately; of a
-    network from that of its plant, ``first``, and of the controllers of all its converters.
+    network from that of its plant, ``first``, and those of the controllers of all its converters.
 
     Raises:
         UserError: a folder is not that of one side, they are not of the same run or of the same
             converter, or ``folder`` is in use or cannot be written.
     """
+    others = [Path(one) for one in ([second] if isinstance(second, str | Path) else second)]
     if converters_of(Path(first)):
-        controllers = [Path(one) for one in (second, *others)]
-        return NetworkRun.merge(Path(first), controllers, Path(folder), write_report)
-    if others:
+        return NetworkRun.merge(Path(first), others, Path(folder), write_report)
+    if len(others) != 1:
         raise UserError(f"{first}: is not of a network, whose folders may be more than two")
-    return run_folder.merge_roles(Path(first), Path(second), Path(folder), write_report)
+    return run_folder.merge_roles(Path(first), others[0], Path(folder), write_report)
 
 
 class Comparison(dict[str, Run]):

@@ -134,7 +134,7 @@ def clearing_map(
         clearing.event_to_clear(base, longest, after, within)
 
     work = partial(clearing.clearing_time, longest=longest, after=after, within=within)
-    return _map(law, on, changes, over, check, work, workers, watch)
+    return _map(law, on, changes, over, check, work, ClearingTime.nowhere, workers, watch)
 
 
 def attraction(
@@ -187,7 +187,7 @@ def attraction_map(
         angles.check_attraction(base, after, within)
 
     work = partial(angles.attraction, after=after, within=within)
-    return _map(law, on, changes, over, check, work, workers, watch)
+    return _map(law, on, changes, over, check, work, Attraction.nowhere, workers, watch)
 
 
 def _at_one(
@@ -210,10 +210,11 @@ def _map(
     over: Over,
     check: Callable[[Scenario], None],
     work: Callable[[Scenario], Found],
+    nowhere: Callable[[Scenario], Found],
     workers: int,
     watch: Watch,
 ) -> TransientMap[Found]:
-    """``work`` at every place of a map."""
+    """``work`` at every place of a map; ``nowhere`` is what it finds where none can begin."""
     axes = _axes(over)
     base = load_scenario(on, in_process=True, **changes)
     check(base)
@@ -232,7 +233,7 @@ def _map(
         if workers > 1:
             compiled_benches(tasks[0][1], watch.notice)
         with pool_of(workers) as pool:
-            run_tasks(partial(_work, work), tasks, pool, workers, keep, watch.stopped)
+            run_tasks(partial(_work, work, nowhere), tasks, pool, workers, keep, watch.stopped)
     if len(found) < len(tasks):
         raise KeyboardInterrupt
     return TransientMap(own.name, base.title, axes, tuple(found[k] for k in range(len(tasks))))
@@ -267,5 +268,13 @@ def _at(base: Scenario, own: Law, values: Mapping[str, float], stack: ExitStack)
     return at_short_circuit_ratios(scenario, [values[SCR]])[0] if SCR in values else scenario
 
 
-def _work(work: Callable[[Scenario], Found], task: tuple[int, Scenario]) -> tuple[int, Found]:
-    return task[0], work(task[1])
+def _work(
+    work: Callable[[Scenario], Found],
+    nowhere: Callable[[Scenario], Found],
+    task: tuple[int, Scenario],
+) -> tuple[int, Found]:
+    k, scenario = task
+    try:
+        return k, work(scenario)
+    except UserError:  # there is no operating point; all else was checked before
+        return k, nowhere(scenario)

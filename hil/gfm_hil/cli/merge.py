@@ -25,8 +25,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     folder = new_folder(options.out, "merged")
-    second, *others = options.others
-    run = merge(options.first, second, folder, *others)
+    run = merge(options.first, options.others, folder)
     print_run(run, folder)
     show_page(options, folder / PAGE)
     return exit_code(run)

@@ -40,12 +40,12 @@ class Operator:
     """
 
     def __init__(self, folder: Path, through: str = "python") -> None:
-        reached = (place for place in (folder, *members(folder)) if running_roles(place))
-        self._folder, self._local = next(reached, folder), local(through)
-        if self._folder == folder and not running_roles(folder):
+        places = (place for place in (folder, *members(folder)) if running_roles(place))
+        if (reached := next(places, None)) is None:
             raise not_running(folder)
-        self._network = folder if self._folder != folder else None
-        self._context, self.run = zmq.Context(), LiveRun(self._folder)
+        self._folder, self._local = reached, local(through)
+        self._network = folder if reached != folder else None
+        self._context, self.run = zmq.Context(), LiveRun(reached)
 
     def close(self) -> None:
         """Close the sockets."""

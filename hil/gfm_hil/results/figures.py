@@ -352,12 +352,10 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
     from PIL import Image  # matplotlib needs it too
 
     with replacing(path) as part:
-        engine = figure.get_layout_engine()
-        assert engine is not None
-        engine.execute(figure)
-        figure.set_layout_engine(
-            "none"
-        )  # with one, the figure is drawn once more before it is saved
+        figure.set_dpi(110)
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
+            figure.set_layout_engine("none")  # with one, savefig draws the figure twice
         figure.savefig(part, dpi=110, format="png")
         if few_colours:
             with Image.open(part) as picture:

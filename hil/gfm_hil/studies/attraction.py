@@ -5,13 +5,14 @@ limits, stages, protection, delay and the transients of the circuit count.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.studies.clearing import NO_EQUILIBRIUM
 from gfm_hil.studies.workers import SILENT, Watch
 
 AFTER_S, WITHIN = 3.0, 1.0  # s, degrees
@@ -40,6 +41,11 @@ class Attraction:
     below: str
     above: str
     runs: int
+
+    @classmethod
+    def nowhere(cls, scenario: Scenario) -> Self:
+        """Of a scenario without an operating point to begin at."""
+        return cls(scenario.law, scenario.title, 0.0, 0.0, NO_EQUILIBRIUM, NO_EQUILIBRIUM, 0)
 
     def row(self) -> dict[str, Any]:
         """``low``, ``high``, ``below``, ``above`` and ``runs``."""

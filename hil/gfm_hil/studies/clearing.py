@@ -7,7 +7,7 @@ System Stability and Control, 1994, ch. 13).
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -59,6 +59,11 @@ class ClearingTime:
     lost: float
     loss: str
     trials: tuple[Trial, ...]
+
+    @classmethod
+    def nowhere(cls, scenario: Scenario) -> Self:
+        """Of a scenario without an operating point to begin at."""
+        return cls(scenario.law, scenario.title, 0.0, 0.0, NO_EQUILIBRIUM, ())
 
     def row(self) -> dict[str, Any]:
         """``seconds``, ``lost``, ``loss``, and the number of ``runs``."""

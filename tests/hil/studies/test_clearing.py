@@ -127,6 +127,17 @@ def test_what_has_no_clearing_time_is_refused_in_one_line(options, said, capsys)
     assert capsys.readouterr().err.startswith(f"gfmhil: {said}")
 
 
+def test_a_place_without_an_operating_point_is_told_and_the_rest_of_the_map_is_there():
+    """A line of SCR 0.3 cannot carry 0.7 p.u."""
+    made = gfmhil.clearing_map("vsg-2", over={"scr": (0.3, 2.0)}, longest=0.1, after=0.3)
+    assert [one.loss for one in made.found] == [NO_EQUILIBRIUM, ""]
+    assert made.values("seconds").tolist() == [0.0, 0.1]
+    made = gfmhil.attraction_map(
+        "vsg-2", "deep_sag", over={"scr": (0.3, 2.0)}, after=0.3, within=90.0
+    )
+    assert (made.found[0].below, made.found[0].runs) == (NO_EQUILIBRIUM, 0) and made.found[1].runs
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_map_has_the_clearing_times_of_its_places(workers):

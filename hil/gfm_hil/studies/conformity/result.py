@@ -190,7 +190,7 @@ class Conformity:
             ("converter under test", f"{under.plant.converter}, {under.instruments}"),
             ("declared", f"droop {words}; power {under.P_min:g} to {under.P_max:g} p.u."),
             ("gfmhil", version("gfmhil")),
-            *([("not run", self._left_out())] if self._left_out() else []),
+            *([("not run", left)] if (left := self._left_out()) else []),
             ("machine", self.machine),
             ("date", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
         ]
