@@ -149,7 +149,9 @@ def test_what_two_processes_compiled_for_two_records_does_not_mix_in_a_third(tmp
     assert found == [["4.0"], ["6.0"], ["4.0", "6.0"]]
 
 
-def test_a_function_that_only_compiled_ones_call_has_no_machine_code():
+def test_a_function_that_only_compiled_ones_call_has_no_machine_code(monkeypatch, tmp_path):
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path))  # where nothing is compiled
+
     @compiled
     def inner(x):
         return x + 1
