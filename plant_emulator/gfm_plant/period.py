@@ -234,7 +234,24 @@ def _make_way(kind: str, *hooks: Any) -> Any:
         hooks: of its components: at the beginning of a piece, where its sources act, in its middle
             and at its end.
     """
-    begin_all, drive_all, at_middle, end_all = hooks
+    piece = inlined_as(f"piece_{kind}", _make_piece(*hooks))
+    stretch = inlined_as(f"stretch_{kind}", _make_stretch(piece))
+
+    def go_on_between(plant: PlantRecords, begin: float, end: float) -> None:
+        n, starts = plant.net[0], 0.0
+        for part in range(n.n_parts):
+            ends = starts + field(n, "stretch")[part]
+            whole = begin <= starts and ends <= end
+            if whole or (starts < end and begin < ends):
+                h = math.inf if whole else min(ends, end) - max(starts, begin)
+                stretch(plant, part, begin <= starts, h)
+            starts = ends
+
+    return inlined_as(f"advance_{kind}", go_on_between)
+
+
+def _make_piece(begin_all: Any, drive_all: Any, at_middle: Any, end_all: Any) -> Any:
+    """A function (plant, c, part) that solves circuit c over a piece of a part of the period."""
 
     def go_on_by_piece(plant: PlantRecords, c: int, part: int) -> None:
         n, now = plant.net[0], plant.now[0]
@@ -274,7 +291,12 @@ def _make_way(kind: str, *hooks: Any) -> Any:
                     _sense(n, s, k, 1 + j, part, s.seen[0, j], s.seen[1, j], s.seen[2, j])
             s.x[DELTA] += 2.0 * half_h * n.omega_b * (s.u_now[1] - omega_g)
 
-    piece = inlined_as(f"piece_{kind}", go_on_by_piece)
+    return go_on_by_piece
+
+
+def _make_stretch(piece: Any) -> Any:
+    """A function (plant, part, begins, h) that goes on by a stretch with its commands; h: how long,
+    s, inf: all of it."""
 
     def go_on_by_stretch(plant: PlantRecords, part: int, begins: bool, h: float) -> None:
         n, now, peaks = plant.net[0], plant.now[0], False
@@ -298,19 +320,7 @@ def _make_way(kind: str, *hooks: Any) -> Any:
                         s.E[0], s.E[1] = _within_peak(plant, k, cut)
             piece(plant, c, cut)
 
-    stretch = inlined_as(f"stretch_{kind}", go_on_by_stretch)
-
-    def go_on_between(plant: PlantRecords, begin: float, end: float) -> None:
-        n, starts = plant.net[0], 0.0
-        for part in range(n.n_parts):
-            ends = starts + field(n, "stretch")[part]
-            whole = begin <= starts and ends <= end
-            if whole or (starts < end and begin < ends):
-                h = math.inf if whole else min(ends, end) - max(starts, begin)
-                stretch(plant, part, begin <= starts, h)
-            starts = ends
-
-    return inlined_as(f"advance_{kind}", go_on_between)
+    return go_on_by_stretch
 
 
 @inlined

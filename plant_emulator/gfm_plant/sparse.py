@@ -115,6 +115,11 @@ class _Merged:
     R: float
     parts: dict[str, float]  # the current of each by its own
 
+    @property
+    def name(self) -> str:
+        """That of the branch whose current it is."""
+        return next(iter(self.parts))
+
 
 @lru_cache(maxsize=64)
 def find_sparse(
@@ -137,125 +142,174 @@ def find_sparse(
     Raises:
         ValueError: as `circuit.find_modes`, but for modes that cannot be told apart.
     """
-    fixed, charged, through = check_parts(circuit)
-    known = {GROUND, *fixed, *charged, *through}
-    place, N = dict(sources), len(units)
-    lines = {unit[2] for unit in units}
-    merged = _in_series(circuit.branches, known | kept, lines)
-    caps = {one.name: one for one in circuit.capacitors}
-    firsts = {next(iter(one.parts)): one for one in merged}
-    own = [[unit[j] for unit in units] for j in range(N_OWN)]
-    names = [name for those in own for name in those]
-    there = {*names}
-    names += [name for name in (*firsts, *caps) if name not in there]
-    at = {name: j for j, name in enumerate(names)}
-    n_x = len(names)
-
-    # the voltages of the nodes by x, s and u
-    column = {one.node: at[one.name] for one in circuit.capacitors}
-    drives = {one.node: tuple(n_x + k for k in place[one.name]) for one in circuit.sources}
-    meets = defaultdict[str, list[tuple[float, _Merged]]](list)
-    for one in merged:
-        for node, sign in one.taken.items():
-            meets[node].append((sign, one))
-    resistive = [node for node in through if node not in {*fixed, *charged} and node in meets]
-    free = [node for node in meets if node not in known]
-    for k, node in enumerate(resistive):
-        column[node] = n_x + n_s + k
-    solved = _Factors.of(free, merged)
-    begin = n_x + n_s + len(resistive) + len(free)  # of the voltages, after what is on the way
-    for k, node in enumerate(free):
-        column[node] = begin + solved.place[k]
-
-    def voltage(node: str, factor: float, row: Row) -> None:
-        if node in drives:
-            for k in drives[node]:
-                row[k] = row.get(k, 0.0) + factor
-        elif node != GROUND:
-            row[column[node]] = row.get(column[node], 0.0) + factor
-
-    rows: list[Row] = []
-    for node in resistive:
-        rows.append({at[_name(b)]: -sign * through[node] for sign, b in meets[node]})
-    right = []
-    for node in free:
-        row: Row = {}
-        for sign, one in meets[node]:
-            row[at[_name(one)]] = row.get(at[_name(one)], 0.0) + sign * one.R / one.L
-            for other, factor in one.taken.items():
-                if other in known:
-                    voltage(other, -sign * factor / one.L, row)
-        right.append(row)
-    rows += solved.rows(right, n_x + n_s + len(resistive))
-
-    slopes: dict[str, Row] = {}
-    for name, one in firsts.items():
-        row = {at[name]: -omega_b * one.R / one.L}
-        for node, sign in one.taken.items():
-            voltage(node, omega_b * sign / one.L, row)
-        slopes[name] = row
-    for name, cap in caps.items():
-        row = {at[_name(b)]: -omega_b * sign / cap.C for sign, b in meets[cap.node]}
-        if cap.node in through:
-            row[at[name]] = -omega_b / cap.C / through[cap.node]
-        for sink in circuit.sinks:
-            if sink.node == cap.node:
-                row |= {n_x + k: -omega_b / cap.C for k in place[sink.name]}
-        slopes[name] = row
-    coefficients, line_to = np.zeros((6, N)), np.zeros(N, np.int64)
-    for k, (i_f, v, i_o) in enumerate(units):
-        filters = slopes.get(i_f, {})
-        b = coefficients[:, k]
-        b[0] = _take(filters, n_x + k)
-        _take(filters, at[v])
-        b[1] = -_take(filters, at[i_f])
-        b[2] = omega_b / caps[v].C
-        _take(slopes[v], at[i_f])
-        if i_o in slopes:
-            line = slopes[i_o]
-            _take(slopes[v], at[i_o])
-            b[3], b[4] = _take(line, at[v]), -_take(line, at[i_o])
-            if len(line) == 1:
-                ((line_to[k], factor),) = line.items()
-                b[5] = -factor
-                line.clear()
-    others = sorted(names[N_OWN * N :], key=lambda name: len(slopes[name]))
+    found = _Equations(circuit, omega_b, units, dict(sources), n_s, kept)
+    slopes = found.slopes()
+    own, line_to = found.take_own(units, slopes)
+    first = N_OWN * len(units)
+    others = sorted(found.names[first:], key=lambda name: len(slopes[name]))
     for name in others:
         if len(slopes[name]) < 2:  # it has itself
-            slopes[name] |= {next(c for c in range(2) if c != at[name]): 0.0}
+            slopes[name] |= {next(c for c in range(2) if c != found.at[name]): 0.0}
     wide = [len(slopes[name]) for name in others]
-    extra = [name for name in names[: N_OWN * N] if slopes.get(name)]
-    rows += [*(slopes[name] for name in others), *(slopes[name] for name in extra)]
-    place_of = {at[name]: N_OWN * N + k for k, name in enumerate(others)}
-    names[N_OWN * N :] = others
+    extra = [name for name in found.names[:first] if slopes.get(name)]
+    rows = found.of_nodes() + [slopes[name] for name in (*others, *extra)]
+
+    # the other states in the order of their rows
+    moved = {found.at[name]: first + k for k, name in enumerate(others)}
+    names = [*found.names[:first], *others]
     at = {name: j for j, name in enumerate(names)}
-    rows = [{place_of.get(c, c): value for c, value in row.items()} for row in rows]
-    line_to = np.array([place_of.get(int(c), int(c)) for c in line_to], np.int64)
-    column = {node: place_of.get(c, c) for node, c in column.items()}
+    rows = [{moved.get(c, c): value for c, value in row.items()} for row in rows]
+    column = {node: moved.get(c, c) for node, c in found.column.items()}
 
     of, by = np.full(len(order), -1), np.zeros(len(order))
     where = {name: j for j, name in enumerate(order)}
-    for name in caps:
-        of[where[name]], by[where[name]] = at[name], 1.0
-    for name, one in firsts.items():
+    for cap in circuit.capacitors:
+        of[where[cap.name]], by[where[cap.name]] = at[cap.name], 1.0
+    for one in found.branches:
         for part, factor in one.parts.items():
-            of[where[part]], by[where[part]] = at[name], factor
+            of[where[part]], by[where[part]] = at[one.name], factor
     enter, n_enter = _entering(circuit, where)
-    lossless, norm = _norms(merged, circuit, solved, omega_b)
-    stores = [*(one.L for one in merged), *(cap.C for cap in circuit.capacitors)]
+    lossless, norm = _norms(found.branches, circuit, found.solved, omega_b)
+    stores = [*(one.L for one in found.branches), *(cap.C for cap in circuit.capacitors)]
     least = _SMALLEST**2 * min(stores) / max(stores)
-    nodes = column | {node: columns[0] for node, columns in drives.items()}
     return Sparse(
-        Sums.of(rows), n_x, len(resistive) + 2 * len(free),
+        Sums.of(rows), found.n_x, found.n_u,
         (sum(w < 3 for w in wide), wide.count(3), wide.count(4)),
         np.array([at[e] for e in extra], int),
-        coefficients, line_to, np.array([where[name] for name in names]), of, by,
-        enter, n_enter, nodes, norm, least, lossless,
+        own, np.array([moved.get(c, c) for c in line_to], np.int64),
+        np.array([where[name] for name in names]), of, by, enter, n_enter,
+        column | {node: columns[0] for node, columns in found.drives.items()},
+        norm, least, lossless,
     )  # fmt: skip
 
 
-def _name(one: _Merged) -> str:
-    return next(iter(one.parts))
+class _Equations:
+    """The equations of a circuit as rows, with the states of converters first.
+
+    Args:
+        circuit, omega_b, units, n_s, kept: as for ``find_sparse``.
+        place: of each source and sink.
+
+    Attributes:
+        branches: those in series as one.
+        names: of the states; ``at``: their columns.
+        column: of the voltage of each node that no source holds; ``drives``: those of the others.
+        solved: the factors by which the voltages of free nodes follow.
+        n_x, n_u: how many states and voltages there are.
+    """
+
+    def __init__(
+        self,
+        circuit: Circuit,
+        omega_b: float,
+        units: Sequence[tuple[str, str, str]],
+        place: Mapping[str, tuple[int, ...]],
+        n_s: int,
+        kept: frozenset[str],
+    ) -> None:
+        fixed, charged, through = check_parts(circuit)
+        known = {GROUND, *fixed, *charged, *through}
+        self._circuit, self._omega_b, self._place = circuit, omega_b, place
+        self._known, self._through = known, through
+        lines = {unit[2] for unit in units}
+        self.branches = _in_series(circuit.branches, known | kept, lines)
+
+        own = [unit[j] for j in range(N_OWN) for unit in units]
+        states = (*(one.name for one in self.branches), *(cap.name for cap in circuit.capacitors))
+        self.names = own + [name for name in states if name not in {*own}]
+        self.at = {name: j for j, name in enumerate(self.names)}
+        self.n_x = len(self.names)
+
+        self._meets = defaultdict[str, list[tuple[float, _Merged]]](list)
+        for one in self.branches:
+            for node, sign in one.taken.items():
+                self._meets[node].append((sign, one))
+        held = {*fixed, *charged}
+        self._resistive = [node for node in through if node not in held and node in self._meets]
+        self._free = [node for node in self._meets if node not in known]
+        self.solved = _Factors.of(self._free, self.branches)
+        self.n_u = len(self._resistive) + 2 * len(self._free)
+
+        self.drives = {
+            one.node: tuple(self.n_x + k for k in place[one.name]) for one in circuit.sources
+        }
+        self.column = {one.node: self.at[one.name] for one in circuit.capacitors}
+        for k, node in enumerate(self._resistive):
+            self.column[node] = self.n_x + n_s + k
+        self._on_the_way = self.n_x + n_s + len(self._resistive)
+        begin = self._on_the_way + len(self._free)
+        for k, node in enumerate(self._free):
+            self.column[node] = begin + self.solved.place[k]
+
+    def _add_voltage(self, node: str, factor: float, row: Row) -> None:
+        if node in self.drives:
+            for k in self.drives[node]:
+                row[k] = row.get(k, 0.0) + factor
+        elif node != GROUND:
+            row[self.column[node]] = row.get(self.column[node], 0.0) + factor
+
+    def of_nodes(self) -> list[Row]:
+        """The voltages of nodes with resistors, and then what gives those of free ones."""
+        at, meets = self.at, self._meets
+        rows: list[Row] = [
+            {at[b.name]: -sign * self._through[node] for sign, b in meets[node]}
+            for node in self._resistive
+        ]
+        right = []
+        for node in self._free:
+            row: Row = {}
+            for sign, one in meets[node]:
+                row[at[one.name]] = row.get(at[one.name], 0.0) + sign * one.R / one.L
+                for other, factor in one.taken.items():
+                    if other in self._known:
+                        self._add_voltage(other, -sign * factor / one.L, row)
+            right.append(row)
+        return rows + self.solved.rows(right, self._on_the_way)
+
+    def slopes(self) -> dict[str, Row]:
+        """The slope of each state, 1/s."""
+        omega_b, at = self._omega_b, self.at
+        slopes: dict[str, Row] = {}
+        for one in self.branches:
+            row = {at[one.name]: -omega_b * one.R / one.L}
+            for node, sign in one.taken.items():
+                self._add_voltage(node, omega_b * sign / one.L, row)
+            slopes[one.name] = row
+        for cap in self._circuit.capacitors:
+            row = {at[b.name]: -omega_b * sign / cap.C for sign, b in self._meets[cap.node]}
+            if cap.node in self._through:
+                row[at[cap.name]] = -omega_b / cap.C / self._through[cap.node]
+            for sink in self._circuit.sinks:
+                if sink.node == cap.node:
+                    row |= {self.n_x + k: -omega_b / cap.C for k in self._place[sink.name]}
+            slopes[cap.name] = row
+        return slopes
+
+    def take_own(
+        self, units: Sequence[tuple[str, str, str]], slopes: Mapping[str, Row]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """What all converters have alike, which their slopes lose: see ``Sparse.own``, and the
+        column of the voltage at the end of each line."""
+        at = self.at
+        capacitance = {one.name: one.C for one in self._circuit.capacitors}
+        own, line_to = np.zeros((6, len(units))), np.zeros(len(units), np.int64)
+        for k, (i_f, v, i_o) in enumerate(units):
+            filters = slopes.get(i_f, {})
+            b = own[:, k]
+            b[0] = _take(filters, self.n_x + k)
+            _take(filters, at[v])
+            b[1] = -_take(filters, at[i_f])
+            b[2] = self._omega_b / capacitance[v]
+            _take(slopes[v], at[i_f])
+            if i_o in slopes:
+                line = slopes[i_o]
+                _take(slopes[v], at[i_o])
+                b[3], b[4] = _take(line, at[v]), -_take(line, at[i_o])
+                if len(line) == 1:
+                    ((line_to[k], factor),) = line.items()
+                    b[5] = -factor
+                    line.clear()
+        return own, line_to
 
 
 def _take(row: Row, column: int) -> float:
@@ -274,8 +328,8 @@ def _in_series(branches: Sequence[Branch], known: set[str], first: set[str]) -> 
     for node in [node for node in at if node not in known]:
         if len(at[node]) != 2:
             continue
-        a, b = sorted(at[node], key=lambda one: _name(one) not in first)
-        if a is b or _name(b) in first:
+        a, b = sorted(at[node], key=lambda one: one.name not in first)
+        if a is b or b.name in first:
             continue
         ratio = -a.taken.pop(node) / b.taken.pop(node)
         a.L, a.R = a.L + ratio**2 * b.L, a.R + ratio**2 * b.R
@@ -366,17 +420,17 @@ def _entering(circuit: Circuit, where: Mapping[str, int]) -> tuple[Sums, int]:
     for one in each:
         for node, sign in one.taken.items():
             if node in index:
-                right[index[node]][where[_name(one)]] = sign
+                right[index[node]][where[one.name]] = sign
     solved = _Factors.of(free, each)
     rows, out = solved.rows(right, n_w), [Row() for _ in where]
     for cap in circuit.capacitors:
         out[where[cap.name]] = {where[cap.name]: 1.0}
     for one in each:
-        row = {where[_name(one)]: 1.0}
+        row = {where[one.name]: 1.0}
         for node, sign in one.taken.items():
             if node in index:
                 row[n_w + n + int(solved.place[index[node]])] = -sign / one.L
-        out[where[_name(one)]] = row
+        out[where[one.name]] = row
     return Sums.of([*rows, *out]), 2 * n
 
 

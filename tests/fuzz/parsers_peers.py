@@ -21,7 +21,7 @@ from gfm_hil.links.can.node import TRANSPORT, Node, process
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import MOST, frame_dtype
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
-from gfm_hil.links.serial.framing import stuffed
+from gfm_hil.links.serial.framing import encoded
 from gfm_hil.scenario import check_scenario
 from gfm_runtime.signals import NU, NY
 
@@ -163,7 +163,7 @@ def _serial(place: Path) -> Iterator[Take]:
 
     def take(content: bytes) -> None:
         into, found = Unstuffer(), []
-        for piece in (content[:7], content[7:], b"\0" + stuffed(b"next")):
+        for piece in (content[:7], content[7:], b"\0" + encoded(b"next")):
             into.feed(piece)
             while (message := into.next()) is not None:
                 found.append(message)
@@ -175,9 +175,9 @@ def _serial(place: Path) -> Iterator[Take]:
 
 def _serial_seeds() -> list[bytes]:
     writer = FrameWriter("y")
-    frames = [stuffed(writer.pack(k, 2, 0, Y)) for k in range(3)]
+    frames = [encoded(writer.pack(k, 2, 0, Y)) for k in range(3)]
     greeting = b'GFMHIL {"kind": "hello", "role": "plant"}'
-    return [b"".join(frames), stuffed(greeting), stuffed(bytes(range(1, 256)) + bytes(249))]
+    return [b"".join(frames), encoded(greeting), encoded(bytes(range(1, 256)) + bytes(249))]
 
 
 PEERS = (

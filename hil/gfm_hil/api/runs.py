@@ -439,7 +439,7 @@ def _compare_in(
     those that are run already."""
     first = next(iter(scenarios.values()))
     rows = first.ticks * len(scenarios) * max(1, len(first.parts))
-    what = first.carries, first.optional_signals
+    what = first.signal_set, first.optional_signals
     run_folder.check_free(folder, rows, *what, rows * len(first.flows))
     made: dict[str, dict[str, Run]] = {}
     for name, one in scenarios.items():

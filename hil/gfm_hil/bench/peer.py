@@ -32,7 +32,7 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import Link, link_kind, link_names
 from gfm_hil.links.base import LinkKind
 from gfm_hil.links.frame import FrameReader, FrameWriter
-from gfm_hil.links.pump import ported
+from gfm_hil.links.pump import with_port
 from gfm_hil.realtime import priority
 from gfm_hil.run.runner import controller_program
 from gfm_hil.scenario import Scenario, check_scenario, write_scenario
@@ -197,7 +197,7 @@ class _Caller:
         self._tick, self._one_clock, self._ptp_us = 0, start.one_clock, more["ptp_us"]
         self._stamps = np.zeros((_MOST, 5), np.int64)
         self._most = _TICKS if more["program"] else 2**62
-        self.link = ported(self._good)
+        self.link = with_port(self._good)
         getattr(self.link, "start", lambda: None)()
         self.sides: dict[str, Any] = {}
 
@@ -300,7 +300,7 @@ def answer(
                     name=ANSWERER,
                 )  # fmt: skip
                 say("a bench has begun")
-                say(_answer_one(ported(link), tai_ns, 1e3 * ptp_us, interrupt))
+                say(_answer_one(with_port(link), tai_ns, 1e3 * ptp_us, interrupt))
             except PeerLost as problem:
                 if not interrupt.came:
                     say(str(problem))

@@ -62,7 +62,7 @@ def call(options: argparse.Namespace) -> int:
 def _bench_context(scenario: Scenario) -> BenchContext:
     """What a model in place of the controller is connected to."""
     delay, bases = scenario.plant.delay, load_converter(scenario.plant.converter).bases
-    return BenchContext(scenario.T_s, scenario.carries, bases, delay.samples + delay.fraction)
+    return BenchContext(scenario.T_s, scenario.signal_set, bases, delay.samples + delay.fraction)
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
     from gfm_runtime.tustin import DiscreteLaw
 
-    Retuned = tuple[DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
+    PackedLaw = tuple[DiscreteLaw, NDArray[Any]]  # and the record that the kernel takes
 
 State = dict[str, NDArray[Any]]
 _LONGEST = 64  # of a name, see gfm_hil.engine.handshake
@@ -50,7 +50,7 @@ class ExternalController:
     gives_state = False  # it has ``state`` and ``restore``
     count = -1  # instructions of the law's step in the last tick; -1 where they are not counted
 
-    def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
+    def begin(self, controller: Controller, changed: Sequence[PackedLaw] = ()) -> None:
         """Get ready for a run; only one that runs its laws has something to do. Raises UserError: a
         program for the laws cannot be built, or does not start.
 
@@ -59,7 +59,7 @@ class ExternalController:
             changed: further laws, discretised and packed, that may come into its spare places.
         """
 
-    def has(self, law: Retuned) -> bool:
+    def has(self, law: PackedLaw) -> bool:
         """Whether it can change to this law, discretised and packed."""
         return False
 
@@ -199,8 +199,8 @@ def refuse_source(text: str) -> None:
 
 
 def check_currents(text: str, inner: int) -> None:
-    """Check that a run carries what a controller takes, see ``Scenario.carries``. Raises UserError:
-    ``text`` is ``c:FILE``, and the run has no inner stage."""
+    """Check that a run carries what a controller takes, see ``Scenario.signal_set``. Raises
+    UserError: ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
     if text.startswith("c:") and not inner:
         raise UserError(

@@ -39,7 +39,7 @@ from gfm_runtime.signals import COUNTS, N_ADC, REF_NAMES, carried, names
 from gfm_runtime.states import BAD_SENSOR, BAD_U, BAD_Y, OK
 
 if TYPE_CHECKING:
-    from gfm_hil.controllers.external import Retuned
+    from gfm_hil.controllers.external import PackedLaw
 
 _SHOWN = 120  # characters of an identification
 _START_S, _POLL_S = 30.0, 0.05
@@ -83,7 +83,7 @@ class PilController(ExternalController):
         self._target = target
         self._ends = contextlib.ExitStack()
 
-    def begin(self, controller: Controller, changed: Sequence[Retuned] = ()) -> None:
+    def begin(self, controller: Controller, changed: Sequence[PackedLaw] = ()) -> None:
         """Build the program for a controller's laws, on whose records it then works, and start it.
         Raises UserError: it cannot be built, does not start, or gives other bits than the
         kernel."""
@@ -113,7 +113,7 @@ class PilController(ExternalController):
             self.close()
             raise UserError(f"controller pil: {problem}") from None
 
-    def has(self, law: Retuned) -> bool:
+    def has(self, law: PackedLaw) -> bool:
         return _numbers(law[1].astype(self._controller.laws.dtype)[0]) in self._places
 
     def _run(self, program: loop.LoopProgram) -> None:

@@ -122,7 +122,7 @@ def _shares(
     else:
         first, second = period, [_role(role, found) for role in sorted(roles)]
         links = {json.dumps([link.type, link.options]): link for link in scenario.links}
-        second += [_link(link.type, link.options, scenario.carries) for link in links.values()]
+        second += [_link(link.type, link.options, scenario.signal_set) for link in links.values()]
         if any(link.impairment is not None for link in links.values()):
             second.append(_IMPAIRMENT)
         if scenario.mode == "realtime":

@@ -33,7 +33,7 @@ from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.links import Link, Port, port_function
 from gfm_hil.links.frame import LAST_TIMES, FrameError, FrameReader, FrameWriter
-from gfm_hil.links.pump import ported
+from gfm_hil.links.pump import with_port
 from gfm_hil.realtime.clock import now_ns, sleep_until
 from gfm_hil.realtime.priority import restore_priority
 from gfm_hil.recording.log import PLANT_LEFT
@@ -290,7 +290,7 @@ def run_loop(
     """
     if flags is None:
         flags = np.zeros(FLAGS, np.int64)
-    shares = [share._replace(link=ported(share.link)) for share in shares]
+    shares = [share._replace(link=with_port(share.link)) for share in shares]
     timelines = [share.timeline for share in shares]
     external = shares[0].bench.external if role == "controller" else None
     for share in shares:

@@ -39,7 +39,7 @@ from gfm_runtime.signals import NY, NY_INNER
 from gfm_runtime.states import READY, RUNNING
 
 if TYPE_CHECKING:
-    from gfm_hil.controllers.external import Retuned
+    from gfm_hil.controllers.external import PackedLaw
 
 REFUSED, ACCEPTED, RESTARTED = range(3)
 _COUNT = kept_of("controller").index("instructions")
@@ -66,7 +66,7 @@ class SteppedController:
         external: ExternalController,
         controller: Controller,
         u: NDArray[np.float64],
-        changed: Sequence[Retuned] = (),
+        changed: Sequence[PackedLaw] = (),
     ) -> None:
         self.name, self.has_laws, self._external = external.name, external.has_laws, external
         self.abandoned = False

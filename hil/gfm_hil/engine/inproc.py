@@ -19,7 +19,7 @@ from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample,
 from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.realtime.atomics import prefetch, row_at
 from gfm_hil.recording.columns import signals_of
-from gfm_hil.recording.parts import Kept, RolePart
+from gfm_hil.recording.parts import MemoryPart, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
 from gfm_plant.synchro_check import WATCHING
@@ -201,8 +201,8 @@ def run_ticks(
 
 def run_inproc(
     benches: Sequence[Bench],
-    plant_parts: Sequence[RolePart | Kept],
-    controller_parts: Sequence[RolePart | Kept],
+    plant_parts: Sequence[RolePart | MemoryPart],
+    controller_parts: Sequence[RolePart | MemoryPart],
     timelines: Sequence[Timeline],
     go_on: Callable[[int], bool],
 ) -> int:
@@ -232,8 +232,8 @@ class Converters(NamedTuple):
     """The converters of a run, or of a part of its plant."""
 
     benches: Sequence[Bench]
-    plant_parts: Sequence[RolePart | Kept]
-    controller_parts: Sequence[RolePart | Kept]
+    plant_parts: Sequence[RolePart | MemoryPart]
+    controller_parts: Sequence[RolePart | MemoryPart]
     timelines: Sequence[Timeline]
 
 
@@ -332,18 +332,18 @@ def _run_parts(whole: Converters, cores: int, chunk: int, ask: Callable[[int], b
 
 def _put(
     first: int,
-    parts: Sequence[RolePart | Kept],
+    parts: Sequence[RolePart | MemoryPart],
     rows: NDArray[np.float64],
     flows: NDArray[np.float64],
 ) -> None:
     """Put rows into those parts that take them."""
     for part, own in zip(parts, rows, strict=True):
-        if isinstance(part, Kept):
+        if isinstance(part, MemoryPart):
             part.put(first, own, flows)
 
 
 def _where_they_stay(
-    plant_parts: Sequence[RolePart | Kept], controller_parts: Sequence[RolePart | Kept]
+    plant_parts: Sequence[RolePart | MemoryPart], controller_parts: Sequence[RolePart | MemoryPart]
 ) -> Places | None:
     """The places of the rows of all ticks in the parts; None if one takes them by ``put``."""
     sides = [[part.rows for part in parts] for parts in (plant_parts, controller_parts)]

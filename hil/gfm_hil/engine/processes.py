@@ -151,7 +151,7 @@ class Processes:
         UserError: there is less."""
         if self.scenario.mode != "realtime":
             return 0.0
-        what = self.scenario.carries, self.scenario.optional_signals
+        what = self.scenario.signal_set, self.scenario.optional_signals
         a_tick = len(self._places) * bytes_per_tick(*what) + 8 * len(self.scenario.flows)
         needed, free = self.scenario.ticks * a_tick / 1e9, available_memory() / 1e9
         if needed > free:

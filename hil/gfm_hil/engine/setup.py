@@ -55,7 +55,7 @@ class Bench:
 
     @property
     def inner(self) -> int:
-        """What frames and recording carry, see ``Scenario.carries``."""
+        """What frames and recording carry, see ``Scenario.signal_set``."""
         return self.controller.inner
 
     @property
@@ -208,7 +208,7 @@ def unstarted_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     vectors: tuple[Vector, Vector] = "y", "u"
     for k, one in enumerate([*scenario.each.values()] or [scenario]):
         controller = _controller(one, plant, real)
-        inner = controller.inner = scenario.carries
+        inner = controller.inner = scenario.signal_set
         y, u = (np.zeros(len(carried(group, inner))) for group in vectors)
         flows = scenario.flows if k == 0 else ()
         benches.append(Bench(one, plant, k, controller, nowhere, y, u, flows=flows))

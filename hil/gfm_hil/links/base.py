@@ -54,7 +54,7 @@ class LinkOptions(BaseModel):
 
     @property
     def inner(self) -> int:
-        """What the frames carry, see ``Scenario.carries``. The laws of the run say so, not the
+        """What the frames carry, see ``Scenario.signal_set``. The laws of the run say so, not the
         user."""
         return self._inner
 

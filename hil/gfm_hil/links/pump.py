@@ -109,7 +109,7 @@ def warm_up() -> None:
     Port(np.zeros(_LOST + 1, np.int64), ring.port_send, _receive, 0)
 
 
-def ported(link: Link) -> Link:
+def with_port(link: Link) -> Link:
     """The link itself, or a ``PumpedLink`` around it if it has no port."""
     return link if link.port is not None else PumpedLink(link)
 

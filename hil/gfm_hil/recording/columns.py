@@ -64,7 +64,7 @@ _MORE_OF: dict[Role, tuple[tuple[str, ...], ...]] = {
 
 
 def signals_of(role: Role, inner: int, options: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """The columns that a role records, without times; ``inner``: see ``Scenario.carries``;
+    """The columns that a role records, without times; ``inner``: see ``Scenario.signal_set``;
     ``options``: what its plant has by options, see ``Scenario.optional_signals``."""
     found = SIGNALS_OF[role] + tuple(n for more in _MORE_OF[role][:inner] for n in more)
     return found + (tuple(f"true_{n}" for n in options) if role == "plant" else ())

@@ -165,7 +165,7 @@ def check_parts(folder: Path, ticks: int) -> None:
                     raise UserError(f"{place}/{role}_{what}.npy: {said}")
 
 
-class Kept:
+class MemoryPart:
     """One side's columns in memory, to record one run after another.
 
     Args:

@@ -22,7 +22,7 @@ from gfm_hil.engine.inproc import run_inproc
 from gfm_hil.engine.setup import Bench, make_bench
 from gfm_hil.engine.timeline import TimelineInMemory
 from gfm_hil.recording.columns import PHASES, WAVES, wave
-from gfm_hil.recording.parts import Kept
+from gfm_hil.recording.parts import MemoryPart
 from gfm_hil.recording.run import Run, bases
 from gfm_hil.scenario import Scenario
 from gfm_plant import Bases, Network, plant_command, plant_is_delayed
@@ -189,7 +189,10 @@ def between_ticks(
         raise UserError(f"controller = {run.summary['controller']!r}: only runs of a law repeat")
     bench = make_bench(scenario)
     what = scenario.ticks, bench.inner, bench.options
-    plant, controller = (Kept("plant", *what, only=_SAME), Kept("controller", *what, only=()))
+    plant, controller = (
+        MemoryPart("plant", *what, only=_SAME),
+        MemoryPart("controller", *what, only=()),
+    )
     watcher = _Watcher(bench, first, last, max(1, math.ceil(T_s / step - 1e-9)))
     timeline = TimelineInMemory(bench)
     timelines: list[TimelineInMemory] = [timeline, watcher]  # type: ignore[list-item]

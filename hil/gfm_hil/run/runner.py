@@ -31,7 +31,7 @@ from gfm_hil.engine.timeline import Timeline, TimelineInMemory
 from gfm_hil.recording.columns import ColumnLike
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
-from gfm_hil.recording.parts import Kept, RolePart, remove_parts
+from gfm_hil.recording.parts import MemoryPart, RolePart, remove_parts
 from gfm_hil.recording.run import Run
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
@@ -95,7 +95,7 @@ def controller_program(
         controller_file(controller, FORMS)
     places = None if ports is None else Path(ports)
     read_map(places)
-    check_currents(controller, scenario.carries)
+    check_currents(controller, scenario.signal_set)
     compile_external(scenario, notice, real)
     return external_command(controller, places)
 
@@ -184,7 +184,7 @@ def _record(
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
     besides = scenario.ticks * len(scenario.flows)
-    what = scenario.carries, scenario.optional_signals
+    what = scenario.signal_set, scenario.optional_signals
     check_free(folder, scenario.ticks * len(places), *what, besides)
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
@@ -287,7 +287,9 @@ def _run_here(
 
 
 def run_in_memory(
-    scenario: Scenario, kept: tuple[Kept, Kept] | None = None, notice: Notice | None = None
+    scenario: Scenario,
+    kept: tuple[MemoryPart, MemoryPart] | None = None,
+    notice: Notice | None = None,
 ) -> Run:
     """Run a scenario in this process and leave nothing on the disk. Raises UserError: the scenario
     has no operating point.
@@ -319,16 +321,18 @@ def _benches(scenario: Scenario, notice: Notice | None) -> list[Bench]:
     return make_benches(scenario) if notice is None else compiled_benches(scenario, notice)
 
 
-def make_room(benches: Sequence[Bench]) -> list[tuple[Kept, Kept]]:
+def make_room(benches: Sequence[Bench]) -> list[tuple[MemoryPart, MemoryPart]]:
     """Room for all columns of the benches of a run, of the plant and of the controller each."""
     whats = [(bench.scenario.ticks, bench.inner, bench.options) for bench in benches]
     return [
-        (Kept("plant", *what, flows=bench.flows), Kept("controller", *what))
+        (MemoryPart("plant", *what, flows=bench.flows), MemoryPart("controller", *what))
         for bench, what in zip(benches, whats, strict=True)
     ]
 
 
-def _in_memory(benches: Sequence[Bench], kept: Sequence[tuple[Kept, Kept]]) -> list[Run]:
+def _in_memory(
+    benches: Sequence[Bench], kept: Sequence[tuple[MemoryPart, MemoryPart]]
+) -> list[Run]:
     """Run benches; the runs' columns are those kept. Raises UserError: a snapshot has no place."""
     if benches[0].scenario.snapshot is not None:
         raise UserError("snapshot: is kept in a run folder, and a run in memory has none")

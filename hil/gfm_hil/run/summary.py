@@ -61,7 +61,7 @@ def origin(scenario: Scenario, began: float) -> dict[str, Any]:
 def stages(scenario: Scenario) -> dict[str, Any]:
     """The kind of the inner stage of each law, under the key ``inner``; empty if no law of the run
     has one."""
-    if not scenario.carries:
+    if not scenario.signal_set:
         return {}
     laws = {
         title: load_law(name, scenario.inner, scenario.counts).first

@@ -313,7 +313,7 @@ def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
 def _counts_mistakes(law: str, scenario: Scenario) -> Sequence[str]:
     """What is wrong with a law's measurement and modulation, if the scenario's laws have them."""
     try:
-        if scenario.carries == COUNTS:
+        if scenario.signal_set == COUNTS:
             for stage in load_law(law, scenario.inner, scenario.counts).laws:
                 _check_counts(stage, scenario)
     except LawError as problem:

@@ -385,7 +385,7 @@ class Scenario(StrictSchema):
         return laws_digest(self.laws(), self.inner, self.counts)
 
     @cached_property
-    def carries(self) -> int:
+    def signal_set(self) -> int:
         """The signals of frames and recording beside y and u of Phi. ``PLAIN``, none; ``INNER``,
         those of an inner stage, if a law has one; ``COUNTS``, those and the counts of A/D and
         modulator, if a law measures and modulates."""
@@ -454,14 +454,14 @@ class Scenario(StrictSchema):
             options = kind.options.model_validate(link.options)
             where = f"network.converters.{name}.link" if name else "link"
             try:
-                if self.carries == COUNTS and link.type not in _WITH_COUNTS:
+                if self.signal_set == COUNTS and link.type not in _WITH_COUNTS:
                     problems.append(
                         f"{where}.type = {link.type!r}: carries no counts, which laws with"
                         f" [measure] and [modulate] exchange; use {', '.join(_WITH_COUNTS)} or"
                         f" {INPROC}"
                     )
                     continue
-                kind.check(options.of_run(self.carries), self.T_s)
+                kind.check(options.of_run(self.signal_set), self.T_s)
             except LawError:
                 pass  # ``check_scenario`` says what is wrong with the laws
             except ValueError as problem:

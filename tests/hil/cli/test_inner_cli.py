@@ -39,9 +39,9 @@ def test_an_option_gives_every_law_the_stage(tmp_path, capsys):
 
 def test_none_takes_the_stage_of_a_law_away(tmp_path):
     law = file(tmp_path, f'inner = "virtual-stator"\n{VSG_2}', "law.toml")
-    assert load_scenario(JUMP, law=law).carries
-    assert not load_scenario(JUMP, law=law, inner="none").carries
-    assert load_scenario(JUMP, law=law, inner="cascaded").carries
+    assert load_scenario(JUMP, law=law).signal_set
+    assert not load_scenario(JUMP, law=law, inner="none").signal_set
+    assert load_scenario(JUMP, law=law, inner="cascaded").signal_set
 
 
 def test_the_laws_digest_is_that_of_the_content(tmp_path):

@@ -18,7 +18,7 @@ import gfm_hil.controllers
 from gfm_hil.engine.handshake import _Hello
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameReader, FrameWriter
-from gfm_hil.links.serial.framing import stuffed
+from gfm_hil.links.serial.framing import encoded
 from gfm_runtime.firmware import make_modules, sources
 from gfm_runtime.firmware.check import HARNESS
 from gfm_runtime.firmware.folder import selftest
@@ -74,7 +74,7 @@ def test_a_line_in_c_stuffs_and_unstuffs_as_the_bench(header, many):
     for message in many:
         size = header.stuff(message, ctypes.c_size_t(len(message)), to)
         line = to.raw[:size]
-        assert line == stuffed(message)
+        assert line == encoded(message)
         found += taken(header, line)
     assert found == many
 

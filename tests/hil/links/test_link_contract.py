@@ -19,7 +19,7 @@ from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.links.impaired import Impairment
 from gfm_hil.links.impaired.link import ImpairedLink
 from gfm_hil.links.port import PORT_CALL
-from gfm_hil.links.pump import ported
+from gfm_hil.links.pump import with_port
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import RUNNING, SAFE
 
@@ -240,7 +240,7 @@ def call(function, handle, message):
 
 def test_the_port_sends_and_receives_the_same(way, ends):
     """Directly, or by a thread that pumps the messages of a link without a port."""
-    links = {role: ported(link) for role, link in ends.items()}
+    links = {role: with_port(link) for role, link in ends.items()}
     for link in links.values():
         getattr(link, "start", lambda: None)()
     try:

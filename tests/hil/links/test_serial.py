@@ -22,7 +22,7 @@ from gfm_hil.links import link_kind, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
 from gfm_hil.links.serial import link as module
-from gfm_hil.links.serial.framing import stuffed
+from gfm_hil.links.serial.framing import encoded
 from gfm_runtime.signals import NY
 from gfm_runtime.states import STOPPED
 
@@ -61,19 +61,19 @@ KNOWN = {
 
 @pytest.mark.parametrize("plain", KNOWN)
 def test_stuffing_is_that_of_the_literature(plain):
-    assert stuffed(bytes.fromhex(plain)) == bytes.fromhex(KNOWN[plain]) + b"\0"
+    assert encoded(bytes.fromhex(plain)) == bytes.fromhex(KNOWN[plain]) + b"\0"
 
 
 def test_a_run_of_254_bytes_needs_one_more_byte():
     run = bytes(range(1, 255))
-    assert stuffed(b"\0" + run)[:2] == b"\x01\xff"
-    assert stuffed(run + b"\xff") == b"\xff" + run + b"\x02\xff\0"
+    assert encoded(b"\0" + run)[:2] == b"\x01\xff"
+    assert encoded(run + b"\xff") == b"\xff" + run + b"\x02\xff\0"
     assert unstuffed(b"\xff" + run + b"\0") == [run]  # without a last code, as others leave it out
 
 
 @given(st.binary(min_size=1, max_size=LONGEST))
 def test_every_message_comes_back(message):
-    line = stuffed(message)
+    line = encoded(message)
     assert line.count(0) == 1 and line[-1] == 0
     assert len(line) <= len(message) + 4 + 4
     assert unstuffed(line) == [message]
@@ -91,7 +91,7 @@ def test_damage_costs_the_damaged_messages_alone(faults, cuts):
     """Every other frame arrives, in order; what comes of a damaged one, the reader refuses."""
     writer, line, good, traces = FrameWriter("y"), b"", [], 0
     for tick, (kind, at, value) in enumerate(faults):
-        whole = stuffed(writer.pack(tick, 2, 0, np.array([1.0, 0.0, tick, -0.0, 1 / 3])))
+        whole = encoded(writer.pack(tick, 2, 0, np.array([1.0, 0.0, tick, -0.0, 1 / 3])))
         one = whole if kind is None else damaged(whole, kind, at, value)
         if one.lstrip(b"\0") == whole:  # a zero more before a message ends nothing
             good.append(tick)
@@ -116,13 +116,13 @@ def test_damage_costs_the_damaged_messages_alone(faults, cuts):
 
 def test_a_lost_end_costs_two_messages_and_a_long_silence_of_zeros_none():
     into, words = Unstuffer(), [b"first", b"second", b"third", b"fourth"]
-    line = stuffed(words[0]) + stuffed(words[1])[:-1] + stuffed(words[2]) + stuffed(words[3])
+    line = encoded(words[0]) + encoded(words[1])[:-1] + encoded(words[2]) + encoded(words[3])
     into.feed(b"\x07ends somewhere\0" + line)
     found = into.all()
     assert found[0] == b"first" and found[-1] == b"fourth"
     assert b"second" not in found and b"third" not in found and into.damaged == 1
     into.feed(b"\x55" * 100_000)  # no end
-    into.feed(b"\0" + stuffed(b"again"))
+    into.feed(b"\0" + encoded(b"again"))
     assert (into.all(), into.damaged) == ([b"again"], 2)
 
 
@@ -130,7 +130,7 @@ def test_a_damaged_greeting_is_left_out():
     """A frame has a CRC of its own; a digit of a greeting would change what it says."""
     hello = b'GFMHIL {"kind": "hello", "T_s": 0.0001}'
     into = Unstuffer()
-    into.feed(stuffed(hello).replace(b"0.0001", b"0.0002") + stuffed(hello))
+    into.feed(encoded(hello).replace(b"0.0001", b"0.0002") + encoded(hello))
     assert (into.all(), into.damaged) == ([hello], 1)
 
 

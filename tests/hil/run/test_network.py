@@ -421,7 +421,7 @@ def test_all_sides_of_a_network_carry_what_a_later_law_of_one_needs():
     later = {"t": 0.1, "type": "law", "law": "regfm-a1", "converter": "A"}
     whole = load_scenario(content(events=[later]))
     parts = [load_scenario(tomllib.loads(scenario_toml(one))) for one in whole.each.values()]
-    assert {one.carries for one in (whole, *whole.each.values(), *parts)} == {INNER}
+    assert {one.signal_set for one in (whole, *whole.each.values(), *parts)} == {INNER}
 
 
 def test_a_load_of_constant_power_draws_it_at_any_voltage():

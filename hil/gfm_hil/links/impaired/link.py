@@ -22,7 +22,7 @@ from gfm_hil.links.impaired.stage import (
     waiting,
 )
 from gfm_hil.links.port import Port, port_function
-from gfm_hil.links.pump import ported
+from gfm_hil.links.pump import with_port
 from gfm_runtime.compiled import intrinsic
 
 
@@ -36,7 +36,7 @@ class ImpairedLink:
     """
 
     def __init__(self, link: Link, settings: Impairment, role: Role) -> None:
-        self._link = ported(link)
+        self._link = with_port(link)
         self._stage = make_stage(settings, ROLES.index(role))
         self._message = np.zeros(LONGEST, np.uint8)
         assert self._link.port is not None

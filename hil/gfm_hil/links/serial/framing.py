@@ -90,7 +90,7 @@ def unstuff(piece, size, message):
     return n if 0 < n <= LONGEST else DAMAGED
 
 
-def stuffed(message: bytes) -> bytes:
+def encoded(message: bytes) -> bytes:
     """A message as it goes to the line, with the zero that ends it."""
     out = np.zeros(MOST + 1, np.uint8)
     return out[: stuff(np.frombuffer(bytearray(message), np.uint8), out)].tobytes()

@@ -17,7 +17,7 @@ from gfm_hil.scenario.events.reset import Reset
 from gfm_runtime.errors import LawError
 
 if TYPE_CHECKING:
-    from gfm_hil.controllers.external import Retuned
+    from gfm_hil.controllers.external import PackedLaw
     from gfm_hil.scenario.schema import Scenario
     from gfm_runtime.assembly import Controller
 
@@ -54,7 +54,7 @@ def retuned(
     omega_b: float,
     inner: str | None,
     counts: str | None,
-) -> Retuned:
+) -> PackedLaw:
     """A law with some gains changed, discretised, and packed for the kernel.
 
     A gain that the law file ties to a changed one follows it unless it is given too. The newest
@@ -74,7 +74,7 @@ def retuned(
         raise ValueError(str(problem)) from None
 
 
-def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
+def ready_gains(controller: Controller, values: Mapping[str, float]) -> PackedLaw:
     """The law selected last with new gains, on top of earlier changes. Raises ValueError: as
     ``retuned``."""
     gains = {**controller.gains, **values}
@@ -84,10 +84,10 @@ def ready_gains(controller: Controller, values: Mapping[str, float]) -> Retuned:
     return retuned(name, changed, T_s, omega_b, own.inner, own.counts)
 
 
-def gains_of(scenario: Scenario, omega_b: float) -> list[Retuned]:
+def gains_of(scenario: Scenario, omega_b: float) -> list[PackedLaw]:
     """Every change of gains that the scenario names, prepared before it runs; ``omega_b`` as for
     ``retuned``. Raises UserError: a change that is not possible."""
-    found: list[Retuned] = []
+    found: list[PackedLaw] = []
     name, gains = scenario.law, dict[str, float]()
     for event in scenario.sorted_events():
         if isinstance(event, LawChange):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import compiled_benches
-from gfm_hil.recording.parts import Kept
+from gfm_hil.recording.parts import MemoryPart
 from gfm_hil.results.report import finite
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import run_in_memory, run_network_in_memory
@@ -36,12 +36,12 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     """The records of some runs. Raises RunFailed: an error that is not the run's own."""
-    room: dict[int, tuple[Kept, Kept]] = {}
+    room: dict[int, tuple[MemoryPart, MemoryPart]] = {}
     records = []
     for run, law in jobs:
         try:
             scenario, drawn = campaign.scenario(run, law)
-            inner = scenario.carries
+            inner = scenario.signal_set
             if inner not in room and not scenario.parts:
                 room[inner] = kept(scenario)
             if scenario.parts:
@@ -56,15 +56,17 @@ def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     return records
 
 
-def kept(scenario: Scenario) -> tuple[Kept, Kept]:
+def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
     """Room for the columns of a run that its summary reads."""
-    ticks, inner = scenario.ticks, scenario.carries
-    plant, controller = (Kept(role, ticks, inner, only=READ) for role in ("plant", "controller"))
+    ticks, inner = scenario.ticks, scenario.signal_set
+    plant, controller = (
+        MemoryPart(role, ticks, inner, only=READ) for role in ("plant", "controller")
+    )
     return plant, controller
 
 
 def simulate(
-    scenario: Scenario, room: tuple[Kept, Kept]
+    scenario: Scenario, room: tuple[MemoryPart, MemoryPart]
 ) -> tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]:
     """The summary of a run, as ``run_scenario`` would write it, and the columns that it reads,
     which are good until the next run in the same room."""

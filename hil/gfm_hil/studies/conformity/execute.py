@@ -285,7 +285,7 @@ def compile_once(jobs: Sequence[Job], notice: runner.Notice) -> None:
             if job.part.cannot is not None:
                 continue
             scenario = _scenario(job)
-            kind = scenario.carries, len(scenario.converters), job.external is not None
+            kind = scenario.signal_set, len(scenario.converters), job.external is not None
             if kind in seen:
                 continue
             if job.external is not None:
