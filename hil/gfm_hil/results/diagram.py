@@ -219,7 +219,9 @@ def _in_words(
     axes.text(x + 1.2, y, text, va="center", **_SMALL | {"color": _INK})
 
 
-def _url_of(line: single_line.Line, nodes: Mapping[str, str], report: str | None) -> str | None:
+def _url_of(
+    line: single_line.DrawnLine, nodes: Mapping[str, str], report: str | None
+) -> str | None:
     """The curves of the converters at the ends of a line, if there are any in a report."""
     at_ends = [converter for converter, node in nodes.items() if node in line.ends]
     return f"{report}#{ONLY}{','.join(at_ends)}" if report is not None and at_ends else None

@@ -21,7 +21,7 @@ class Bar:
 
 
 @dataclass
-class Line:
+class DrawnLine:
     """What lies between two nodes, ``ends``, in a row of its own."""
 
     ends: tuple[str, str]
@@ -31,7 +31,7 @@ class Line:
     row: int = 0
 
 
-Lines = dict[str, Line]  #: by name
+Lines = dict[str, DrawnLine]  #: by name
 
 
 def converters_of(scenario: Scenario) -> tuple[dict[str, Plant], dict[str, str], dict[str, str]]:
@@ -62,7 +62,7 @@ def bars_of(scenario: Scenario, nodes: Mapping[str, str]) -> tuple[dict[str, Bar
         each = [(name, one, getattr(one, "closed", True)) for _, name, one in network.components()]
         for name, one, closed in each:
             if hasattr(one, "start") and hasattr(one, "end"):
-                lines[name] = Line((one.start, one.end), one.symbol, one.label(), closed)
+                lines[name] = DrawnLine((one.start, one.end), one.symbol, one.label(), closed)
         for line in lines.values():
             for node in line.ends:
                 bars.setdefault(node, Bar())

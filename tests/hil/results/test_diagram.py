@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Rectangle
 
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram, fill_narrow
-from gfm_hil.results.single_line import Bar, Line, assign_lanes, assign_rows
+from gfm_hil.results.single_line import Bar, DrawnLine, assign_lanes, assign_rows
 from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 from gfm_plant import NetworkParts
 from gfm_plant.components.part import Component
@@ -124,7 +124,9 @@ def test_lines_of_a_narrow_page_meet_at_nodes_alone():
     bars = {name: Bar(column=3 - k, converters=[name]) for k, name in enumerate("abcd")}
     bars["b"].right = [("load", "town", True)]
     ends = {"ab": "ab", "bc": "bc", "cd": "cd", "da": "da"}
-    lines = {name: Line((pair[0], pair[1]), "inductor", "", True) for name, pair in ends.items()}
+    lines = {
+        name: DrawnLine((pair[0], pair[1]), "inductor", "", True) for name, pair in ends.items()
+    }
     assert assign_rows(bars, lines, stacked=True) == 9
     assert [bars[name].rows for name in "abcd"] == [[0], [2, 3], [5], [8]]
     assert {name: line.row for name, line in lines.items()} == {"ab": 1, "bc": 4, "cd": 6, "da": 7}
