@@ -281,7 +281,7 @@ def certificate(found: CertifiedLaws) -> Axes:
 
 
 #: how a clearing time is marked, by what a longer fault does
-_ENDS = {"o": "falls out of step", "x": "is tripped", "^": "bears longer ones"}
+_ENDS = {"o": "equilibrium not reached", "x": "is tripped", "^": "bears longer ones"}
 
 
 @with_look

@@ -33,6 +33,7 @@ END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 #: the recorded columns that the summary of a run in memory reads
 READ = frozenset(
     {"true_p", "true_omega_u", "true_V", "true_i", "true_omega_g", "true_V_g", "law", "ref_P_ref"}
+    | {"true_delta"}
 )
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 
@@ -102,6 +103,8 @@ def summarise(
         if ripple is not None and ripple.oscillates:
             outcome = Outcome("oscillating", ripple.words(), outcome.tick)
     trips = _trips(log, outcome, done, scenario.T_s)
+    if plant and not outcome.reason and not trips:
+        outcome = Outcome(outcome.status, _out_of_step(scenario, signals, log, done), outcome.tick)
     changes = [e for e in log if e["event"] == "law-active"]
     first = law_titles(scenario.laws())[scenario.law]
     laws = [first, *[e["law"] for e in changes]]
@@ -142,6 +145,28 @@ def summarise(
     if scenario.mode == "realtime" and not all(e["one_clock"] for e in met):
         summary["clock_drift_ppm"] = clock_drift(timing, scenario.T_s)
     return summary
+
+
+def _out_of_step(
+    scenario: Scenario, signals: Columns, log: Sequence[dict[str, Any]], done: int
+) -> str:
+    """Words on an angle to the grid that ends half a turn or more from where it began; empty
+    without one. In a network, or behind a breaker, the angle to the grid may be anyone's."""
+    delta = signals["true_delta"]
+    if scenario.network is not None or any(e["event"] == "grid-breaker" for e in log) or not done:
+        return ""
+    first, last = float(delta[:1][0]), float(delta[done - 1 : done][0])
+    if not abs(last - first) >= math.pi:
+        return ""
+    at, tick = 0, done - 1
+    for piece in pieces(delta, 0, done):
+        beyond = np.flatnonzero(np.abs(piece - first) >= math.pi)
+        if len(beyond):
+            tick = at + int(beyond[0])
+            break
+        at += len(piece)
+    t, degrees = tick * scenario.T_s, math.degrees(last - first)
+    return f"fell out of step at {t:.4g} s: its angle to the grid ends {degrees:+.4g}° from before"
 
 
 def _events(

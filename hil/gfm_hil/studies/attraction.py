@@ -10,9 +10,8 @@ from typing import Any, Self
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.run.runner import run_in_memory
-from gfm_hil.scenario import Scenario, load_scenario
-from gfm_hil.studies.clearing import NO_EQUILIBRIUM
+from gfm_hil.scenario import Scenario
+from gfm_hil.studies.clearing import NO_EQUILIBRIUM, loss_of, run_to_rest
 from gfm_hil.studies.workers import SILENT, Watch
 
 AFTER_S, WITHIN = 3.0, 1.0  # s, degrees
@@ -65,7 +64,7 @@ def attraction(
 
     Args:
         scenario: of one converter; none of its events counts.
-        after: how long each run goes on after the jump, s.
+        after: how long each run goes on after the jump at least, s; see ``run_to_rest``.
         within: distance between an angle from which it comes back and one from which not, degrees.
         watch: told the runs done.
 
@@ -115,10 +114,6 @@ def _loss(scenario: Scenario, degrees: float, after: float) -> str:
     """The reason for which the converter does not come back after a jump; empty if it does."""
     content = scenario.model_dump(mode="json", exclude_unset=True)
     jump = {"type": "grid-phase-jump", "t": _BEFORE_S, "degrees": degrees}
-    content |= {"events": [jump], "duration": _BEFORE_S + after}
-    run = run_in_memory(load_scenario(content, in_process=True))
-    if run.status not in ("completed", "oscillating"):
-        return str(run.summary["reason"])
-    delta = np.degrees(np.asarray(run.signals["delta"], float))
-    before = delta[round(_BEFORE_S / scenario.T_s) - 1]
-    return ANOTHER_TURN if abs(delta[-1] - before) >= _HALF else ""
+    begin = round(_BEFORE_S / scenario.T_s)
+    run, moved = run_to_rest(content | {"events": [jump]}, begin, _BEFORE_S, after)
+    return loss_of(run) or (ANOTHER_TURN if abs(moved[-1]) >= _HALF else "")

@@ -6,12 +6,15 @@ System Stability and Control, 1994, ch. 13).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.recording.run import Run
 from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.workers import SILENT, Watch
@@ -19,6 +22,9 @@ from gfm_hil.studies.workers import SILENT, Watch
 LONGEST_S, AFTER_S = 2.0, 3.0
 _MOST_S = 60.0
 _OUT_OF_STEP = 180.0  # degrees, as the criterion stays_in_step has it
+#: s, degrees: a run is over when its angle was no farther than this from where it was before
+_REST_S, _REST = 1.0, 30.0
+_AWAY, _LONGEST_AFTER_S = 540.0, 24.0  # degrees, s; else
 
 NO_EQUILIBRIUM = "no equilibrium"  # its angle runs away even if the fault does not occur
 NOT_REACHED = "equilibrium not reached"  # there is one, and the angle passes it
@@ -91,7 +97,7 @@ def clearing_time(
     Args:
         scenario: of one converter, with one event that has a ``duration``.
         longest: the longest that is tried, s.
-        after: how long each run goes on after it, s.
+        after: how long each run goes on after it at least, s; see ``run_to_rest``.
         within: distance between what is borne and what is not, s; None: one tick.
         watch: is told the runs done.
 
@@ -156,11 +162,34 @@ def _run(scenario: Scenario, at: int, ticks: int, after: float) -> Trial:
             events.append(event)
         elif ticks:
             events.append({**event, "duration": seconds})
-    lasts = begin * T_s + seconds + after
-    run = run_in_memory(
-        load_scenario({**content, "events": events, "duration": lasts}, in_process=True)
-    )
-    delta = np.asarray(run.signals["delta"], float)
-    far = float(np.degrees(np.abs(delta - delta[max(begin - 1, 0)]).max()))
-    loss = "" if run.status in ("completed", "oscillating") else str(run.summary["reason"])
-    return Trial(seconds, far, NOT_REACHED if far >= _OUT_OF_STEP else loss)
+    run, moved = run_to_rest({**content, "events": events}, begin, begin * T_s + seconds, after)
+    far = float(np.abs(moved).max())
+    return Trial(seconds, far, NOT_REACHED if far >= _OUT_OF_STEP else loss_of(run))
+
+
+def run_to_rest(
+    content: Mapping[str, Any], begin: int, end: float, after: float
+) -> tuple[Run, NDArray[np.float64]]:
+    """The run of a scenario, and how far its angle is from where it was before tick ``begin``,
+    degrees, by tick.
+
+    The run goes on for ``after`` s after ``end``, s. If its angle has not come back to where it
+    was by then, up to whole turns, and does not run away, nothing is decided: it may creep past its
+    unstable equilibrium. It is run again for twice as long, to 24 s.
+    """
+    while True:
+        scenario = load_scenario({**content, "duration": end + after}, in_process=True)
+        run = run_in_memory(scenario)
+        delta = np.degrees(np.asarray(run.signals["delta"], float))
+        moved = delta - delta[max(begin - 1, 0)]
+        rest = moved[-round(_REST_S / scenario.T_s) :]
+        rests = np.abs(rest - 360.0 * np.round(rest[-1] / 360.0)).max() <= _REST
+        runs_away = np.abs(moved[-1]) > _AWAY
+        if rests or runs_away or loss_of(run) or 2 * after > _LONGEST_AFTER_S:
+            return run, moved
+        after *= 2
+
+
+def loss_of(run: Run) -> str:
+    """How a run ended in the safe state; empty if it did not."""
+    return "" if run.status in ("completed", "oscillating") else str(run.summary["reason"])

@@ -101,6 +101,12 @@ def test_a_trip_is_named_and_a_sag_that_is_borne_has_no_end():
     assert made.seconds == pytest.approx(0.1, abs=0.02)
 
 
+def test_a_run_goes_on_until_its_angle_is_back_or_lost():
+    """After 1 s it still creeps along near half a turn."""
+    soon, late = (gfmhil.clearing_time("vsg-2", after=after, within=5e-4) for after in (1.0, 12.0))
+    assert (soon.seconds, soon.lost, soon.loss) == (late.seconds, late.lost, NOT_REACHED)
+
+
 def test_what_is_lost_without_the_fault_has_no_equilibrium():
     content = load_scenario("deep_sag", in_process=True).model_dump(exclude_unset=True)
     content["events"] = [*content["events"], {"t": 1.0, "type": "grid-voltage", "V_g": 0.1}]
@@ -161,9 +167,9 @@ def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
     options = ["--scr", "2,4", "--longest", "0.3", "--after", "0.5", "--out", str(figure)]
     assert main(["design", "clearing", "--law", "droop-5", *options]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [row[:3] for row in rows if row[:1] in (["2"], ["4"])] == [
-        ["2", "0.3", "borne"], ["4", "0.3", "borne"]
-    ]  # fmt: skip
+    assert [row[1:5] for row in rows if row[:1] in (["2"], ["4"])] == [
+        ["≥", "0.3", "not", "tried"]
+    ] * 2
     assert figure.stat().st_size > 5000
     assert main(["design", "clearing", "--law", "droop-5", *options, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
@@ -174,6 +180,6 @@ def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
     options += ["--over", "events.0.V_g=0.1,0.3", "--over", "inner.I_max=1.2"]
     assert main(["design", "clearing", "--law", "droop-5", *options]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [row[:4] for row in rows if row[3:4] == ["0.3"]] == [
-        [scr, V_g, "1.2", "0.3"] for scr in ("2", "4") for V_g in ("0.1", "0.3")
+    assert [row[:5] for row in rows if row[4:5] == ["0.3"]] == [
+        [scr, V_g, "1.2", "≥", "0.3"] for scr in ("2", "4") for V_g in ("0.1", "0.3")
     ]

@@ -19,15 +19,15 @@ def add_converter_option(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def add_loop_options(command: argparse.ArgumentParser) -> Any:
+def add_loop_options(command: argparse.ArgumentParser, scenario: str = "pref_step") -> Any:
     """Law, inner stage, scenario and converter of a loop, and JSON; returns the group in which
     something else may stand in place of the scenario."""
     command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
     add_inner(command)
     where = command.add_mutually_exclusive_group()
     where.add_argument(
-        "--scenario", default="pref_step",
-        help="scenario file or shipped name: plant, references, T_s; pref_step by default",
+        "--scenario", default=scenario,
+        help="scenario file or shipped name: plant, references, T_s; %(default)s by default",
     )  # fmt: skip
     add_converter_option(command)
     add_settings(command)

@@ -3,7 +3,7 @@ converter comes back, at one place or over a map."""
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -17,12 +17,26 @@ from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.studies import attraction, clearing
 
-#: heads of what ``row`` has, and how it is told
-_CLEARING = (("seconds", "bears [s]", None), ("loss", "a longer one", "borne"))
-_ATTRACTION = (
-    ("low", "back from [deg]", None), ("high", "to [deg]", None),
-    ("below", "a larger jump back", "comes back"), ("above", "a larger one ahead", "comes back"),
-)  # fmt: skip
+Row = dict[str, Any]
+Columns = dict[str, Callable[[Row], Any]]
+
+
+def _reason(row: Row, key: str, none: str) -> str:
+    """A reason without its numbers; ``none`` if there is no reason."""
+    return row[key].partition(":")[0] or none
+
+
+#: what is told of a ``row``, by its head
+_CLEARING: Columns = {
+    "bears [s]": lambda row: row["seconds"] if row["loss"] else f"≥ {row['seconds']:g}",
+    "a longer one": lambda row: _reason(row, "loss", "not tried"),
+}
+_ATTRACTION: Columns = {
+    "back from [deg]": lambda row: row["low"],
+    "to [deg]": lambda row: row["high"],
+    "a larger jump back": lambda row: _reason(row, "below", "comes back"),
+    "a larger one ahead": lambda row: _reason(row, "above", "comes back"),
+}
 
 
 def add(kinds: Any) -> None:
@@ -50,8 +64,7 @@ def _add(kinds: Any, name: str, text: str, scenario: str, after: float) -> argpa
     command: argparse.ArgumentParser = kinds.add_parser(
         name, help=text, description=f"{text}, by runs"
     )
-    add_loop_options(command)
-    command.set_defaults(scenario=scenario)
+    add_loop_options(command, scenario)
     command.add_argument(
         "--scr", metavar="LIST", type=numbers, default=[],
         help="short-circuit ratios by commas; that of the scenario by default",
@@ -63,7 +76,8 @@ def _add(kinds: Any, name: str, text: str, scenario: str, after: float) -> argpa
     )  # fmt: skip
     command.add_argument(
         "--after", metavar="S", type=float, default=after,
-        help="how long a run goes on afterwards (default: %(default)s)",
+        help="how long a run goes on afterwards at least (default: %(default)s); one whose angle is"
+        " not back by then goes on, to 24 s",
     )  # fmt: skip
     command.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
     add_figure(command)
@@ -94,7 +108,7 @@ def _attraction(options: argparse.Namespace) -> int:
 
 def _tell(
     options: argparse.Namespace,
-    columns: Sequence[tuple[str, str, str | None]],
+    columns: Columns,
     at_one: Callable[..., Any],
     how: dict[str, Any],
     at_map: Callable[..., Any],
@@ -125,16 +139,14 @@ def _tell(
     console.print(f"[bold]{scenario.law}[/] · {scenario.title}")
     heads = ["SCR" if name == SCR else name for name in over]
     cells = [
-        [*(f"{row[name]:g}" for name in over), *(_cell(row[key], none) for key, _, none in columns),
-         row["runs"]]
+        [
+            *(f"{row[name]:g}" for name in over),
+            *(tell(row) for tell in columns.values()),
+            row["runs"],
+        ]
         for row in rows
-    ]  # fmt: skip
-    console.print(Table([*heads, *(head for _, head, _ in columns), "runs"], cells, text=0))
+    ]
+    console.print(Table([*heads, *columns, "runs"], cells, text=0))
     if options.out:
         console.print(f"figure: {options.out}", soft_wrap=True)
     return 0
-
-
-def _cell(value: Any, none: str | None) -> Any:
-    """A number, or a reason without its numbers; ``none`` if there is no reason."""
-    return value if none is None else value.partition(":")[0] or none
