@@ -134,7 +134,7 @@ def fault(
         clearing=clearing,
     )  # fmt: skip
     changed = replace(wiring, fault=place)
-    if kind in ("LG", "LLG") and changed.zero_sequence() is None:
+    if kind in ("LG", "LLG") and changed.zero_sequence is None:
         raise ValueError(
             f"X_0: not set, and no closed line leads from {where} to the earthed star point of the"
             f" grid or of a transformer; an {kind} fault needs a path to ground"

@@ -453,7 +453,7 @@ def _pack_flows(net: Any, wiring: Wiring) -> None:
 def _pack_contacts(net: Any, wiring: Wiring) -> None:
     """Set what the phases of a fault or breaker carry, and what is left when one of them opens."""
     contacts, order = wiring.contacts, wiring.order
-    zero_sequence = wiring.zero_sequence() is not None
+    zero_sequence = wiring.zero_sequence is not None
     net["opens_to"] = -1
     net["contact_w"] = order.index(CONTACT) if CONTACT in order else -1
     net["contact_of"] = 0

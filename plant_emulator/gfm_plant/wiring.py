@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,7 +206,7 @@ class Wiring:
     recorded: tuple[Terminal, ...] = ()  # where the run records currents and powers
     led: bool = False  # whether another part of the plant sets the frequency, see `parted`
 
-    @property
+    @cached_property
     def order(self) -> tuple[str, ...]:
         """Names of the states as w has them: three a converter, the branches, the banks' voltages,
         and what a fault adds: the current beyond it within a branch, and its own through the
@@ -264,7 +265,7 @@ class Wiring:
         """Whether several contacts may each conduct in other phases, see `contacts`."""
         return len(self.poles) + (self.fault is not None) > 1
 
-    @property
+    @cached_property
     def poles(self) -> tuple[tuple[str, str], ...]:
         """The breakers that open, by their names and the branches that they interrupt: a line with
         a fault inside is one on each side of it."""
@@ -294,26 +295,26 @@ class Wiring:
         """The branch that has a place for a fault inside."""
         return None if self.fault is None else self.fault.branch
 
-    @property
+    @cached_property
     def units_lines(self) -> tuple[Branch, ...]:
         """The lines from the converters to their nodes."""
         return tuple(
             Branch(u.line, u.terminal, u.node, u.L_g, u.R_g, u.earthed) for u in self.units
         )
 
-    @property
+    @cached_property
     def fed_branches(self) -> tuple[Branch, ...]:
         """From the voltages of components to their nodes."""
         each = (part for name, one in self.fed for part in one.elements(name))
         return tuple(part for part in each if isinstance(part, Branch))
 
-    @property
+    @cached_property
     def sinks(self) -> tuple[CurrentSource, ...]:
         """The currents of components."""
         each = (part for name, one in self.fed for part in one.elements(name))
         return tuple(part for part in each if isinstance(part, CurrentSource))
 
-    @property
+    @cached_property
     def fed_shunts(self) -> tuple[Shunt, ...]:
         """What the components with currents put beside them."""
         each = (part for name, one in self.fed for part in one.elements(name))
@@ -381,14 +382,14 @@ class Wiring:
         )  # fmt: skip
         return found | {part.name: (part.name, part.node, GROUND) for part in to_ground}
 
-    @property
+    @cached_property
     def contacts(self) -> tuple[Contact | None, ...]:
         """None, the fault or the opening breaker, and what may be left of it while its phases open
         one by one."""
         found: list[Contact | None] = [None]
         alone = None if self.joint else next(iter(self.opening), None)
         waiting: list[Contact | None] = [self.fault or alone]
-        zero_sequence = waiting != [None] and self.zero_sequence() is not None
+        zero_sequence = waiting != [None] and self.zero_sequence is not None
         while waiting:
             one = waiting.pop(0)
             if one in found or one is None:
@@ -403,7 +404,7 @@ class Wiring:
         part of what this gives with w, in the frame that stands still."""
         to_axis = np.zeros((2, len(self.order)))
         for axis in (ALPHA, BETA):
-            seen = contact.seen(axis, self.zero_sequence())
+            seen = contact.seen(axis, self.zero_sequence)
             if seen is not None:
                 for name, factor in self._through(contact, axis, seen).items():
                     to_axis[axis, self.order.index(name)] += factor
@@ -484,6 +485,7 @@ class Wiring:
         angle = 0.0 if contact is None or contact.balanced else contact.angle
         return found, angle, circuits[0].names
 
+    @cached_property
     def zero_sequence(self) -> complex | None:
         """The impedance between the place of the fault and ground for a zero sequence at nominal
         frequency, or that of the loop through an opening breaker, p.u.; None: there is no path.
@@ -591,10 +593,23 @@ class Wiring:
     ) -> tuple[Circuit, list[Branch]]:
         """A circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis. At ``place`` no branch hangs."""
+        # an event asks for the same ones again and again, and the loop waits for it
+        key = blocked, contact, axis, place
+        if key not in self._circuits:
+            self._circuits[key] = self._make_circuit(*key)
+        return self._circuits[key]
+
+    @cached_property
+    def _circuits(self) -> dict[Any, tuple[Circuit, list[Branch]]]:
+        return {}
+
+    def _make_circuit(
+        self, blocked: frozenset[int], contact: Contact | None, axis: int, place: str
+    ) -> tuple[Circuit, list[Branch]]:
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         through, poles, grid = [], {}, self.grid if self.closed else None
-        seen = None if contact is None else contact.seen(axis, self.zero_sequence())
+        seen = None if contact is None else contact.seen(axis, self.zero_sequence)
         if isinstance(contact, FaultPlace) and seen is not None:
             node = self.fault_node
             if seen.imag > 0:

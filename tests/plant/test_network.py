@@ -424,7 +424,7 @@ def test_the_path_of_a_zero_sequence(earthed, node, Z_0):
             fault(plant, None, 0.1, node=node, kind="LG")
         return
     fault(plant, None, 0.1, node=node, kind="LG")
-    assert plant.wiring.zero_sequence() == pytest.approx(Z_0, abs=1e-15)
+    assert plant.wiring.zero_sequence == pytest.approx(Z_0, abs=1e-15)
     go(plant, u, 100)
     told = make(
         {"a": ({}, "m")}, grid="far",
