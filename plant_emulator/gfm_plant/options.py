@@ -36,6 +36,9 @@ from gfm_runtime.signals import (
     quantity,
 )
 
+LINE = ("L_g", "R_g")
+"""Elements of a converter's line, which ``grid.scr`` sets."""
+
 Measured = Literal["v_dc", "p", "q", "V", "i_d", "i_q", "v_d", "v_q", "i_od", "i_oq"]
 Command = Literal["i_u", "omega_u", "E_u", "E_q"]
 MEASURED = cast("tuple[Measured, ...]", (*(Y_NAMES[k] for k in SENSED), *names("y_inner")))
@@ -432,7 +435,7 @@ class Plant(Options):
     @model_validator(mode="after")
     def _elements_stay_physical(self) -> Plant:
         check_factors(self.factors)
-        given = [f"factors.{name}" for name in ("L_g", "R_g") if name in self.factors]
+        given = [f"factors.{name}" for name in LINE if name in self.factors]
         if given and self.grid.scr is not None:
             raise ValueError(
                 f"grid.scr = {self.grid.scr:g}: sets the line; leave out {' and '.join(given)}"

@@ -369,11 +369,12 @@ class _ConverterEquilibrium:
 
     def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
-        idle = self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any())
-        cause = (
-            "; nothing holds v_dc: row 1 answers to no measurement; give it phi.11, or the plant "
-            'dc_source.mode = "regulated"'
-        ) * idle
+        cause = ""
+        if self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any()):
+            cause = (
+                "; nothing holds v_dc: row 1 answers to no measurement; give it phi.11, or the "
+                'plant dc_source.mode = "regulated"'
+            )
         return (
             f"{self.law.law.name} has no steady state at P_ref = {self.ref[1]:g} p.u., V_ref = "
             f"{self.ref[4]:g} p.u., {grid}{cause}"

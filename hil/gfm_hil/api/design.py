@@ -30,6 +30,7 @@ from gfm_hil.scenario.schema import LatePolicy
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant, make_plant
+from gfm_plant.options import LINE
 from gfm_runtime import law_file
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile, shipped_law
@@ -239,6 +240,10 @@ def tune(
     except NoEquilibrium as none:
         raise UserError(str(none)) from None
     starts = starts or search.starts_for(len(problem.gains))
+    try:  # before the search, which moves the problem to the operating point of what it found
+        before = _gamma_of(law.name, problem, np.array([gain.start for gain in problem.gains]))
+    except Unstable:
+        before = None
     try:
         found = search.tune_paper(
             problem, seed, evaluations, starts,
@@ -248,17 +253,15 @@ def tune(
         raise NotTuned(_in_the_way(none, problem, converter)) from None
     except ModuleNotFoundError as missing:
         raise UserError(str(missing)) from None
-    return _tuning(law, name or f"{law.name}-tuned", problem, found)
+    return _tuning(law, name or f"{law.name}-tuned", problem, found, before)
 
 
-def _tuning(law: Law, name: str, problem: search.PaperProblem, found: Tuned) -> Tuning:
+def _tuning(
+    law: Law, name: str, problem: search.PaperProblem, found: Tuned, before: Gamma | None
+) -> Tuning:
     named = problem.law.named(found.values)
     tuned = law.with_gains(name, **named)
     after = _gamma_of(tuned.name, problem, found.values)
-    try:
-        before = _gamma_of(law.name, problem, np.array([gain.start for gain in problem.gains]))
-    except Unstable:
-        before = None
     fixed = _unmoved(problem, found.values, after)
     took = found.evaluations, found.seconds, found.seed
     return Tuning(tuned, after, before, named, fixed, *took, problem)
@@ -315,10 +318,12 @@ def at_short_circuit_ratios(scenario: Scenario, scr: Sequence[float]) -> list[Sc
         return [scenario]
     content = scenario.model_dump(mode="json", exclude_unset=True)
     plant = content.get("plant", {})
+    factors = {name: by for name, by in plant.get("factors", {}).items() if name not in LINE}
     line = make_plant(scenario.plant, scenario.T_s).par[0]
     own = {"x_over_r": float(line["L_g"] / line["R_g"])} if line["R_g"] > 0.0 else {}
     grids = [{**own, **plant.get("grid", {}), "scr": ratio} for ratio in scr]
-    return [check_scenario({**content, "plant": {**plant, "grid": g}}, "scr") for g in grids]
+    plants = [{**plant, "factors": factors, "grid": grid} for grid in grids]
+    return [check_scenario({**content, "plant": one}, "scr") for one in plants]
 
 
 def margins(

@@ -15,6 +15,7 @@ from gfm_hil.core.files import write_text
 from gfm_hil.scenario.events.base import PlantEvent
 from gfm_hil.scenario.schema import INPROC, Scenario
 from gfm_plant import ConverterParameters, Network, load_converter, make_network, make_plant
+from gfm_plant.options import LINE
 from gfm_plant.parted import find_places
 from gfm_runtime import BuiltLaw, LawError, discretise, load_law
 from gfm_runtime.counts import named_counts
@@ -81,7 +82,8 @@ def load_scenario(
             all converters get them, so that none may name its own.
         changed: overrides by dotted path with ``__`` for the dot, e.g. ``link__type="inproc"``, or
             ``events__0__V_g=0.2`` of the first event; None leaves the file's value. A link other
-            than the file's drops the file's endpoint and options. The link ``inproc`` implies
+            than the file's drops the file's endpoint and options, and ``plant__grid__scr`` its
+            factors of the line. The link ``inproc`` implies
             lockstep unless a ``mode`` is given.
 
     Raises:
@@ -110,6 +112,9 @@ def load_scenario(
     if isinstance(link, dict) and chosen not in (None, INPROC, link.get("type", "zmq")):
         link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
+    if "plant__grid__scr" in overrides or "scr" in (overrides.get("plant__grid") or {}):
+        for name in LINE:  # in whose place it comes
+            _inside(content, "plant", "factors").pop(name, None)
     if in_process or chosen is not None:  # one link for all
         for member in _inside(content, "network", "converters").values():
             if isinstance(member, dict):

@@ -45,6 +45,13 @@ def test_a_system_of_python_control_has_the_bits_of_named_elements():
     assert bits(again) == bits(law) and again.gains == dict.fromkeys(law.gains, 1.0)
 
 
+def test_tuning_says_gamma_of_the_law_that_it_began_with():
+    """Its k_34 and k_35 share the operating point, to which the search moves."""
+    law = gfmhil.Law.from_control(PHI, "mine")
+    tuned = gfmhil.design.tune(law, starts=1, evaluations=64)
+    assert tuned.before.value == gfmhil.design.gamma(law).value > tuned.gamma.value
+
+
 def test_a_matrix_has_them_too_and_takes_every_kind_of_cell():
     second = signal.TransferFunction([38.0], [1.0, 0.0])
     integral = {"type": "I", "k_i": 1.9}

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.run.runner import run_in_memory
 from gfm_hil.scenario import check_scenario, load_scenario, scenario_toml, shipped_scenarios
 
 from ...support.files import text_of
@@ -175,6 +176,22 @@ def test_an_override_of_a_table_that_is_none(here):
     Path("bad.toml").write_text('title = "bad"\nduration = 1.0\nlink = "zmq"\n')
     with pytest.raises(UserError, match=r"link: .* not 'zmq'"):
         load_scenario("bad.toml", link__type="inproc")
+
+
+def test_a_short_circuit_ratio_comes_in_place_of_the_files_own_line():
+    grid = {"scr": 3.0, "x_over_r": 6.0}
+    changes = {"plant__grid__scr": 3.0, "plant__grid__x_over_r": 6.0}, {"plant__grid": grid}
+    for one in (load_scenario("rig_pref_step", **each) for each in changes):
+        was = load_scenario("rig_pref_step").plant.factors
+        assert one.plant.factors == {n: by for n, by in was.items() if n not in ("L_g", "R_g")}
+    with pytest.raises(UserError, match=r"grid\.scr = 3: sets the line; leave out factors\.L_g"):
+        load_scenario("rig_pref_step", plant__factors__L_g=2.0, **changes[0])
+
+
+def test_a_plant_without_an_operating_point_is_told():
+    """Its DC source is regulated: nothing of the law is to blame."""
+    with pytest.raises(UserError, match=r"steady state at .*V_g = 3 p\.u\.$"):
+        run_in_memory(load_scenario("rig_pref_step", in_process=True, plant__grid__V_g=3.0))
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())
