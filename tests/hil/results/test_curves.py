@@ -97,3 +97,27 @@ def test_a_browser_draws_the_report(report, width, scheme):
             wait_for(lambda k=k: browser.js(drawn.format(k)) == 1)
         assert browser.js("return document.documentElement.scrollWidth") <= width
         assert browser.complaints() == []
+
+
+@pytest.mark.systems
+@pytest.mark.apt
+@pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver")
+def test_a_report_has_its_figures_when_it_is_loaded(report):
+    """``chromium --print-to-pdf`` prints then, however long the curves take to unpack."""
+    printed = """
+        const unpack = Response.prototype.arrayBuffer;
+        Response.prototype.arrayBuffer = async function () {
+          await new Promise((done) => setTimeout(done, 300));
+          return unpack.call(this);
+        };
+        addEventListener("load", () => {
+          dispatchEvent(new Event("beforeprint"));
+          window.printed = document.querySelectorAll(".printed").length;
+        });
+    """
+    with Browser() as browser:
+        source = {"source": printed}
+        browser.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", source)
+        browser.driver.get(report.as_uri())
+        assert browser.js("return window.printed") == 9
+        assert browser.complaints() == []

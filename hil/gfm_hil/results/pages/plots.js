@@ -2,6 +2,10 @@
 // Draws the plots of a page with uPlot when they come into view or are printed. Drag to zoom in on a time, in all
 // plots of the run; double-click to see all of it again.
 (async () => {
+  // A document that is still open holds back the page's load event: `chromium --print-to-pdf` prints at that event.
+  const open = document.body.appendChild(document.createElement("iframe"));
+  open.hidden = true;
+  open.contentDocument.open();
   const read = (id) => document.getElementById(id).textContent;
   const bytes = Uint8Array.from(atob(read("curves")), (c) => c.charCodeAt(0));
   const plain = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -235,4 +239,6 @@
     });
   });
   addEventListener("afterprint", () => document.querySelectorAll(".printed").forEach((svg) => svg.remove()));
+  open.contentDocument.close();
+  open.remove();
 })();
