@@ -36,7 +36,7 @@ from gfm_hil.results.look import save as save
 from gfm_hil.studies.certificate import CertifiedLaws
 from gfm_hil.studies.clearing import OF_ANGLE, ClearingTime
 from gfm_hil.studies.linear_loop import title_of
-from gfm_hil.studies.margin_figures import NO_POINT, draw_sigma
+from gfm_hil.studies.margin_figures import draw_sigma
 from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
@@ -203,6 +203,7 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
+    axes.autoscale_view()  # of these scales
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
     dress_alone(axes, title)
     if isinstance(loop, NetworkLoop):
@@ -223,18 +224,34 @@ def root_locus(sweep: GainSweep) -> Axes:
     assert figure is not None
     figure.colorbar(cloud, ax=axes, label=sweep.gain)
     if sweep.values[0] <= sweep.own <= sweep.values[-1]:
-        near = sweep.poles[int(np.argmin(np.abs(sweep.values - sweep.own)))]
-        label = f"near the law's {sweep.own:g}"
+        k = int(np.argmin(np.abs(sweep.values - sweep.own)))
+        near, label = sweep.poles[k], _of_law(sweep.gain, sweep.own)
+        if not math.isclose(sweep.values[k], sweep.own, rel_tol=1e-3):
+            label = f"{sweep.gain} = {sweep.values[k]:.4g}, nearest to the law's {sweep.own:.4g}"
         axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
-        place: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1)} if look().paper else {}
-        axes.legend(fontsize=rc("legend.fontsize", 8), **({"loc": "upper left"} | place))
+        axes.legend(fontsize=rc("legend.fontsize", 8), **_place("best"))
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.autoscale_view()  # of these scales
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    dress_alone(axes, f"{sweep.law}: poles over {sweep.gain}, stable where σ < 0")
+    dress_alone(axes, f"{_of(sweep)}: poles over {sweep.gain}, stable where σ < 0")
     return axes
+
+
+def _of_law(gain: str, own: float) -> str:
+    return f"{gain} = {own:.4g} (the law's)"
+
+
+def _of(found: GainSweep | StabilityMap) -> str:
+    """The law, and the scenario if it is known."""
+    return f"{found.law}, {found.title}" if found.title else found.law
+
+
+def _place(loc: str) -> dict[str, Any]:
+    """Of a legend: above the axes in a paper, whose figures are small and have no title."""
+    above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 2}
+    return above if look().paper else {"loc": loc}
 
 
 @with_look
@@ -242,16 +259,19 @@ def stability_map(stability: StabilityMap) -> Axes:
     """Draw ``gfmhil.design.stability_map``: sigma [1/s] over the parameter and the short-circuit
     ratio, its zero as a line, the law's own value dashed."""
     (axes,) = pyplot_panels(1, (6.6, 4.6))
-    draw_sigma(axes, stability.values, stability.scr, stability.sigma)
-    axes.axvline(stability.own, color="k", lw=0.9, ls=(0, (4, 3)))
+    explained = draw_sigma(axes, stability.values, stability.scr, stability.sigma)
+    label = _of_law(stability.gain, stability.own)
+    own = axes.axvline(stability.own, color="k", lw=0.9, ls=(0, (4, 3)), label=label)
     axes.set_xlim(stability.values[0], stability.values[-1])
     axes.set_xscale("log" if stability.values[0] > 0.0 else "linear")
     axes.set_yscale("log")
     axes.set(xlabel=stability.gain, ylabel="short-circuit ratio")
     if not look().paper:  # which has captions
-        axes.set_title(f"{stability.law}: stable where σ < 0", loc="left", fontsize=10)
-    if np.isnan(stability.sigma).any():
-        axes.legend(handles=[NO_POINT], fontsize=rc("legend.fontsize", 8), loc="upper left")
+        axes.set_title(f"{_of(stability)}: stable where σ < 0", loc="left", fontsize=10)
+    if stability.values[0] <= stability.own <= stability.values[-1]:
+        explained.insert(0, own)
+    if explained:
+        axes.legend(handles=explained, fontsize=rc("legend.fontsize", 8), **_place("upper left"))
     return axes
 
 

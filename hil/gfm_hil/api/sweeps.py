@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +35,7 @@ class GainSweep:
         values: of the parameter, shape (n,).
         poles: of the loop at each value, 1/s; none where it has no operating point.
         edges: values at which the loop becomes stable or unstable, ascending.
+        title: of the scenario.
     """
 
     law: str
@@ -43,6 +44,7 @@ class GainSweep:
     values: Vector
     poles: tuple[NDArray[np.complex128], ...]
     edges: tuple[float, ...]
+    title: str = ""
 
     @property
     def sigma(self) -> Vector:
@@ -80,6 +82,7 @@ class StabilityMap:
         law, gain, own, values: as for ``GainSweep``.
         scr: short-circuit ratios, shape (m,).
         sigma: largest real part of the poles, 1/s, shape (m, n); NaN without an operating point.
+        title: of the scenario.
     """
 
     law: str
@@ -88,6 +91,7 @@ class StabilityMap:
     values: Vector
     scr: Vector
     sigma: Vector
+    title: str = ""
 
 
 def sweep(
@@ -126,7 +130,7 @@ def sweep(
         watch.progress(k + 1, points, "")
     one = GainSweep(law.name, gain, _own(law, gain), values, tuple(poles), ())
     largest = partial(_sigma, law, gain, loop, converter)
-    return GainSweep(one.law, gain, one.own, values, one.poles, _edges(values, one.sigma, largest))
+    return replace(one, edges=_edges(values, one.sigma, largest), title=loop.title)
 
 
 def stability_map(
@@ -162,7 +166,7 @@ def stability_map(
     for i, one in enumerate(at_short_circuit_ratios(scenario, ratios.tolist())):
         sigma[i] = [_sigma(law, gain, one, None, value) for value in values]
         watch.progress(i + 1, points, "")
-    return StabilityMap(law.name, gain, _own(law, gain), values, ratios, sigma)
+    return StabilityMap(law.name, gain, _own(law, gain), values, ratios, sigma, scenario.title)
 
 
 def _scenario(on: str | Path | Scenario) -> Scenario:

@@ -41,7 +41,9 @@ def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Clo
     operating point; or no converter is named, or one that the network does not have."""
     if scenario.network is None:
         law, label = initial_law(scenario)
-        return ClosedLoop.of(law, scenario.plant, scenario.references.vector()), label
+        loop = ClosedLoop.of(law, scenario.plant, scenario.references.vector())
+        loop.where = scenario.title
+        return loop, label
     name = converter or scenario.converter
     if name is None:
         raise UserError(

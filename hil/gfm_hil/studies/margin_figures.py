@@ -12,37 +12,42 @@ from numpy.typing import NDArray
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS, GREY, dress
+from gfm_hil.results.look import look
 
 _SPAN = 100.0  # 1/s; colours of sigma end there
 _DELAYS = 300
 _NOWHERE = "#dddddd"
-NO_POINT = Line2D([], [], color=_NOWHERE, marker="s", ls="", label="no operating point")
+_NO_POINT = Line2D([], [], color=_NOWHERE, marker="s", ls="", label="no operating point")
+_EDGE = Line2D([], [], color="k", lw=1.2, label="σ = 0")
 
 
 def draw_sigma(
     axes: Axes, x: NDArray[np.float64], y: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> None:
+) -> list[Line2D]:
     """The largest real part of the poles [1/s], shape (len(y), len(x)), in colour, and its zero as
-    a line; grey where there is no operating point."""
+    a line; grey where there is no operating point. Returns what of this a legend explains."""
     axes.set_facecolor(_NOWHERE)
     # evenly spaced in decades on both sides of zero: from growing fast to hardly damped and back
     decades = AsinhNorm(1.0, -_SPAN, _SPAN)
     mesh = axes.pcolormesh(x, y, sigma, cmap="RdBu_r", norm=decades, shading="nearest")
     finite = np.nan_to_num(np.arcsinh(sigma), nan=1.0)
-    if finite.min() < 0.0 < finite.max():
+    crosses = bool(finite.min() < 0.0 < finite.max())
+    if crosses:
         axes.contour(x, y, finite, levels=[0.0], colors="k", linewidths=1.2)
-    ticks = [-100.0, -10.0, -1.0, 0.0, 1.0, 10.0, 100.0]
+    close = () if look().paper else (-1.0, 1.0)  # to 0, where the bar is short
+    ticks = [-100.0, -10.0, 0.0, 10.0, 100.0, *close]
     figure = axes.get_figure()
     assert figure is not None
     bar = figure.colorbar(mesh, ax=axes, ticks=ticks, format="%g", label="largest σ [1/s]")
     bar.minorticks_off()
+    return [_EDGE] * crosses + [_NO_POINT] * bool(np.isnan(sigma).any())
 
 
 def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> None:
     """sigma in colour, its zero as a line, the printed and the scenario's line as points."""
     figure = Figure(figsize=(6.6, 5.2), layout="constrained")
     axes = figure.subplots()
-    draw_sigma(axes, region.L_g, region.R_g, region.sigma)
+    explained = draw_sigma(axes, region.L_g, region.R_g, region.sigma)
     axes.plot(1.0, 1.0, "o", color="k", ms=6, mfc="none")
     axes.plot(factor(loop, "L_g"), max(factor(loop, "R_g"), region.R_g[0]), "k*", ms=9)
     axes.set_xscale("log")
@@ -54,8 +59,7 @@ def draw_region(path: Path, loop: ClosedLoop, label: str, region: Region) -> Non
         Line2D([], [], color="k", marker="o", mfc="none", ls="", label="printed"),
         Line2D([], [], color="k", marker="*", ms=9, ls="", label="scenario"),
     ]
-    marks += [NO_POINT] * bool(np.isnan(region.sigma).any())
-    axes.legend(handles=marks, fontsize=8, loc="upper left")
+    axes.legend(handles=[*marks, *explained], fontsize=8, loc="upper left")
     figure.savefig(path, dpi=110)
 
 

@@ -61,11 +61,30 @@ def test_a_figure_s_csv_has_what_its_colours_show(tmp_path):
 def test_both_commands_print_and_draw(capsys, tmp_path):
     where = ["k_34", "--law", "mimo-gfm", "--range", "1:20", "--points", "5"]
     assert main(["design", "sweep", *where, "-o", str(tmp_path / "sweep.svg")]) == 0
-    assert "stable for k_34 of 1 to 7.3" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "stable for k_34 of 1 to 7.3" in told
+    assert "from 0.5 to 1 p.u. · P_ref 0.5 p.u., SCR 57.2, X/R 10.5\n" in told
     assert main(["design", "map", *where, "--json", "-o", str(tmp_path / "map.svg")]) == 0
     content = json.loads(capsys.readouterr().out)
     assert np.shape(content["sigma"]) == (5, 5)
     assert all((tmp_path / f"{name}.svg").stat().st_size > 10_000 for name in ("sweep", "map"))
+
+
+def test_a_map_says_of_which_grids_it_is(capsys):
+    strong = ["--set", "plant.grid={scr=3.0, x_over_r=5.0}"]
+    where = ["k_34", "--range", "1:20", "--scr", "1:2", "--points", "2", *strong]
+    assert main(["design", "map", *where]) == 0
+    heading, heads, *_, last = capsys.readouterr().out.splitlines()
+    assert "· P_ref 0.5 p.u., SCR 3, X/R 5 · --set plant.grid=" in heading
+    assert "lowest stable k_34 tried  highest" in heads
+    assert last == "all have X/R 5; SCR 1 to 2 does not contain the scenario's 3"
+
+
+def test_no_pole_lies_at_the_edge_of_the_figure():
+    axes = plot.pole_map(gfmhil.Law.load("mimo-gfm").closed_loop("pref_step"))
+    poles = axes.lines[0].get_xydata()
+    shown = axes.transAxes.inverted().transform(axes.transData.transform(poles))
+    assert (shown > 0.02).all() and (shown < 0.98).all()
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,17 @@
 """What the design commands share: the options that choose a loop, and the figure."""
 
 import argparse
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
+
 from gfm_hil.cli.common import OPTIONS, add_inner, add_settings, settings
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario import Scenario, load_scenario
+from gfm_plant import make_plant
 
 
 def add_converter_option(command: argparse.ArgumentParser) -> None:
@@ -33,6 +37,25 @@ def add_loop_options(command: argparse.ArgumentParser, scenario: str = "pref_ste
     add_settings(command)
     command.add_argument("--json", action="store_true", help="as JSON")
     return where
+
+
+def heading(law: str, scenario: Scenario, options: argparse.Namespace) -> str:
+    """What a table is of: law, scenario, operating point and grid, and what --set changed; of a
+    network the P_ref of the one converter that --converter names, if it does."""
+    told, one = [f"[bold]{law}[/]", escape(scenario.title)], scenario.each.get(options.converter)
+    if scenario.network is None or one is not None:
+        told.append(f"P_ref {(one or scenario).references.P_ref:g} p.u.")
+    if scenario.network is None and (grid := grid_of(scenario)) is not None:
+        told[-1] += f", SCR {grid[0]:.3g}, X/R {grid[1]:.3g}"
+    told += [escape(f"--set {name}={value}") for name, value in options.settings]
+    return " · ".join(told)
+
+
+def grid_of(scenario: Scenario) -> tuple[float, float] | None:
+    """Short-circuit ratio and X/R of the grid of one converter; None of one without resistance."""
+    line = make_plant(scenario.plant, scenario.T_s).par[0]
+    L, R = float(line["L_g"]), float(line["R_g"])
+    return (1.0 / math.hypot(L, R), L / R) if R > 0.0 else None
 
 
 def add_figure(command: argparse.ArgumentParser) -> None:

@@ -11,7 +11,13 @@ from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
-from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
+from gfm_hil.cli.design.common import (
+    add_figure,
+    add_loop_options,
+    chosen_scenario,
+    heading,
+    save_figure,
+)
 from gfm_hil.cli.design.margins import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -74,7 +80,7 @@ def call(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"law": label, "scenario": scenario.title} | content, indent=2))
     else:
-        console.print(f"[bold]{label}[/] · {scenario.title}")
+        console.print(heading(label, scenario, options), soft_wrap=True)
         console.print(table)
         if options.out:
             console.print(f"figure: {options.out}", soft_wrap=True)

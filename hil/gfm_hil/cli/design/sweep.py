@@ -11,7 +11,14 @@ from gfm_hil.api.plot import root_locus, stability_map
 from gfm_hil.api.sweeps import POINTS, GainSweep, StabilityMap, sweep
 from gfm_hil.api.sweeps import stability_map as map_stability
 from gfm_hil.cli.common import two_numbers, watching
-from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
+from gfm_hil.cli.design.common import (
+    add_figure,
+    add_loop_options,
+    chosen_scenario,
+    grid_of,
+    heading,
+    save_figure,
+)
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import finite
@@ -79,7 +86,7 @@ def _sweep(options: argparse.Namespace) -> int:
         return 0
     ranges = " and ".join(f"{low:.6g} to {high:.6g}" for low, high in found.stable())
     console = terminal(highlight=False)
-    console.print(f"[bold]{found.law}[/] · {scenario.title}")
+    console.print(heading(found.law, scenario, options), soft_wrap=True)
     console.print(_sweep_table(found))
     console.print(
         f"stable for {found.gain} of {ranges or 'no value here'}; the law has {found.own:g}",
@@ -119,12 +126,19 @@ def _map(options: argparse.Namespace) -> int:
         print(json.dumps({**about, "own": found.own, **finite(rows)}, indent=2))
         return 0
     console = terminal(highlight=False)
-    console.print(f"[bold]{found.law}[/] · {scenario.title}")
+    console.print(heading(found.law, scenario, options), soft_wrap=True)
     console.print(_map_table(found))
     console.print(
         f"{min(_ROWS, len(found.scr))} of {len(found.scr)} grids, for each of which "
         f"{len(found.values)} values were tried"
     )
+    if own := grid_of(scenario):
+        low, high = (float(found.scr[k]) for k in (0, -1))
+        inside = "contains" if low <= own[0] <= high else "does not contain"
+        console.print(
+            f"all have X/R {own[1]:.3g}; SCR {low:g} to {high:g} {inside} the scenario's "
+            f"{own[0]:.3g}"
+        )
     if options.out:
         console.print(f"figure: {options.out}", soft_wrap=True)
     return 0
@@ -138,5 +152,5 @@ def _map_table(found: StabilityMap) -> Table:
         share = f"{100 * len(stable) / len(found.values):.0f} %"
         ends = [float(stable.min()), float(stable.max())] if len(stable) else [None, None]
         rows.append([float(found.scr[i]), *ends, share])
-    heads = ["short-circuit ratio", f"least stable {found.gain} tried", "greatest", "stable values"]
+    heads = ["short-circuit ratio", f"lowest stable {found.gain} tried", "highest", "stable values"]
     return Table(heads, rows, text=0)
