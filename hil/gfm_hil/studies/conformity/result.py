@@ -294,13 +294,13 @@ _MEANINGS: dict[str, str] = {
     INFORMATIVE: "Informative: measured but judged by no limit; it counts for nothing.",
 }
 #: of the table of a part, after number and verdict
-HEADS = ("clause", "signal", "window [s]", "measured", "limit", "in words", "source", "known")
+HEADS = ("clause", "signal", "window", "measured", "limit", "in words", "source", "known")
 
 
 def row(v: Verdict) -> list[str]:
     """What a report says of a clause, under ``HEADS``."""
     measured = "–" if v.value is None else f"{shown(v.value)} {v.unit}".rstrip()
-    window = f"{v.start:g} … {v.stop:g}" if v.stop > v.start else "–"
+    window = f"{v.start:g} … {v.stop:g} s" if v.stop > v.start else "–"
     signal = symbol_of(v.signal) or "–"
     known = KNOWN.get(v.known, "–")
     return [v.clause, signal, window, measured, v.limit or "–", v.text, v.source or "–", known]

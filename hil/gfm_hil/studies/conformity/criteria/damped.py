@@ -43,7 +43,8 @@ class Damped(Windowed):
             text = "p does not swing."
         else:
             text = f"The swing of p at {mode.hz:.3g} Hz has a damping ratio of {mode.damping:.3g}."
-        return m.make_verdict(found is None, value, "", f"at least {self.ratio:g}", text, "p")
+        limit = f"damping ratio of at least {self.ratio:g}"
+        return m.make_verdict(found is None, value, "", limit, text, "p")
 
 
 CRITERION = Damped

@@ -40,7 +40,8 @@ class EquivalentDamping(Windowed):
             return m.cannot_judge(f"no swing equation fits the answer of p: {problem}")
         ratio, text = damping_of(unit, omega_b)
         ok = self.low <= ratio <= self.high
-        return m.make_verdict(ok, ratio, "", f"{self.low:g} to {self.high:g}", text, "p")
+        limit = f"damping ratio of {self.low:g} to {self.high:g}"
+        return m.make_verdict(ok, ratio, "", limit, text, "p")
 
 
 def damping_of(unit: Unit, omega_b: float) -> tuple[float, str]:

@@ -105,7 +105,7 @@ class Nfp(Plot):
         """The verdict on the equivalent damping ratio of a plot."""
         omega_b = found.omega[0]
         slow = found.frequency < 0.5 * omega_b / (2 * math.pi)
-        limit = f"{low:g} to {high:g}"
+        limit = f"damping ratio of {low:g} to {high:g}"
         try:
             unit = fit_nfp(found.frequency[slow], found.nfp[slow], omega_b)
         except UserError as problem:

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from gfm_hil.recording.columns import unit_of
 from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import FAIL, LIMITED, PASS, Outcome, Verdict
@@ -47,10 +48,10 @@ class Settles(Windowed):
                 f"The one-cycle mean of {w.symbol} should settle at {w.show(to)} ({why})",
                 1,
             )
+        limit = f"within {self.within:g} s, ± {self.tolerance:g} {unit_of(self.signal)}"
         made = m.make_verdict(
-            found is None, took, "s", f"within {self.within:g} s, ± {self.tolerance:g}", text,
-            self.signal, to - self.tolerance, to + self.tolerance,
-            (m.at + self.within, m.last * m.T_s),
+            found is None, took, "s", limit, text, self.signal,
+            to - self.tolerance, to + self.tolerance, (m.at + self.within, m.last * m.T_s),
         )  # fmt: skip
         return replace(made, verdict=LIMITED) if limited and found is None else made
 
