@@ -458,6 +458,8 @@ def _refuse_unstable(kind: str, pole: complex, fine: Any) -> None:
     """Raise LawError unless ``fine`` or the pole, rad/s, has a negative real part."""
     real = pole.real if abs(pole.real) > _CANCELS * abs(pole) else 0.0
     if not fine and real >= 0.0:
+        if real == 0.0 and pole.imag:
+            raise LawError(kind, f"undamped: poles at s = ±{abs(pole.imag):.3g}j rad/s")
         at = f"{complex(real, abs(pole.imag)):.3g}" if pole.imag else f"{real:.3g}"
         raise LawError(kind, f"unstable: a pole at s = {at} rad/s")
 

@@ -155,10 +155,11 @@ def _check(where: str, element: Element) -> None:
         raise LawError(
             where,
             f"improper: its numerator has degree {len(element.num) - 1}, its denominator "
-            f"{element.order}; give a filter T_f to D or PD, or multiply by an IF",
+            f"{element.order}; add a pole (to den of a TF, as T_f of a D or PD, or as an IF)",
         )
     for factor in element.den:
         if factor != INTEGRATOR and not stable(factor):
-            raise LawError(where, f"unstable factor {factor} (ascending powers of s)")
+            word = "undamped" if len(factor) == 3 and factor[1] == 0.0 < factor[2] else "unstable"
+            raise LawError(where, f"{word} factor {factor} (ascending powers of s)")
     if element.den.count(INTEGRATOR) > 1:
         raise LawError(where, "unstable: a double integrator 1/s^2")
