@@ -155,7 +155,7 @@ def _check(where: str, element: Element) -> None:
         raise LawError(
             where,
             f"improper: its numerator has degree {len(element.num) - 1}, its denominator "
-            f"{element.order}; add a pole (to den of a TF, as T_f of a D or PD, or as an IF)",
+            f"{element.order}; give it a pole (den of a TF, T_f of a D or PD, or an IF)",
         )
     for factor in element.den:
         if factor != INTEGRATOR and not stable(factor):

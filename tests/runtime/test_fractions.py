@@ -141,7 +141,7 @@ def test_what_is_no_state_space_over_several_cells_has_one_line(line, message):
          "phi_22: unstable: a double integrator 1/s^2"),
         ('type = "TF", num = [1, 0, 0], den = [1, 1]',
          "phi_22: improper: its numerator has degree 2, its denominator 1; "
-         "add a pole (to den of a TF, as T_f of a D or PD, or as an IF)"),
+         "give it a pole (den of a TF, T_f of a D or PD, or an IF)"),
         ('type = "TF", num = [1], den = [1, -2]',
          "phi_22, TF: unstable: a pole at s = 2 rad/s"),
         ('type = "TF", num = [1], den = [1, 1, 4, 30]',

@@ -113,7 +113,7 @@ def test_what_is_no_law_is_told(system, message):
         (control.ss(UNSTABLE), "phi_22, SS: unstable: a pole at s = 2 rad/s"),
         (1 / S**2, "phi_22: unstable: a double integrator 1/s^2"),
         (S / 1, "phi_22: improper: its numerator has degree 1, its denominator 0; "
-         "add a pole (to den of a TF, as T_f of a D or PD, or as an IF)"),
+         "give it a pole (den of a TF, T_f of a D or PD, or an IF)"),
         ("1/s", "phi_22: system: str is no transfer function or state space"),
         (PHI, "phi_22: system: is 3 × 5; must be 1 × 1"),
         (("s", [1]), "phi_22: ('s', [1]): must be two lists of numbers"),
