@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -169,7 +170,8 @@ def _mark(
 ) -> None:
     """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one.
 
-    The labels stand in three rows, the lowest of which is ``above`` points above the panel.
+    The labels stand in three rows, the lowest of which is ``above`` points above the panel; in a
+    paper, whose panels have no titles, right above the legend, with symbols as the axes have them.
     """
     if (ends := look().xlim) is not None:
         events = [e for e in events if ends[0] <= e["t"] <= ends[1]]
@@ -187,15 +189,27 @@ def _mark(
         a.update_datalim([(e["t"], 0) for e in events], updatey=False)
         a.autoscale_view(scaley=False)
     first, last = axes[0].get_xlim()
+    paper = look().paper
     for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
         late = event["t"] > first + 0.6 * (last - first)  # its label would be cut at the right
         axes[0].annotate(
-            event["label"], (event["t"], 1.0), (-3 if late else 3, above + 10 * (k % 3)),
+            _in_symbols(event["label"]) if paper else event["label"], (event["t"], 1.0),
+            (-3 if late else 3, above - 9 * paper + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points",
             fontsize=rc("legend.fontsize", 8),
             ha="right" if late else "left",
             color="#444444" if colour == GREY else colour,
         )  # fmt: skip
+
+
+def _in_symbols(label: str) -> str:
+    """The label of an event with the symbols of the references and commands that it names."""
+    return re.sub(r"\b[A-Z]\w*_\w+\b", lambda name: _symbol_in(name[0]), label)
+
+
+def _symbol_in(name: str) -> str:
+    row = TABLE.get(f"ref_{name}")
+    return f"${row.symbol}$" if row else name
 
 
 class Magnitude:

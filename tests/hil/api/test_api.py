@@ -167,6 +167,7 @@ def test_figures():
     assert [a.get_ylabel() for a in drawn] == [
         r"$\omega_u$ [p.u.]", "$v_{dc}$ [p.u.]", r"$| i_{dq} |$ [p.u.]"
     ]  # fmt: skip
+    assert drawn[0].texts[0].get_text() == "$P_{ref}$ = 1"
     assert drawn[0].figure.get_figwidth() == 3.5 and drawn[-1].get_xlim() == (0.9, 1.4)
     line = drawn[1].lines[1]
     assert (line.get_ydata()[1:] == laws["vsg-2"].signals["v_dc"][9000:14001]).all()
