@@ -99,8 +99,13 @@ def test_fused_multiply_add_is_found(tmp_path, capsys, target, real, flags):
     folder = str(exported(tmp_path, real, "unrolled", "vsg-1", "hybrid-angle"))
     command = ["firmware", "check", folder, "--target", target]
     assert main(command) == 0
+    assert capsys.readouterr().out.endswith(
+        f"\n{target}, {TARGETS[target].optimised}: no word differs\n"
+    )
     assert main([*command, f"--flags={flags} -ffp-contract=fast"]) == 3
-    assert "look for a fused multiply-add" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert f"\n{target}, {flags} -ffp-contract=fast: words that differ: " in told.out
+    assert "look for a fused multiply-add" in told.err
 
 
 def test_a_folder_that_lacks_a_source_or_crashes_is_told(tmp_path):

@@ -226,7 +226,11 @@ def call_check(options: argparse.Namespace) -> int:
         print(json.dumps([asdict(result) for result in results], indent=2))
     else:
         _print(results)
-        if any(result.differ for result in results):
+        flags = TARGETS[options.target].optimised if options.flags is None else options.flags
+        differ = sum(result.differ for result in results)
+        words = f"words that differ: {differ}" if differ else "no word differs"
+        print(f"{options.target}, {flags}: {words}")
+        if differ:
             print(
                 "gfmhil: words differ from the kernel's: look for a fused multiply-add, sums in a "
                 "wider type, numbers flushed to zero, or a changed source",
@@ -288,4 +292,5 @@ def _print(results: Sequence[firmware.CheckResult]) -> None:
         )
         for r in results
     ]  # fmt: skip
-    terminal().print(Table(heads, rows), highlight=False)
+    about = "constants: read-only data; state: one instance; report.md counts the law's numbers"
+    terminal().print(Table(heads, rows, caption=about), highlight=False)
