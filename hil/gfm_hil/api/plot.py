@@ -41,6 +41,7 @@ from gfm_runtime.signals import U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
 
     from gfm_hil.api.sweeps import GainSweep, StabilityMap
     from gfm_hil.api.transients import TransientMap
@@ -228,8 +229,8 @@ def root_locus(sweep: GainSweep) -> Axes:
         near, label = sweep.poles[k], _of_law(sweep.gain, sweep.own)
         if not math.isclose(sweep.values[k], sweep.own, rel_tol=1e-3):
             label = f"{sweep.gain} = {sweep.values[k]:.4g}, nearest to the law's {sweep.own:.4g}"
-        axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
-        axes.legend(fontsize=rc("legend.fontsize", 8), **_place("best"))
+        crosses = axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
+        _explain(axes, crosses)
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
@@ -248,10 +249,13 @@ def _of(found: GainSweep | StabilityMap) -> str:
     return f"{found.law}, {found.title}" if found.title else found.law
 
 
-def _place(loc: str) -> dict[str, Any]:
-    """Of a legend: above the axes in a paper, whose figures are small and have no title."""
-    above: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 2}
-    return above if look().paper else {"loc": loc}
+def _explain(axes: Axes, lines: list[Line2D]) -> None:
+    """A legend below the axes, where it covers nothing; within those of somebody's figure."""
+    more: dict[str, Any] = {"handles": lines, "fontsize": rc("legend.fontsize", 8)}
+    if look().ax:
+        axes.legend(**more, loc="upper left")
+    else:
+        figure_of([axes]).legend(**more, loc="outside lower center", ncols=2, frameon=False)
 
 
 @with_look
@@ -271,7 +275,7 @@ def stability_map(stability: StabilityMap) -> Axes:
     if stability.values[0] <= stability.own <= stability.values[-1]:
         explained.insert(0, own)
     if explained:
-        axes.legend(handles=explained, fontsize=rc("legend.fontsize", 8), **_place("upper left"))
+        _explain(axes, explained)
     return axes
 
 

@@ -171,7 +171,8 @@ def _mark(
     """Mark every event in every panel, and label at most ``_LABELS`` of them in the first one.
 
     The labels stand in three rows, the lowest of which is ``above`` points above the panel; in a
-    paper, whose panels have no titles, right above the legend, with symbols as the axes have them.
+    paper, whose panels have no titles, right above the legend or the panel, with symbols as the
+    axes have them.
     """
     if (ends := look().xlim) is not None:
         events = [e for e in events if ends[0] <= e["t"] <= ends[1]]
@@ -190,11 +191,13 @@ def _mark(
         a.autoscale_view(scaley=False)
     first, last = axes[0].get_xlim()
     paper = look().paper
+    if paper:
+        above -= 9 if axes[0].get_legend() else 17
     for k, event in enumerate(events[:: -(-len(events) // _LABELS)]):
         late = event["t"] > first + 0.6 * (last - first)  # its label would be cut at the right
         axes[0].annotate(
             _in_symbols(event["label"]) if paper else event["label"], (event["t"], 1.0),
-            (-3 if late else 3, above - 9 * paper + 10 * (k % 3)),
+            (-3 if late else 3, above + 10 * (k % 3)),
             xycoords=("data", "axes fraction"), textcoords="offset points",
             fontsize=rc("legend.fontsize", 8),
             ha="right" if late else "left",
