@@ -58,14 +58,15 @@ def call(options: argparse.Namespace) -> int:
             raise UserError(
                 f"--from {one.name}: has T_s = {one.T_s:g} s, and the scenario {scenario.T_s:g} s"
             )
-    chosen = options.law or [scenario.law]
+    converter = options.converter or scenario.converter  # a converter's folder knows its own
+    chosen = options.law or [scenario.each[converter].law if converter else scenario.law]
     names = [*laws()] if chosen == [_ALL] else chosen
     found: dict[str, LatencyTolerance | UnstableLoop] = {}
     with watching("latency tolerance") as watch:
         for k, name in enumerate(names):
             watch.progress(k, len(names), name)
             try:
-                found[name] = latency_tolerance(name, scenario, converter=options.converter)
+                found[name] = latency_tolerance(name, scenario, converter=converter)
             except UnstableLoop as unstable:
                 found[name] = unstable
     stable = {name: of for name, of in found.items() if isinstance(of, LatencyTolerance)}
