@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,6 +56,11 @@ class Joint:
     pole_bars: _Array  # the currents of the poles, (n_poles, 3, n_q); an open one is a bar
     sources: list[str]  # names of sources and sinks in their order
 
+    @cached_property
+    def fastest(self) -> float:
+        """Of its modes, 1/s."""
+        return max(float(np.abs(np.linalg.eigvals(flow).imag).max()) for flow in self.flow)
+
 
 def zero_circuit(wiring: Wiring) -> Circuit:
     """The lines and windings through which a zero sequence flows, and the fault's own path."""
@@ -69,7 +75,8 @@ def zero_circuit(wiring: Wiring) -> Circuit:
     return Circuit(tuple(without_ends(found, held)), (), ())
 
 
-def join(wiring: Wiring, omega_b: float) -> Joint:
+@lru_cache(maxsize=32)
+def join(wiring: Wiring) -> Joint:
     """Return the system of a wiring whose contacts are all closed. Raises ValueError: as
     `circuit.find_modes`."""
     ensure_lapack()  # now, as the loop that calls `joint.make_joint` has no time for it
@@ -92,7 +99,7 @@ def join(wiring: Wiring, omega_b: float) -> Joint:
             )
             wide[phases] += more
             bars[phases, : len(none)] = none
-    flow = omega_b * K.T @ (wide / root[:, None] / root) @ K
+    flow = wiring.omega_b * K.T @ (wide / root[:, None] / root) @ K
     states = np.zeros((2, len(order), len(root)))
     for j, name in enumerate(axis.names):
         states[0, order.index(name), j] = states[1, order.index(name), n + j] = 1.0
@@ -110,7 +117,7 @@ def join(wiring: Wiring, omega_b: float) -> Joint:
     return Joint(
         to_w=states / root @ K,
         from_w=states * root @ K,
-        from_s=omega_b * (B / root) @ K,
+        from_s=wiring.omega_b * (B / root) @ K,
         flow=flow,
         fault_bars=bars / root @ K,
         fault_carries=carries / root @ K,

@@ -6,11 +6,11 @@ A wiring never changes: an event makes another one. Elements are in p.u. of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ from gfm_plant.names import FAULTED_PHASES
 GRID_SOURCE = "grid"
 CONTACT = "contact"  # the branch through which a zero sequence lets a fault, or the grid, conduct
 ALPHA, BETA = 0, 1
+P = ParamSpec("P")
+R = TypeVar("R")
 """The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
 
@@ -180,6 +182,22 @@ class Check:
 
     name: str  # of the breaker; "" for that of the grid
     sides: tuple[str, str]  # the nodes at its two ends, or GRID_SOURCE for the grid itself
+
+
+def _once(method: Callable[Concatenate[Wiring, P], R]) -> Callable[Concatenate[Wiring, P], R]:
+    """A method that works out once what it is asked again and again: an event has many circuits
+    alike, and the loop waits for it."""
+
+    @wraps(method)
+    def call(self: Wiring, /, *args: P.args, **more: P.kwargs) -> R:
+        known = self.__dict__.setdefault("_known", {})
+        key = method.__name__, args, *more.items()
+        if key not in known:
+            known[key] = method(self, *args, **more)
+        found: R = known[key]
+        return found
+
+    return call
 
 
 @dataclass(frozen=True)
@@ -399,6 +417,7 @@ class Wiring:
                 waiting += [one.opened(phase, zero_sequence) for phase in one.phases]
         return tuple(found)
 
+    @_once
     def contact_current(self, contact: Contact) -> NDArray[np.complex128]:
         """The currents of phases a, b, c through a fault or a breaker, (3, n_w): each is the real
         part of what this gives with w, in the frame that stands still."""
@@ -436,6 +455,7 @@ class Wiring:
             if node == place
         }
 
+    @_once
     def modes(self, blocked: frozenset[int], contact: Contact | None) -> tuple[Modes, list[str]]:
         """The modes of a circuit, and the names of its sources and sinks in their order.
 
@@ -542,6 +562,7 @@ class Wiring:
             a, b = (GROUND if end in ends else end for end in (branch.start, branch.end))
             yield branch, (a, b)
 
+    @_once
     def voltage(
         self, node: str, blocked: frozenset[int], contact: Contact | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], complex]:
@@ -588,24 +609,12 @@ class Wiring:
                     seen.add(other)
         return ""
 
+    @_once
     def circuit(
         self, blocked: frozenset[int], contact: Contact | None, axis: int, place: str = GROUND
     ) -> tuple[Circuit, list[Branch]]:
         """A circuit, and the branches that an open breaker has left hanging; of an
         unbalanced one those of an axis. At ``place`` no branch hangs."""
-        # an event asks for the same ones again and again, and the loop waits for it
-        key = blocked, contact, axis, place
-        if key not in self._circuits:
-            self._circuits[key] = self._make_circuit(*key)
-        return self._circuits[key]
-
-    @cached_property
-    def _circuits(self) -> dict[Any, tuple[Circuit, list[Branch]]]:
-        return {}
-
-    def _make_circuit(
-        self, blocked: frozenset[int], contact: Contact | None, axis: int, place: str
-    ) -> tuple[Circuit, list[Branch]]:
         filters, sources = [], []
         shunts = [shunt for shunt in self.shunts if shunt.name not in self.opened]
         through, poles, grid = [], {}, self.grid if self.closed else None

@@ -239,7 +239,7 @@ def test_closed_contacts_have_the_modes_of_their_axes(kind, which, more, place):
     wiring = replace(
         wiring, opened=wiring.opened | {"load"}, opening=(OpeningBreaker(name="load"),)
     )
-    joint, of = join(wiring, wiring.omega_b), sum(1 << "abc".index(p) for p in which)
+    joint, of = join(wiring), sum(1 << "abc".index(p) for p in which)
     bars = joint.fault_bars[of]
     K = null_space(bars) if np.abs(bars).max() > 1e-9 else np.eye(bars.shape[1])
     found = np.linalg.eigvals(K.T @ joint.flow[of] @ K)
