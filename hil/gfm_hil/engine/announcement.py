@@ -75,4 +75,5 @@ def not_running(folder: Path) -> UserError:
         return UserError(
             f"{folder}: is of a network; name the folder of a converter: one of {names}"
         )
-    return UserError(f"{folder}: no run is going on there")
+    why = "no run is going on there" if folder.exists() else "no such folder"
+    return UserError(f"{folder}: {why}")

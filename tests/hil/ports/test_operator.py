@@ -171,3 +171,5 @@ def test_what_a_killed_run_has_announced_is_not_going_on(tmp_path):
     finally:
         place.rmdir()
     assert running_roles(tmp_path) == []
+    with pytest.raises(UserError, match=r"nowhere: no such folder$"):
+        Operator(tmp_path / "nowhere")
