@@ -39,9 +39,10 @@ from gfm_plant.names import FAULTED_PHASES
 GRID_SOURCE = "grid"
 CONTACT = "contact"  # the branch through which a zero sequence lets a fault, or the grid, conduct
 ALPHA, BETA = 0, 1
+"""The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
+
 P = ParamSpec("P")
 R = TypeVar("R")
-"""The axes of an unbalanced fault: that of the phase which differs from the others, and across."""
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,11 @@ from gfm_design.tuning.synthesis import NotStabilised, Tuned
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
+from gfm_hil.scenario.loading import drop_line
 from gfm_hil.scenario.schema import LatePolicy
 from gfm_hil.studies.linear_loop import loop_under, title_of
 from gfm_hil.studies.workers import SILENT, Watch
 from gfm_plant import NoEquilibrium, Plant, make_plant
-from gfm_plant.options import LINE
 from gfm_runtime import law_file
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile, shipped_law
@@ -317,13 +317,12 @@ def at_short_circuit_ratios(scenario: Scenario, scr: Sequence[float]) -> list[Sc
     if not scr:
         return [scenario]
     content = scenario.model_dump(mode="json", exclude_unset=True)
+    drop_line(content)
     plant = content.get("plant", {})
-    factors = {name: by for name, by in plant.get("factors", {}).items() if name not in LINE}
     line = make_plant(scenario.plant, scenario.T_s).par[0]
     own = {"x_over_r": float(line["L_g"] / line["R_g"])} if line["R_g"] > 0.0 else {}
     grids = [{**own, **plant.get("grid", {}), "scr": ratio} for ratio in scr]
-    plants = [{**plant, "factors": factors, "grid": grid} for grid in grids]
-    return [check_scenario({**content, "plant": one}, "scr") for one in plants]
+    return [check_scenario({**content, "plant": {**plant, "grid": g}}, "scr") for g in grids]
 
 
 def margins(

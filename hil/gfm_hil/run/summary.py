@@ -32,8 +32,10 @@ _FAULTS = ("tripped", "safe")
 END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 #: the recorded columns that the summary of a run in memory reads
 READ = frozenset(
-    {"true_p", "true_omega_u", "true_V", "true_i", "true_omega_g", "true_V_g", "law", "ref_P_ref"}
-    | {"true_delta"}
+    {
+        *("true_p", "true_omega_u", "true_V", "true_i", "true_delta", "true_omega_g", "true_V_g"),
+        *("law", "ref_P_ref"),
+    }
 )
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
 

@@ -113,8 +113,7 @@ def load_scenario(
         link.pop("endpoint", None)  # they belong to the file's link
         link.pop("options", None)
     if "plant__grid__scr" in overrides or "scr" in (overrides.get("plant__grid") or {}):
-        for name in LINE:  # in whose place it comes
-            _inside(content, "plant", "factors").pop(name, None)
+        drop_line(content)
     if in_process or chosen is not None:  # one link for all
         for member in _inside(content, "network", "converters").values():
             if isinstance(member, dict):
@@ -138,6 +137,12 @@ def load_scenario(
         for key, value in overrides.items()
     }
     return check_scenario(content, where, named)
+
+
+def drop_line(content: Mapping[str, Any]) -> None:
+    """Take the factors of a scenario's own line out of its content: an SCR comes in their place."""
+    for name in LINE:
+        _inside(content, "plant", "factors").pop(name, None)
 
 
 def _place(key: str, part: str, entries: list[Any], options: Mapping[str, str]) -> int:

@@ -22,9 +22,9 @@ from gfm_hil.studies.workers import SILENT, Watch
 LONGEST_S, AFTER_S = 2.0, 3.0
 _MOST_S = 60.0
 _OUT_OF_STEP = 180.0  # degrees, as the criterion stays_in_step has it
-#: s, degrees: a run is over when its angle was no farther than this from where it was before
-_REST_S, _REST = 1.0, 30.0
-_AWAY, _LONGEST_AFTER_S = 540.0, 24.0  # degrees, s; else
+_REST_S, _REST = 1.0, 30.0  # s, degrees: so long it was no farther from where it was before
+_AWAY = 540.0  # degrees; an angle that is farther does not come back
+_LONGEST_AFTER_S = 24.0
 
 NO_EQUILIBRIUM = "no equilibrium"  # its angle runs away even if the fault does not occur
 NOT_REACHED = "equilibrium not reached"  # there is one, and the angle passes it

@@ -101,6 +101,20 @@ def test_a_trip_is_named_and_a_sag_that_is_borne_has_no_end():
     assert made.seconds == pytest.approx(0.1, abs=0.02)
 
 
+def test_a_run_that_falls_out_of_step_says_so_and_no_other():
+    """On either side of the clearing time."""
+    lost, kept = (
+        gfmhil.run("deep_sag", "vsg-2", duration=7.0, events__0__duration=lasts)
+        for lasts in (1.05, 0.5)
+    )
+    assert (lost.status, kept.status, kept.summary["reason"]) == ("completed", "completed", "")
+    first, turned = lost.summary["reason"].split(" s: its angle to the grid ends ")
+    t = float(first.removeprefix("fell out of step at "))
+    delta = np.asarray(lost.signals["delta"])
+    assert abs(delta[round(t / 1e-4)] - delta[0]) == pytest.approx(math.pi, abs=0.05)
+    assert turned == "+360° from before"
+
+
 def test_a_run_goes_on_until_its_angle_is_back_or_lost():
     """After 1 s it still creeps along near half a turn."""
     soon, late = (gfmhil.clearing_time("vsg-2", after=after, within=5e-4) for after in (1.0, 12.0))
