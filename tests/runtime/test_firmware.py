@@ -473,6 +473,7 @@ def test_the_command_exports_an_inner_stage(tmp_path):
         assert (tmp_path / name).read_text(encoding="utf-8") == text
 
 
+@pytest.mark.full
 def test_export_of_all_in_fixed_point_leaves_out_what_is_scheduled(tmp_path, capsys):
     assert main(["firmware", "export", "all", "--real", "fixed", "-o", str(tmp_path)]) == 0
     said = capsys.readouterr()

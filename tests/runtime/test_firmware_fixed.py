@@ -41,12 +41,12 @@ from gfm_runtime.states import OK
 from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import SOME, STRICT, T_S, cc, exported
-from ..support.laws import LAWS
+from ..support.laws import LAWS, slow_but
 
 PAGES = Path(__file__).parents[2] / "docs"
 #: one of each error map, and the most states
 FAST = ("vsg-2", "psc-dc", "dvoc", "hybrid-angle", "vsg-11")
-EACH_LAW = [pytest.param(name, marks=() if name in FAST else pytest.mark.full) for name in LAWS]
+EACH_LAW = slow_but(FAST, LAWS)
 COMPILERS = [pytest.mark.compilers, pytest.mark.timeout(900)]
 
 

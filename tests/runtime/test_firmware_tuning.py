@@ -30,6 +30,7 @@ from gfm_runtime.lawfile import parse_law, tied
 from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import T_S, accepted, bench, cc, exported
+from ..support.laws import slow_but
 from .test_firmware_dll import MESSAGE, OK, Model
 from .test_firmware_fmu import Unit
 
@@ -77,10 +78,11 @@ def test_the_coefficients_are_those_of_the_law_with_these_gains(name):
             assert np.abs(found[field] - wanted).max(initial=0.0) <= 1e-10 * most, field
 
 
-@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize("real", slow_but(["float32"], ["float32", "float64"]))
 @pytest.mark.parametrize(
     ("laws", "how"),
-    [(("vsg-2", "vsg-12", "hybrid-angle", "matching-2", "dvoc"), ()),
+    [pytest.param(("vsg-2", "vsg-12", "hybrid-angle", "matching-2", "dvoc"), (),
+                  marks=pytest.mark.full),
      (("mimo-gfm", "droop-4"), ("--inner", "cascaded", "--counts", "rig"))],
     ids=["plain", "counts"],
 )  # fmt: skip
@@ -210,7 +212,7 @@ def ticks(inner: str, real: str) -> tuple[Any, Any, Any, Any]:
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])
-@pytest.mark.parametrize("inner", ["none", "cascaded"])
+@pytest.mark.parametrize("inner", slow_but(["none"], ["none", "cascaded"]))
 def test_a_dll_whose_parameters_change_has_the_kernels_bits(tmp_path, inner, real):
     command = ["firmware", "dll", "vsg-2", "--inner", inner, "--real", real, "-o", str(tmp_path)]
     assert main(command) == 0

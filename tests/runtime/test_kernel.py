@@ -16,7 +16,7 @@ from gfm_runtime.kernel import N_MAX
 from gfm_runtime.law import cell_name
 from gfm_runtime.signals import NU, NY, U_NAMES
 
-from ..support.laws import LAWS, REF, Running, Vector, drive, wander
+from ..support.laws import LAWS, REF, Running, Vector, drive, slow_but, wander
 
 T_S = 1e-4
 f32 = np.float32
@@ -35,7 +35,7 @@ def ticks_at(law, state, ref, y, u, i, limit, most):
 # --- precision ---
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", slow_but(("droop-1", "dvoc", "mimo-gfm"), LAWS))
 def test_float32_stays_close_to_float64(name):
     """Over 0.5 s; the tolerance covers the rounding that an integrator accumulates."""
     discrete = discretise(LAWS[name], T_S)

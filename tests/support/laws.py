@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,10 +57,13 @@ def every_law() -> list[Any]:
     first: dict[tuple[object, ...], str] = {}
     for name in law_names():
         first.setdefault(structure(name), name)
-    return [
-        pytest.param(name, marks=() if name in first.values() else pytest.mark.full)
-        for name in law_names()
-    ]
+    return slow_but(first.values(), law_names())
+
+
+def slow_but(fast: Iterable[Any], values: Iterable[Any]) -> list[Any]:
+    """Values of a parameter of a test; all but the ``fast`` ones are ``full``."""
+    few = [*fast]
+    return [pytest.param(v, marks=() if v in few else pytest.mark.full) for v in values]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from gfm_hil.links.pump import with_port
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import RUNNING, SAFE
 
-from ...support.laws import home_plant
+from ...support.laws import home_plant, slow_but
 from ...support.links import PATIENT, RIG, Tampering, assert_same, in_threads, run_pair
 from ...support.processes import free_port
 
@@ -280,7 +280,7 @@ CONTENT = {
 }
 
 
-@pytest.mark.parametrize("lossy", [False, True])
+@pytest.mark.parametrize("lossy", slow_but([True], [False, True]))
 @pytest.mark.parametrize("way", WHOLE, indirect=True)
 def test_a_run_in_lockstep_has_the_bits_of_the_run_in_process(way, lossy, make, run, place):
     """Also if frames are lost or repeated: the plant asks for them again."""

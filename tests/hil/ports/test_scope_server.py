@@ -110,6 +110,7 @@ def test_it_says_what_there_is_and_shows_it(served):
         about = words(socket, "about")
         assert (about["live"], about["commands"], about["f_b"]) == (False, False, 50.0)
         assert about["labels"][0]["name"] == "mimo-gfm"
+        assert {"grid-voltage", "grid-phase-jump", "fault"} <= about["events"].keys()
         assert {c["name"] for c in about["channels"]} >= {"p", "q", "V", "omega_u", "v_dc", "slack"}
         events = words(socket, "events")
         assert [e["label"] for e in events["events"] if "label" in e] == ["P_ref = 0.6"]
@@ -145,6 +146,8 @@ def test_a_page_asks_for_a_converter_of_a_network(tmp_path):
             with connect(f"ws://127.0.0.1:{port}/socket{query}") as socket:
                 about = words(socket, "about")
                 assert (about["converter"], about["converters"]) == (name, ["A", "B"])
+                assert "fault" in about["events"]
+                assert not [kind for kind in about["events"] if "grid" in kind or "jump" in kind]
                 (bar,) = words(socket, "network")["bars"]
                 assert (bar["name"], bar["converters"]) == ("bus", ["A", "B"])
                 flows = words(socket, "flows")

@@ -16,6 +16,8 @@ from gfm_hil.scenario import Scenario, load_scenario, shipped_scenarios
 from gfm_plant import NetworkParts
 from gfm_plant.components.part import Component
 
+from ...support.laws import slow_but
+
 Make = Callable[..., Scenario]
 FAULT = {"t": 0.02, "type": "fault", "position": 0.25, "R": 0.1}
 
@@ -137,7 +139,7 @@ EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 MESHES = [str(EXAMPLES / name / "network.toml") for name in ("ieee9", "ieee39")]
 
 
-@pytest.mark.parametrize("fill", [fill_diagram, fill_narrow])
+@pytest.mark.parametrize("fill", slow_but([fill_narrow], [fill_diagram, fill_narrow]))
 @pytest.mark.parametrize("name", [*shipped_scenarios(), *MESHES])
 def test_every_shipped_scenario_is_drawn_within_its_picture(name, fill):
     figure = Figure()

@@ -105,6 +105,7 @@ def test_mat_is_read_again_as_it_was(table, tmp_path):
     assert found["scenario"] == table.text("scenario.toml")
 
 
+@pytest.mark.full
 def test_parquet_holds_the_currents_of_a_network(tmp_path):
     """Those that ``network.record`` names, in the folder of the first converter."""
     network = {"network__record": ["feeder", "base"], "duration": 0.02, "events": []}

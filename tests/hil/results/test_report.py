@@ -12,6 +12,7 @@ from gfm_hil.recording.columns import symbol_of
 from gfm_hil.recording.run import Run
 from gfm_hil.results.report import _commands
 
+from ...support.laws import slow_but
 from ...support.page import unpacked
 from ...support.processes import wait_for
 from ...support.scope import HAS_BROWSER, Browser
@@ -69,7 +70,7 @@ def test_a_network_has_one_report(network):
     assert V["curves"]["dvoc"] == pytest.approx(run.signals["V"][at], abs=2 / 4094)
 
 
-@pytest.mark.parametrize("opened", [True, False])
+@pytest.mark.parametrize("opened", slow_but([False], [True, False]))
 def test_a_comparison_has_a_report_which_the_command_names_and_opens(
     opened, tmp_path, capsys, monkeypatch
 ):

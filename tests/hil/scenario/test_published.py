@@ -142,6 +142,7 @@ def rms(x: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(x**2, axis=1))
 
 
+@pytest.mark.full
 def test_dynawo_s_equations_are_what_it_published(dynawo):
     omega, i = dynawo.solved("THEIRS")
     assert (rms(omega - dynawo.omega) <= [1e-4, 1e-4, 5e-4]).all()

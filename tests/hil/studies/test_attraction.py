@@ -58,6 +58,7 @@ def test_without_inertia_its_ends_are_the_unstable_equilibria(P_ref, tmp_path):
     assert made.above == (ANOTHER_TURN if ahead < 180.0 else "")
 
 
+@pytest.mark.full
 def test_a_map_has_the_regions_of_its_places():
     over = {"scr": (2.0, 6.0), "references.P_ref": (0.2, 0.8)}
     how = {"after": 2.0, "within": 4.0, "on": "deep_sag"}

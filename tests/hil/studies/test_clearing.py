@@ -81,6 +81,7 @@ def equal_area(content: dict, H: float, E: float = 1.0) -> float:
     return float(brentq(excess, 0.05, 0.4))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("H", "x_over_r"), [(5.0, 30.0), (5.0, 100.0), (10.0, 30.0)])
 def test_a_converter_like_a_machine_has_the_clearing_time_of_equal_areas(H, x_over_r, tmp_path):
     content = machine(H, x_over_r, tmp_path)

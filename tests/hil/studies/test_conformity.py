@@ -1276,6 +1276,7 @@ def test_the_list_is_also_json(capsys):
     assert all(row["part"] and row["title"] for row in parts)
 
 
+@pytest.mark.full
 def test_a_converter_under_test_may_switch(tmp_path):
     """Its file says so; the pulses of the bridge take the place of the fraction of a sample."""
     shipped = under_test_file(None).read_text(encoding="utf-8")

@@ -14,6 +14,7 @@ from gfm_hil.ports.scope.session import Session, in_words
 from gfm_hil.recording.run import bases
 from gfm_hil.scenario import INPROC, Scenario
 from gfm_hil.scenario.events import EVENTS
+from gfm_hil.scenario.events.base import Event, GridEvent
 from gfm_runtime import LawError, law_file, law_titles
 from gfm_runtime.states import STATES
 
@@ -75,7 +76,7 @@ class WatchedRun:
             "labels": self.record.laws,
             "laws": [*law_titles(s.laws()).items()],
             "bases": si_bases(bases(s)),
-            "events": {name: kind.model_json_schema() for name, kind in EVENTS.items()},
+            "events": {name: kind.model_json_schema() for name, kind in _events_of(s).items()},
             "choices": _choices(s),
         }
 
@@ -93,6 +94,12 @@ class WatchedRun:
                 )
             self._operator = Operator(self.record.folder)
         return self._operator.command(event, by)
+
+
+def _events_of(scenario: Scenario) -> dict[str, type[Event]]:
+    """The kinds of events of a run, by their names; none of the grid for an island."""
+    island = scenario.network is not None and scenario.network.grid is None
+    return {k: kind for k, kind in EVENTS.items() if not (island and issubclass(kind, GridEvent))}
 
 
 def _choices(scenario: Scenario) -> dict[str, list[str]]:

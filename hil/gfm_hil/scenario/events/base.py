@@ -122,3 +122,7 @@ class PlantEvent(Event):
         # a plant of several converters changes once, and of its parts only where the event is
         if target.place == 0 and self.acts_on() not in target.plant.elsewhere:
             self.apply(target.plant)
+
+
+class GridEvent(PlantEvent):
+    """An event of the grid, which an island does not have."""

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 import gfm_plant
 from gfm_hil.core.schema import StrictSchema
-from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
+from gfm_hil.scenario.events.base import GridEvent, PlantEvent, nominal_hz
 from gfm_plant.names import THE_GRID
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def switched(line: Mapping[str, Any]) -> tuple[str, bool] | None:
     return (GRID if name == "grid breaker" else name), _WORDS[word]
 
 
-class GridBreaker(Switch):
+class GridBreaker(Switch, GridEvent):
     """The grid breaker opens onto the local load, or closes again."""
 
     type: Literal["grid-breaker"] = Field(description="kind of event")

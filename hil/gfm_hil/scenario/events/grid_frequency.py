@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent, nominal_hz
+from gfm_hil.scenario.events.base import GridEvent, nominal_hz
 
 
-class GridFrequency(PlantEvent):
+class GridFrequency(GridEvent):
     """Grid frequency: a step, or a ramp at ``rate`` [Hz/s]."""
 
     type: Literal["grid-frequency"] = Field(description="kind of event")

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field, model_validator
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent
+from gfm_hil.scenario.events.base import GridEvent
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.schema import Scenario
 
 
-class GridImpedance(PlantEvent):
+class GridImpedance(GridEvent):
     """The line becomes ``L_g`` and ``R_g`` times its nominal elements, or one of a short-circuit
     ratio ``scr`` with ``x_over_r``, as ``plant.grid`` has them."""
 

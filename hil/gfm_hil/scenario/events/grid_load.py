@@ -7,11 +7,11 @@ from typing import Literal
 from pydantic import Field
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent
+from gfm_hil.scenario.events.base import GridEvent
 from gfm_plant.names import THE_GRID
 
 
-class GridLoad(PlantEvent):
+class GridLoad(GridEvent):
     """The load of a finite grid changes by ``change`` [p.u. of the grid's rating]."""
 
     type: Literal["grid-load"] = Field(description="kind of event")

@@ -20,7 +20,7 @@ from pydantic import Field
 
 import gfm_plant
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario.events.base import EventTarget, PlantEvent, nominal_hz
+from gfm_hil.scenario.events.base import EventTarget, GridEvent, nominal_hz
 from gfm_runtime.errors import printable
 from gfm_runtime.regular import open_regular
 from gfm_runtime.signals import SIGNALS
@@ -32,7 +32,7 @@ MOST_LINES = 100_000
 LARGEST_FILE = 64 << 20
 
 
-class GridProfile(PlantEvent):
+class GridProfile(GridEvent):
     """The grid's frequency and voltage follow a CSV file: t [s after the event], and f_hz [Hz] or
     omega_g [p.u.], V_g [p.u.], or both; straight between its lines, and at the end they stay. By
     what a column degrees says, the grid's angle jumps ahead at each line."""

@@ -9,10 +9,10 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent
+from gfm_hil.scenario.events.base import GridEvent
 
 
-class GridUnbalance(PlantEvent):
+class GridUnbalance(GridEvent):
     """The grid's phases a, b, c keep a part of their voltage and jump in angle."""
 
     type: Literal["grid-unbalance"] = Field(description="kind of event")

@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent
+from gfm_hil.scenario.events.base import GridEvent
 
 
-class GridVoltage(PlantEvent):
+class GridVoltage(GridEvent):
     """Grid voltage [p.u.]: a step, a ramp at ``rate`` [p.u./s], or a sag of ``duration`` [s]."""
 
     type: Literal["grid-voltage"] = Field(description="kind of event")

@@ -7,10 +7,10 @@ from typing import Literal
 from pydantic import Field
 
 import gfm_plant
-from gfm_hil.scenario.events.base import PlantEvent
+from gfm_hil.scenario.events.base import GridEvent
 
 
-class PhaseJump(PlantEvent):
+class PhaseJump(GridEvent):
     """The grid's angle jumps ahead by ``degrees``."""
 
     type: Literal["grid-phase-jump"] = Field(description="kind of event")

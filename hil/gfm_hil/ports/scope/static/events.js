@@ -55,10 +55,10 @@ export class Events {
       ctx.moveTo(left, bbox.top);
       ctx.lineTo(left, bbox.top + bbox.height);
       ctx.stroke();
-      const text = e.label ?? e.status ?? e.event;
-      const wide = ctx.measureText(text).width;
-      const room = left + wide + 8 * ratio < bbox.left + bbox.width;
-      const from = room ? left + 4 * ratio : left - 4 * ratio - wide;
+      const right = bbox.left + bbox.width - left - 8 * ratio;
+      const before = left - bbox.left - 8 * ratio;
+      const [text, wide] = shortened(ctx, e.label ?? e.status ?? e.event, Math.max(right, before));
+      const from = wide <= right ? left + 4 * ratio : left - 4 * ratio - wide;
       const row = first ? free.findIndex((at) => from > at) : -1;
       if (row >= 0) {
         ctx.fillText(text, from, bbox.top + bbox.height - (5 + 12 * row) * ratio);
@@ -67,6 +67,16 @@ export class Events {
     }
     ctx.restore();
   }
+}
+
+// As much of a text as fits a width, and the width it has.
+function shortened(ctx, text, room) {
+  const width = (some) => ctx.measureText(some).width;
+  if (width(text) <= room) return [text, width(text)];
+  let end = text.length;
+  while (end > 0 && width(`${text.slice(0, end)}…`) > room) end -= 1;
+  const cut = `${text.slice(0, end)}…`;
+  return [cut, width(cut)];
 }
 
 // Both sides log one trip, or one end; the first entry is that of the side where it happened.
