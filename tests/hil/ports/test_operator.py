@@ -87,6 +87,9 @@ def test_a_trip_is_waited_for_and_reset_and_gains_change(going):
     assert seen["laws"] == ["mimo-gfm", "vsg-2", "vsg-5"]
     operator.command({"type": "grid-voltage", "V_g": 0.0})
     wait_for(lambda: operator.snapshot()["state"] == "SAFE" and operator.snapshot()["trip"])
+    for lost in ({"type": "reference", "P_ref": 0.4}, {"type": "law", "law": "vsg-2"}):
+        with pytest.raises(UserError, match="send this after the reset"):
+            operator.command(lost)
     seen = operator.snapshot()
     assert (seen["trip"], seen["reason"]) == ("over-current", "the plant's protection tripped")
     reset = operator.command({"type": "reset"})

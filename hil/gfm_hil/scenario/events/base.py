@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from gfm_hil.core.roles import Role
 from gfm_hil.core.schema import StrictSchema
+from gfm_runtime.states import SAFE
 
 if TYPE_CHECKING:
     from gfm_hil.scenario.events.grid_profile import ProfilePoint
@@ -90,6 +91,19 @@ class Event(StrictSchema):
         """Carry it out between two ticks. Raises ValueError: it is not possible; nothing has
         changed."""
         raise NotImplementedError
+
+
+class ControllerEvent(Event):
+    """An event that changes a controller which runs."""
+
+    side: ClassVar[Role] = "controller"
+
+    def check_now(self, target: EventTarget) -> None:
+        if target.controller.ctl["state"][0] == SAFE:
+            raise ValueError(
+                f"{self.label_in(target)}: the controller is in SAFE, and a reset will bring back "
+                "the scenario's law and references; send this after the reset"
+            )
 
 
 class PlantEvent(Event):

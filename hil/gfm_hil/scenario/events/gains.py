@@ -10,8 +10,7 @@ from pydantic import Field
 
 import gfm_runtime  # lazy: an operator's command loads no kernel, and so no compiler
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import Role
-from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_hil.scenario.events.base import WHOSE, ControllerEvent, EventTarget
 from gfm_hil.scenario.events.law import LawChange
 from gfm_hil.scenario.events.reset import Reset
 from gfm_runtime.errors import LawError
@@ -22,11 +21,10 @@ if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
 
 
-class GainChange(Event):
+class GainChange(ControllerEvent):
     """New gains of the active law, by the names in its file, without a bump. Tied parameters
     follow."""
 
-    side: ClassVar[Role] = "controller"
     changes_law: ClassVar[bool] = True
     type: Literal["gains"] = Field(description="kind of event")
     values: dict[str, float] = Field(
@@ -39,6 +37,7 @@ class GainChange(Event):
 
     def check_now(self, target: EventTarget) -> None:
         ready_gains(target.controller, self.values)
+        super().check_now(target)
 
     def carry_out(self, target: EventTarget) -> None:
         """Change gains of the law selected last, on top of earlier changes."""

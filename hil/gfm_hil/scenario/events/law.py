@@ -5,15 +5,13 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 import gfm_runtime
-from gfm_hil.core.roles import Role
-from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_hil.scenario.events.base import WHOSE, ControllerEvent, EventTarget
 from gfm_runtime.errors import meant
 
 
-class LawChange(Event):
+class LawChange(ControllerEvent):
     """Change to another law, without a bump."""
 
-    side: ClassVar[Role] = "controller"
     changes_law: ClassVar[bool] = True
     type: Literal["law"] = Field(description="kind of event")
     law: str = Field(description="catalogue name or law file")
@@ -31,6 +29,7 @@ class LawChange(Event):
             ready = sorted(target.controller.sets)
             known = f"ready are {ready}{meant(self.law, ready)}"
             raise ValueError(f"law = {self.law!r}: not made ready for this run; {known}")
+        super().check_now(target)
 
     def carry_out(self, target: EventTarget) -> None:
         target.controller.select(self.law)

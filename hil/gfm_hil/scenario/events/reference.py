@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from gfm_hil.core.roles import Role
-from gfm_hil.scenario.events.base import WHOSE, Event, EventTarget
+from gfm_hil.scenario.events.base import WHOSE, ControllerEvent, EventTarget
 from gfm_runtime.signals import SIGNALS
 
 _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
@@ -26,10 +25,9 @@ def check_reference(name: str, value: float) -> None:
         raise ValueError(f"{name} = {value}: must lie in [{s.low:g}, {s.high:g}] {s.unit}")
 
 
-class Reference(Event):
+class Reference(ControllerEvent):
     """New references; ``ramp_s`` spreads the change over a time instead of one tick."""
 
-    side: ClassVar[Role] = "controller"
     type: Literal["reference"] = Field(description="kind of event")
     V_dcref: float | None = reference_field("V_dcref", None)
     P_ref: float | None = reference_field("P_ref", None)
