@@ -194,7 +194,9 @@ def test_mean_square_against_a_thousand_drawn_runs(ideal):
 def test_what_the_ideal_loop_bears(ideal):
     """MIMO-GFM on the paper's converter without a delay: every other u may be missing, not two in a
     row; and the verdict follows."""
-    found = latency_tolerance(ideal)
+    shares = list[float]()
+    found = latency_tolerance(ideal, progress=shares.append)
+    assert shares == [0.25, 0.5, 0.75, 1.0]
     assert (found.bears, found.proved) == (1, 1)
     none = found.used(Misses.of(np.zeros(1000)))
     assert none.light == "green" and none.in_a_row == 0.0 and none.added["p"] == pytest.approx(1.0)

@@ -185,6 +185,11 @@ def _feasible(A: Matrix, lengths: NDArray[np.int64], log_g: float) -> Matrix | N
     g, A = (c * g)[:, None, None], np.sqrt(c)[:, None, None] * A
     eye, half = np.eye(N), np.triu_indices(N)
     both = np.where(half[0] == half[1], 1.0, 2.0)
+    n, weights = len(both), 0.5 * np.outer(both, both)
+    # a form in two symmetric matrices, of (ik, jl), as one in their n different elements
+    (i, j), (k, m) = (x[:, None] for x in half), half
+    ik_jl, il_jk = ((i * N + k) * N + j) * N + m, ((i * N + m) * N + j) * N + k
+    signs = np.concatenate([np.ones((2 * E + 2, 1)), -g[:, 0], -g[:, 0]])
     weight, barriers = 1.0, N * (E + 2)
 
     def slack(P: Matrix, s: float) -> Matrix:
@@ -203,16 +208,11 @@ def _feasible(A: Matrix, lengths: NDArray[np.int64], log_g: float) -> Matrix | N
             slope = other - own - (g * S_e - W).sum(0)
             by_s = weight - float(np.trace(S_e, axis1=1, axis2=2).sum())
             cross = (g * SS - A @ SS @ A.transpose(0, 2, 1)).sum(0)
-            flat_S, flat_V, flat_W = ((x.reshape(len(x), -1)) for x in (g * S_e, V, W))
-            mixed = _kron_order((g[:, 0] * flat_V).T @ flat_V, N)
-            curve = flat_S.T @ flat_S + flat_W.T @ flat_W
-            curve += np.outer(own, own) + np.outer(other, other)
-            form = (_kron_order(curve, N) - mixed - mixed.T).reshape(N, N, N, N)
-            form = form + form.transpose(1, 0, 2, 3)
-            form = 0.25 * (form + form.transpose(0, 1, 3, 2))
-            n = len(both)
+            each = np.concatenate([g * S_e, W, [own, other], V, V.transpose(0, 2, 1)])
+            flat = each.reshape(len(each), -1)
+            curve = flat.T @ (signs * flat)
             H, b = np.empty((n + 1, n + 1)), np.empty(n + 1)
-            H[:n, :n] = form[half[0], half[1]][:, half[0], half[1]] * np.outer(both, both)
+            H[:n, :n] = weights * (curve.take(ik_jl) + curve.take(il_jk))
             H[:n, n] = H[n, :n] = cross[half] * both
             H[n, n] = float((SS.trace(axis1=1, axis2=2)).sum())
             b[:n], b[n] = slope[half] * both, by_s
@@ -243,11 +243,6 @@ def _positive(many: Matrix) -> bool:
     except np.linalg.LinAlgError:
         return False
     return True
-
-
-def _kron_order(M: Matrix, N: int) -> Matrix:
-    """From (ij, kl) to (ik, jl), so that it is a form in the matrices."""
-    return M.reshape(N, N, N, N).transpose(0, 2, 1, 3).reshape(N * N, N * N)
 
 
 def _coordinates(hit: Matrix) -> Matrix:

@@ -6,7 +6,7 @@ all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -86,12 +86,18 @@ class LatencyTolerance:
         return used(self, misses)
 
 
-def latency_tolerance(loop: ClosedLoop, hold: int = 200, extrapolate: int = 0) -> LatencyTolerance:
-    """What a sampled loop bears; takes some seconds.
+def latency_tolerance(
+    loop: ClosedLoop,
+    hold: int = 200,
+    extrapolate: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> LatencyTolerance:
+    """What a sampled loop bears; takes some seconds, of a network a minute.
 
     Args:
         loop: of a law and a plant, stable.
         hold, extrapolate: of the late policy, ticks.
+        progress: called with the share of the work that is done.
 
     Raises:
         UnstableLoop: it is unstable without any miss.
@@ -101,15 +107,17 @@ def latency_tolerance(loop: ClosedLoop, hold: int = 200, extrapolate: int = 0) -
     if modes[0].sigma > -_AT_REST:
         raise UnstableLoop(modes[0])
     of: dict[Meanwhile, Ticks] = {case: ticks(loop, case, extrapolate) for case in MEANWHILE}
-    cases = {case: _tolerance(Words(these)) for case, these in of.items()}
+    cases = dict[Meanwhile, RowTolerance]()
+    for k, case in enumerate(of):
+        words = Words(of[case])
+        lost = words.first_unstable()
+        row = proved_in_a_row(words, lost.misses if lost else None)
+        progress((k + 0.5) / len(of))
+        window = proved_in_a_window(words, WINDOW, row.most)
+        progress((k + 1) / len(of))
+        cases[case] = RowTolerance(lost, row, window)
     assert loop.T_s is not None
     return LatencyTolerance(loop.T_s, overall_delay(loop), hold, extrapolate, cases, of)
-
-
-def _tolerance(words: Words) -> RowTolerance:
-    lost = words.first_unstable()
-    row = proved_in_a_row(words, lost.misses if lost else None)
-    return RowTolerance(lost, row, proved_in_a_window(words, WINDOW, row.most))
 
 
 @dataclass(frozen=True)

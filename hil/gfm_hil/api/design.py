@@ -3,7 +3,7 @@ law file with the gains that a synthesis found."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -357,6 +357,7 @@ def latency_tolerance(
     *,
     hold: int | None = None,
     extrapolate: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
     **more: Any,
 ) -> LatencyTolerance:
     """What a law bears of late and of lost commands: its delay margin; how many ticks in a row
@@ -364,12 +365,13 @@ def latency_tolerance(
     row, and in any ten ticks, every sequence is stable. ``LatencyTolerance.used`` says how much of
     that a measurement used.
 
-    Takes some seconds; the page on benchmarks says how each is obtained.
+    Takes some seconds, for a network a minute; the page on benchmarks says how each is obtained.
 
     Args:
         law: name, law file or ``Law``.
         on, more: as for ``Law.closed_loop``.
         hold, extrapolate: of the plant's late policy, ticks; by default those of the scenario.
+        progress: called with the share of the work that is done.
 
     Raises:
         UnstableLoop: the loop is unstable without any miss.
@@ -382,6 +384,7 @@ def latency_tolerance(
         as_law(law).closed_loop(on, **more),
         policy.hold if hold is None else hold,
         policy.extrapolate if extrapolate is None else extrapolate,
+        progress,
     )
 
 

@@ -20,6 +20,7 @@ from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.latency import as_json, tolerance_table, used_table
 
 _ALL = "all"
+_PARTS = 4  # of the bar, a law
 
 
 def add(kinds: Any) -> None:
@@ -64,9 +65,13 @@ def call(options: argparse.Namespace) -> int:
     found: dict[str, LatencyTolerance | UnstableLoop] = {}
     with watching("latency tolerance") as watch:
         for k, name in enumerate(names):
-            watch.progress(k, len(names), name)
+
+            def tell(share: float, k: int = k, name: str = name) -> None:
+                watch.progress(round(_PARTS * (k + share)), _PARTS * len(names), name)
+
+            tell(0.0)
             try:
-                found[name] = latency_tolerance(name, scenario, converter=converter)
+                found[name] = latency_tolerance(name, scenario, converter=converter, progress=tell)
             except UnstableLoop as unstable:
                 found[name] = unstable
     stable = {name: of for name, of in found.items() if isinstance(of, LatencyTolerance)}
