@@ -170,6 +170,23 @@ def test_mean_square_of_a_loop_of_one_state():
     assert np.linalg.eigvals(M).real.max() == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_the_mean_square_decays_as_the_eigenvalues_of_all_second_moments_say(seed, monkeypatch):
+    """Those of whole matrices, symmetric or not."""
+    rng = np.random.default_rng(seed)
+    hit, miss = 0.5 * rng.normal(size=(2, 4, 4))
+    b, on = rng.random(2)
+    of = Ticks(hit, (miss,), np.ones(4), np.ones((5, 4)), T_S)
+    A, B = np.kron(hit, hit), np.kron(miss, miss)
+    moments = np.block([[(1 - b) * A, (1 - on) * A], [b * B, on * B]])
+    size = np.abs(np.linalg.eigvals(moments)).max()
+    found = MeanSquare(of, MissChain(b, on))
+    assert found.stable == (size < 1.0)
+    for few in (400, 0):  # all eigenvalues of the map, or the one that counts
+        monkeypatch.setattr("gfm_design.misses.statistics._FEW", few)
+        assert found.sigma() == pytest.approx(np.log(size) / (2 * T_S), rel=1e-9)
+
+
 def test_mean_square_against_a_thousand_drawn_runs(ideal):
     """The variance of p under white noise of the grid's voltage, with one miss in twenty, after a
     second, within four standard deviations of the estimate."""

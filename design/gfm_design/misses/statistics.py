@@ -15,14 +15,17 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.linalg import eigs
 
 from gfm_design.misses.ticks import Matrix, Ticks
 
 _NEVER = 1e-300
 _HALVINGS = 8
+_FEW = 400  # rows of a map whose eigenvalues are all sought
 
 
 @dataclass(frozen=True)
@@ -112,14 +115,7 @@ class MeanSquare:
         if len(ticks.misses) != 1:
             raise ValueError("extrapolate: the mean square is that of a u that is held")
         self.ticks, self.chain = ticks, chain
-        N = len(ticks.hit)
-        self._half = np.triu_indices(N)
-        # rows and columns of the symmetric matrices only
-        spread = np.zeros((N * N, len(self._half[0])))
-        for k, (i, j) in enumerate(zip(*self._half, strict=True)):
-            spread[i * N + j, k] = spread[j * N + i, k] = 1.0
-        rows = self._half[0] * N + self._half[1]
-        hit, miss = ((np.kron(A, A)[rows]) @ spread for A in (ticks.hit, ticks.misses[0]))
+        self._half, (hit, miss) = np.triu_indices(len(ticks.hit)), _moments(ticks)
         b, on = chain.begins, chain.continues
         self._map = np.block([[(1 - b) * hit, (1 - on) * hit], [b * miss, on * miss]])
 
@@ -127,25 +123,66 @@ class MeanSquare:
         """That of the loop that misses nothing."""
         return MeanSquare(self.ticks, MissChain(0.0, 0.0))
 
+    @cached_property
+    def stable(self) -> bool:
+        """Whether the mean square decays: exactly if Q = I + map(Q) has a positive solution."""
+        one = np.eye(len(self.ticks.hit))
+        try:
+            for Q in self._at_rest(one, one):
+                np.linalg.cholesky(Q)
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def _at_rest(self, *added: Matrix) -> tuple[Matrix, ...]:
+        """The fixed point Q_j of the map to which ``added`` comes in each tick, of both outcomes.
+        Raises LinAlgError: there is none."""
+        both = np.concatenate([one[self._half] for one in added])
+        Q = np.linalg.solve(np.eye(len(both)) - self._map, both)
+        of = []
+        for elements in np.split(Q, len(added)):
+            full = np.zeros_like(self.ticks.hit)
+            full[self._half] = elements
+            of.append(full + full.T - np.diag(np.diag(full)))
+        return tuple(of)
+
     def sigma(self) -> float:
         """Rate at which the root of the mean square grows, 1/s; stable below 0."""
-        size = float(np.abs(np.linalg.eigvals(self._map)).max())
+        if self.chain.begins and self.stable and len(self._map) > _FEW:
+            # that of a map that keeps Q >= 0 is real, and none below 1 is closer to 1
+            size = float(np.abs(eigs(self._map, 1, sigma=1.0, return_eigenvectors=False)).max())
+        elif self.chain.begins:
+            size = _radius(self._map)
+        else:  # no miss begins: each outcome for itself, by the matrices of x
+            hit, miss = _radius(self.ticks.hit), _radius(self.ticks.misses[0])
+            size = max(hit**2, self.chain.continues * miss**2)
         return 0.5 * float(np.log(max(size, _NEVER))) / self.ticks.T_s
 
     def variance(self) -> Matrix:
         """That of y = (v_dc, p, omega_u, q, V), shape (5,), under white noise of the grid's
         voltage of 1 p.u. a tick; inf if the mean square does not decay."""
-        if self.sigma() >= 0.0:
+        if not self.stable:
             return np.full(len(self.ticks.outputs), np.inf)
-        added = np.outer(self.ticks.noise, self.ticks.noise)[self._half]
-        share = self.chain.share
-        both = np.concatenate([(1 - share) * added, share * added])
-        Q = np.linalg.solve(np.eye(len(both)) - self._map, both)
-        total = np.zeros_like(self.ticks.hit)
-        total[self._half] = Q[: len(added)] + Q[len(added) :]
-        total += total.T - np.diag(np.diag(total))
+        added, share = np.outer(self.ticks.noise, self.ticks.noise), self.chain.share
+        total = sum(self._at_rest((1 - share) * added, share * added))
         C = self.ticks.outputs
         return np.asarray(np.einsum("ij,jk,ik->i", C, total, C))
+
+
+def _radius(A: Matrix) -> float:
+    return float(np.abs(np.linalg.eigvals(A)).max())
+
+
+@lru_cache(maxsize=2)
+def _moments(ticks: Ticks) -> tuple[Matrix, Matrix]:
+    """What a hit and a miss make of the elements of a symmetric Q on and above its diagonal."""
+    N = len(ticks.hit)
+    rows, columns = np.triu_indices(N)
+    spread = np.zeros((N * N, len(rows)))
+    k = np.arange(len(rows))
+    spread[rows * N + columns, k] = spread[columns * N + rows, k] = 1.0
+    hit, miss = (np.kron(A, A)[rows * N + columns] @ spread for A in (ticks.hit, ticks.misses[0]))
+    return hit, miss
 
 
 def most_misses(ticks: Ticks, continues: float) -> float | None:
@@ -156,7 +193,7 @@ def most_misses(ticks: Ticks, continues: float) -> float | None:
     """
 
     def stable(begins: float) -> bool:
-        return MeanSquare(ticks, MissChain(begins, continues)).sigma() < 0.0
+        return MeanSquare(ticks, MissChain(begins, continues)).stable
 
     low, high = 0.0, 1.0
     if stable(high):

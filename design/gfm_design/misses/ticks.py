@@ -25,7 +25,7 @@ Meanwhile = Literal["stands still", "steps"]
 MEANWHILE: tuple[Meanwhile, ...] = "stands still", "steps"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ticks:
     """Hit and misses of one loop: x[k+1] = hit x[k], or misses[i] x[k] in the i-th miss in a row;
     the last of ``misses`` is that of all further ones."""
