@@ -32,6 +32,8 @@ def measured_misses(path: str | Path) -> list[Measured]:
         UserError: it is neither, or nothing in it ran in real time.
     """
     path = Path(path)
+    if not path.exists():
+        raise UserError(f"{path}: no such run folder or result")
     if (path / "summary.json").exists():
         run = Run.load(path)
         return [Measured(path.name or str(path), run.scenario.T_s, misses_of(run))]

@@ -42,7 +42,7 @@ def test_a_law_that_two_misses_in_a_row_make_unstable(result, capsys):
 def test_refuses_what_measured_nothing(result, tmp_path, capsys):
     from_ = ["design", "latency", "--from"]
     for arguments, words in (
-        ([str(tmp_path / "none")], "none: cannot be read"),
+        ([str(tmp_path / "none")], "none: no such run folder or result"),
         ([result(T_s_us=200.0)], "T_s = 0.0002 s, and the scenario 0.0001 s"),
     ):
         assert main([*from_, *arguments]) == 2
