@@ -150,7 +150,9 @@ class MeanSquare:
         """Rate at which the root of the mean square grows, 1/s; stable below 0."""
         if self.chain.begins and self.stable and len(self._map) > _FEW:
             # that of a map that keeps Q >= 0 is real, and none below 1 is closer to 1
-            size = float(np.abs(eigs(self._map, 1, sigma=1.0, return_eigenvectors=False)).max())
+            begin = np.ones(len(self._map))  # else a random one, and other last digits each time
+            near = eigs(self._map, 1, sigma=1.0, v0=begin, return_eigenvectors=False)
+            size = float(np.abs(near[0]))
         elif self.chain.begins:
             size = _radius(self._map)
         else:  # no miss begins: each outcome for itself, by the matrices of x
