@@ -148,16 +148,13 @@ class MeanSquare:
 
     def sigma(self) -> float:
         """Rate at which the root of the mean square grows, 1/s; stable below 0."""
-        if self.chain.begins and self.stable and len(self._map) > _FEW:
+        if self.stable and len(self._map) > _FEW:
             # that of a map that keeps Q >= 0 is real, and none below 1 is closer to 1
             begin = np.ones(len(self._map))  # else a random one, and other last digits each time
             near = eigs(self._map, 1, sigma=1.0, v0=begin, return_eigenvectors=False)
-            size = float(np.abs(near[0]))
-        elif self.chain.begins:
-            size = _radius(self._map)
-        else:  # no miss begins: each outcome for itself, by the matrices of x
-            hit, miss = _radius(self.ticks.hit), _radius(self.ticks.misses[0])
-            size = max(hit**2, self.chain.continues * miss**2)
+        else:
+            near = np.linalg.eigvals(self._map)
+        size = float(np.abs(near).max())
         return 0.5 * float(np.log(max(size, _NEVER))) / self.ticks.T_s
 
     def variance(self) -> Matrix:
@@ -169,10 +166,6 @@ class MeanSquare:
         total = sum(self._at_rest((1 - share) * added, share * added))
         C = self.ticks.outputs
         return np.asarray(np.einsum("ij,jk,ik->i", C, total, C))
-
-
-def _radius(A: Matrix) -> float:
-    return float(np.abs(np.linalg.eigvals(A)).max())
 
 
 @lru_cache(maxsize=2)
