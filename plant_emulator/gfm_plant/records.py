@@ -4,7 +4,8 @@
 pointer arithmetic, nothing is allocated in a tick, and a run can be saved or compared as bytes.
 Units are p.u. and s unless stated: those of a converter are p.u. of its own rating, those of the
 network p.u. of the first converter's. The order of measured channels is (v_dc, p, q, V), then those
-of an inner stage.
+of an inner stage. What every tick needs stands first in a record, so that it fills few lines of the
+processor's cache.
 """
 
 from typing import NamedTuple
@@ -55,9 +56,6 @@ converter_par_dtype = np.dtype(
         ("L_g", "f8"),
         ("R_g", "f8"),
         ("C_dc", "f8"),
-        # the line as the converter file has it
-        ("L_line_n", "f8"),
-        ("R_line_n", "f8"),
         ("current", "f8"),  # p.u. of the network in p.u. of the converter: ratio of their ratings
         # DC source: i_dc = i_u_gain i_u + k_p (1 - v_dc) + k_i integral, |i_dc| <= i_max
         ("i_u_gain", "f8"),
@@ -77,6 +75,36 @@ converter_par_dtype = np.dtype(
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
         ("i_peak", "f8"),
+        # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
+        ("filtered", "i8"),
+        ("omega_s", "f8"),  # bandwidth, rad/s
+        ("gain", "f8", (N_MEASURED,)),
+        ("offset", "f8", (N_MEASURED,)),
+        ("noisy", "i8"),
+        ("noise_std", "f8", (N_MEASURED,)),
+        ("seed", "u8"),
+        ("adc_lo", "f8", (N_MEASURED,)),
+        ("adc_hi", "f8", (N_MEASURED,)),
+        ("adc_lsb", "f8", (N_MEASURED,)),
+        # D/A, one entry a command
+        ("dac_lo", "f8", (N_COMMANDS,)),
+        ("dac_hi", "f8", (N_COMMANDS,)),
+        ("dac_lsb", "f8", (N_COMMANDS,)),
+        # from the tick that samples y[k] to the effect of u[k]: samples, and a fraction of one
+        ("T_s", "f8"),
+        ("delay", "i8"),
+        ("fraction", "f8"),
+        # protection: threshold, and ticks it may stay crossed (-1: disabled)
+        ("trip_limit", "f8", (N_TRIPS + N_OVERLOADS,)),
+        ("trip_ticks", "i8", (N_TRIPS + N_OVERLOADS,)),
+        # what is looked at over a cycle: places of the ring (0: nothing), ticks from one place to
+        # the next, and whether the frequency is that of the voltage
+        ("places", "i8"),
+        ("place_ticks", "i8"),
+        ("by_voltage", "i8"),
+        # the line as the converter file has it
+        ("L_line_n", "f8"),
+        ("R_line_n", "f8"),
         # a switched one (0 levels: it is averaged), see `bridge`: levels of a leg, gates that block
         # it; counts of the timer in half a carrier, and s of one; dead time, s; the shortest half
         # of a pulse, counts; the space vector of a leg's voltage in p.u. of v_dc. For each state of
@@ -95,17 +123,6 @@ converter_par_dtype = np.dtype(
         # which of all different ones it is; whether legs of one kind give no voltage together
         ("band_kind", "i8", (N_GATES, 2)),
         ("cancels", "i8"),
-        # sensors and A/D, one entry a measured channel; lsb = 0: no rounding
-        ("filtered", "i8"),
-        ("omega_s", "f8"),  # bandwidth, rad/s
-        ("gain", "f8", (N_MEASURED,)),
-        ("offset", "f8", (N_MEASURED,)),
-        ("noisy", "i8"),
-        ("noise_std", "f8", (N_MEASURED,)),
-        ("seed", "u8"),
-        ("adc_lo", "f8", (N_MEASURED,)),
-        ("adc_hi", "f8", (N_MEASURED,)),
-        ("adc_lsb", "f8", (N_MEASURED,)),
         # sensors and A/D at the phases, see `phases`, one entry a channel: s by which it samples
         # before the tick; value of the lowest code and of a step; the highest code; weights of the
         # sensor's low-pass in a period
@@ -118,22 +135,6 @@ converter_par_dtype = np.dtype(
         ("phase_top", "f8"),
         ("phase_weights", "f8", (3,)),
         ("phase_samples", "i8"),  # conversions in a period, whose sum is the count
-        # D/A, one entry a command
-        ("dac_lo", "f8", (N_COMMANDS,)),
-        ("dac_hi", "f8", (N_COMMANDS,)),
-        ("dac_lsb", "f8", (N_COMMANDS,)),
-        # from the tick that samples y[k] to the effect of u[k]: samples, and a fraction of one
-        ("T_s", "f8"),
-        ("delay", "i8"),
-        ("fraction", "f8"),
-        # protection: threshold, and ticks it may stay crossed (-1: disabled)
-        ("trip_limit", "f8", (N_TRIPS + N_OVERLOADS,)),
-        ("trip_ticks", "i8", (N_TRIPS + N_OVERLOADS,)),
-        # what is looked at over a cycle: places of the ring (0: nothing), ticks from one place to
-        # the next, and whether the frequency is that of the voltage
-        ("places", "i8"),
-        ("place_ticks", "i8"),
-        ("by_voltage", "i8"),
     ],
     align=True,
 )
@@ -154,17 +155,29 @@ converter_state_dtype = np.dtype(
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
         ("u_now", "f8", (N_COMMANDS,)),  # the command that acts at this instant
         ("reads", "f8", (NY_INNER,)),  # what the A/D of `sensors` gave last, p.u.
-        # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
-        ("phase_seen", "f8", (2, N_PHASES)),
         ("phase_sums", "f8", (N_PHASES,)),  # of this period's conversions, NaN if there were none
         # in a piece of time: power that the bridge draws, and what the sensors see, at its
-        # beginning, middle and end (and what these change by in a second at the beginning and the
-        # end of an interval between two edges); the command's voltage and the most that v_dc gives
+        # beginning, middle and end; the command's voltage and the most that v_dc gives
         ("drawn", "f8", (3,)),
         ("seen", "f8", (3, 3)),
-        ("seen_slopes", "f8", (2, 3)),
         ("E_commanded", "f8", (2,)),
         ("E_most", "f8"),
+        # when kept: delta, v_dc, DC source (3), sensors (4), and what the bridge was commanded (3)
+        ("before", "f8", (12,)),
+        # protection: ticks in a row that each threshold was crossed, and the latched trip
+        ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
+        ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
+        ("trip_tick", "i8"),
+        ("trip_value", "f8"),
+        # of a bridge that is to start again, see `protection.start_condition`; the speed of the
+        # capacitor's voltage that a blocked one sees
+        ("waits", "i8"),
+        ("omega_seen", "f8"),
+        # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
+        ("phase_seen", "f8", (2, N_PHASES)),
+        # what ``seen`` changes by in a second at the beginning and the end of an interval between
+        # two edges
+        ("seen_slopes", "f8", (2, 3)),
         # the legs of a switched bridge: gates, commanded level, sign of the current where it
         # decides (0: there is none), and when the next gate turns on, s from the beginning of the
         # unit; of this unit the level below the carrier and the edges down and up, s; when each leg
@@ -205,10 +218,6 @@ converter_state_dtype = np.dtype(
         # the bridge's frame, as a phasor that stands still
         ("ahead", "c16"),
         ("legs_before", "f8", (7, 3)),
-        # when kept: delta, v_dc, DC source (3), sensors (4), and what the bridge was commanded (3)
-        ("before", "f8", (12,)),
-        # protection: ticks in a row that each threshold was crossed, and the latched trip
-        ("crossed", "i8", (N_TRIPS + N_OVERLOADS,)),
         # one cycle: ticks looked at; sums over them of i^2 and of the turn of the capacitor's
         # voltage in the common frame, rad, and a ring of what they were; the voltage at the last
         # tick; RMS of the current and speed of the voltage
@@ -218,13 +227,6 @@ converter_state_dtype = np.dtype(
         ("v_before", "f8", (2,)),
         ("i_rms", "f8"),
         ("omega_v", "f8"),
-        ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
-        ("trip_tick", "i8"),
-        ("trip_value", "f8"),
-        # of a bridge that is to start again, see `protection.start_condition`; the speed of the
-        # capacitor's voltage that a blocked one sees
-        ("waits", "i8"),
-        ("omega_seen", "f8"),
     ],
     align=True,
 )

@@ -595,8 +595,11 @@ def series_half(n: Any, now: Any, half: float, which: int) -> None:
         steps = 1
         if not once:
             steps = max(1, math.ceil(half * norm[c] / LARGEST))
-        for _ in range(steps):
-            _series(n, now, c, axis, (2.0 if once else 1.0) * half / steps)
+        h = (2.0 if once else 1.0) * half / steps
+        for step in range(steps):
+            if step > 0:
+                _turn_sources(now, h)
+            _series(n, now, c, axis, h)
         if which == 0 and not once:  # the end of the first half is the middle
             end, middle = field(now, "x_end"), field(now, "x_middle")
             for part in range(2):
@@ -642,8 +645,17 @@ def _begin(n: Any, now: Any, c: int, axis: int, which: int) -> None:
 
 
 @compiled
+def _turn_sources(now: Any, h: float) -> None:
+    """Take the sources on by h s."""
+    s_now, speed = field(now, "s_now"), field(now, "source_speed")
+    for k in range(now.n_s):
+        s = complex(s_now[0, k], s_now[1, k]) * turned(speed[k] * h)
+        s_now[0, k], s_now[1, k] = s.real, s.imag
+
+
+@compiled
 def _series(n: Any, now: Any, c: int, axis: int, h: float) -> None:
-    """Take ``x_end`` on by h s, and the sources with it; ``x_middle`` is in the middle of it."""
+    """Take ``x_end`` on by h s; ``x_middle`` is in the middle of it."""
     n_x, n_s, N = field(n, "n_sums")[c, 0], now.n_s, n.n_converters
     n_u, n_extra = field(n, "n_sums")[c, 1], field(n, "n_sums")[c, 2]
     columns, end, middle = field(now, "columns"), field(now, "x_end"), field(now, "x_middle")
@@ -675,9 +687,6 @@ def _series(n: Any, now: Any, c: int, axis: int, h: float) -> None:
         # all further terms are together no larger: each is at most half of the one before
         if size < least and 2.0 * norm_h < j + 1:
             break
-    for k in range(n_s):
-        s = complex(s_now[0, k], s_now[1, k]) * turned(speed[k] * h)
-        s_now[0, k], s_now[1, k] = s.real, s.imag
 
 
 @summing
