@@ -1,5 +1,5 @@
 """``python -m gfm_hil`` is ``gfmhil``."""
 
-from gfm_hil.cli import main
+from gfm_hil.cli import program
 
-raise SystemExit(main())
+raise SystemExit(program())

@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from gfm_plant.circuit import Branch
@@ -24,6 +23,7 @@ from gfm_plant.names import WAYS
 from gfm_plant.phases import convert_nothing
 from gfm_plant.port import pack_port
 from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
+from gfm_plant.solution import integrals
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.ways import find_ways
 from gfm_plant.wiring import CONTACT, GRID_SOURCE, FaultPlace, Wiring
@@ -573,8 +573,5 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
 def _low_pass(x: float) -> tuple[float, ...]:
     """Weights of a first-order low-pass after a stretch of x time constants: of its state, and of
     its input at the beginning, the middle and the end, between which the input is a parabola."""
-    A = np.diag([1.0, 1.0, 1.0], 1)
-    A[0, 0] = -x
-    # f_k: integrals of e^(-x (1 - t)) t^(k - 1) / (k - 1)!
-    whole, f_1, f_2, f_3 = scipy.linalg.expm(A)[0]
+    whole, f_1, f_2, f_3 = integrals.py_func(x)
     return whole, x * (f_1 - 3 * f_2 + 4 * f_3), x * (4 * f_2 - 8 * f_3), x * (4 * f_3 - f_2)

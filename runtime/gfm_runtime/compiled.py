@@ -30,6 +30,7 @@ from typing import Any
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.ccallback import CFunc
+from numba.core.runtime.nrt import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic as _intrinsic
 
@@ -114,16 +115,19 @@ class _Cache(FunctionCache):
         self._cache_file = _Index(self._cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """As numba asks for it: from the wheel, or from its own cache."""
+        """As numba asks for it: from the wheel, or from its own cache.
+
+        numba would first import all that it can compile, and with it scipy.linalg, which takes
+        longer than all our functions; when it compiles a caller, it has done so already."""
+        rtsys.initialize(target_context)
         if self._enabled and not self.links:
             key = self._index_key(sig, target_context.codegen())
             kept = wheel_code().load(name_of(*self._from, key))
             if kept is not None:
-                target_context.refresh()
                 found = self._impl.rebuild(target_context, kept)
                 found.entry_point.linkable = False
                 return found
-        return super().load_overload(sig, target_context)
+        return self._load_overload(sig, target_context)
 
 
 #: options of numba; a division by 0 gives infinity or NaN as in C, and no branch. Without a word on

@@ -13,10 +13,7 @@ a function.
 
 from __future__ import annotations
 
-import gc
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache, cached_property
 from typing import Any
 
@@ -32,6 +29,8 @@ from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering
 from numba.core.types import Boolean, Function, Number, unliteral
 from numba.core.typing.context import Context
+
+from gfm_runtime.garbage import garbage_kept
 
 
 class _Library(JITCodeLibrary):
@@ -269,20 +268,6 @@ class _Typing(Context):
 _NUMBERS = Number, Boolean
 _signatures: dict[Any, Any] = {}
 _typing = cache(_Typing)
-
-
-@contextmanager
-def garbage_kept() -> Iterator[None]:
-    """Collect no garbage meanwhile: numba keeps millions of objects while it compiles, and looking
-    through them again and again took a tenth of the time."""
-    if not gc.isenabled():
-        yield
-        return
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
 
 
 class Deferring(Compiler):

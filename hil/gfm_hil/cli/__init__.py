@@ -1,5 +1,5 @@
 """The command ``gfmhil``: one module a command."""
 
-from gfm_hil.cli.main import main
+from gfm_hil.cli.main import main, program
 
-__all__ = ["main"]
+__all__ = ["main", "program"]

@@ -328,12 +328,17 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
     console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
 
 
+def _lasted(run: Run | NetworkRun) -> bool:
+    each = run.values() if isinstance(run, NetworkRun) else [run]
+    return all(one.status == "completed" for one in each)
+
+
 def print_run(run: Run | NetworkRun, folder: Path, why: bool = False) -> None:
     """The tables that end a run; with ``why`` also what made it unstable, see ``why_it_ended``."""
     reason = ""
     if isinstance(run, Run) and "unstable_mode" in run.summary:
         reason = run.summary["unstable_mode"]
-    elif why or isinstance(run, NetworkRun):
+    elif (why or isinstance(run, NetworkRun)) and not _lasted(run):
         from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
 
         reason = why_it_ended(run)

@@ -28,7 +28,7 @@ from gfm_hil.scenario import Scenario
 from gfm_plant.names import WAYS
 from gfm_plant.ways import find_ways
 from gfm_runtime.compiled import wheel_code
-from gfm_runtime.deferred import garbage_kept
+from gfm_runtime.garbage import garbage_kept
 from gfm_runtime.inner_tick import inner_tick
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numba.experimental.function_type  # noqa: F401  so that numba knows a PortFunction
 import numpy as np
 from numba import types
 from numpy.typing import NDArray

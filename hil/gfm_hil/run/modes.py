@@ -16,12 +16,11 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads its parts when they are first used
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.run.cycles import cycle_means, cycle_ticks, hann, whole_ticks
+from gfm_hil.run.cycles import cycle_means, cycle_ticks, fast_length, hann, whole_ticks
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import FaultClear
 from gfm_hil.scenario.events.grid_frequency import GridFrequency
@@ -185,7 +184,7 @@ def _filter(stride: int) -> Vector:
     import takes half a second in every run.
     """
     taps = _TAPS * stride + 1
-    n = scipy.fft.next_fast_len(32 * taps)
+    n = fast_length(32 * taps)
     steep = np.sinc(0.8 / stride * (np.arange(taps) - (taps - 1) / 2)) * np.hamming(taps)
     size = np.abs(np.fft.fft(steep / steep.sum(), n))
     fold = np.zeros(n)  # the cepstrum of what is one-sided
@@ -209,12 +208,9 @@ def _strongest(
     if not np.max(np.abs(x)) >= least:
         return None
     hankel = np.lib.stride_tricks.sliding_window_view(x, len(x) // 3 + 1)
-    width = hankel.shape[1]
     # the few largest singular values and vectors: far above rounding, so that squares do
-    power, modes = scipy.linalg.eigh(
-        hankel.T @ hankel, subset_by_index=[max(0, width - _RANK), width - 1], check_finite=False
-    )
-    subspace = modes[:, power > 1e-6 * power[-1]]
+    power, modes = np.linalg.eigh(hankel.T @ hankel)
+    subspace = modes[:, -_RANK:][:, power[-_RANK:] > 1e-6 * power[-1]]
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
     z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / h

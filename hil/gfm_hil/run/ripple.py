@@ -17,12 +17,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # loads scipy.fft when it is first used
 from numpy.typing import NDArray
 
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import nominal_frequency
-from gfm_hil.run.cycles import detrend, hann
+from gfm_hil.run.cycles import detrend, fast_length, hann
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
@@ -148,7 +147,7 @@ def _sinusoids(
     n = x.shape[1]
     window = hann(n)
     # Lines lie half as far apart as the window has them: the strongest falls between two by 4 %.
-    length = scipy.fft.next_fast_len(2 * n, real=True)
+    length = fast_length(2 * n)
     spectra = np.abs(np.fft.rfft(detrend(x) * window, length))
     lines = np.fft.rfftfreq(length, T_s)
     apart = 1.0 / (n * T_s)

@@ -378,6 +378,24 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("arguments", [["laws", "--json"], ["scenarios"]])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_disk_that_is_full_is_told_in_one_line(arguments, unbuffered):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "gfm_hil", *arguments], stdout=full, stderr=subprocess.PIPE,
+            text=True, env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (2, "gfmhil: No space left on device\n")
+
+
+def test_a_mistake_of_ours_leaves_its_traceback():
+    broken = "import sys, gfm_hil.cli; m = sys.modules['gfm_hil.cli.main']"
+    broken += "; m.parser = lambda _: 1 / 0; m.program()"
+    done = subprocess.run([sys.executable, "-c", broken], capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr.endswith("ZeroDivisionError: division by zero\n")
+
+
 def own_law(folder: Path, name: str, **gains: float) -> Path:
     """A law file of VSG-2 in a folder of its own, with another name and other gains."""
     path = folder / "laws of mine" / "file.toml"

@@ -70,6 +70,15 @@ def test_an_operator_s_command_loads_no_compiler(tmp_path):
     assert not {"numba", "scipy", "rich"} & set(modules.split())
 
 
+def test_a_run_that_is_compiled_loads_no_compiler_s_libraries_nor_scipy_s(tmp_path):
+    program = f"{_LIGHT}print(*{{'scipy.linalg', 'numba.np.arraymath'}} & set(sys.modules))"
+    for k in range(2):  # the first one may compile
+        words = "run", "pref_step", "--link", "inproc", "--no-figures", "--out"
+        command = [sys.executable, "-c", program, *words, str(tmp_path / str(k))]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == ""
+
+
 def test_only_what_is_compiled_is_said_and_which_of_how_many():
     new = njit(lambda x: x + 1)
     said: list[str] = []

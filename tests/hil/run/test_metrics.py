@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.fft
 import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 import gfmhil
 from gfm_hil.api.law import as_law
 from gfm_hil.core.errors import UserError
-from gfm_hil.run.cycles import cycle_means
+from gfm_hil.run.cycles import cycle_means, fast_length
 from gfm_hil.run.metrics import METRICS, event_metrics
 from gfm_hil.run.modes import _TAPS, Acting, _filter, acting, fast_mode, free_from, swing
 from gfm_hil.scenario import check_scenario
@@ -206,12 +207,16 @@ def test_a_fast_mode_is_found_beside_a_larger_swing_without_aliasing(hertz, sigm
     assert swings.damping == pytest.approx(3 / math.hypot(3, 6 * np.pi), abs=1e-3)
 
 
+@given(st.integers(1, 10**6))
+def test_a_fast_length_is_that_of_scipy(n):
+    assert fast_length(n) == scipy.fft.next_fast_len(n, real=True)
+
+
 @pytest.mark.parametrize("stride", [2, 10, 33])
 def test_the_low_pass_is_that_of_scipy(stride):
     taps = _TAPS * stride + 1
     steep = scipy.signal.firwin(taps, 0.8 / stride)
-    n = scipy.fft.next_fast_len(32 * taps)
-    least = scipy.signal.minimum_phase(steep, n_fft=n, half=False)
+    least = scipy.signal.minimum_phase(steep, n_fft=fast_length(32 * taps), half=False)
     weights = _filter(stride).ravel()
     assert weights[:taps] == pytest.approx(least / least.sum(), abs=1e-13)
     assert not weights[taps:].any()
