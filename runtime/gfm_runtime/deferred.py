@@ -147,6 +147,7 @@ class UnlinkedCode:
 
     def make(self) -> None:
         """Make the machine code, with a function that takes the arguments from Python."""
+        cpu_target.target_context.refresh()  # what is only loaded does without, see `compiled`
         context = cpu_target.target_context.subtarget(enable_nrt=self.nrt)
         library = _Library.of(self.library.name)  # a caller without this compiler may have its own
         library.add_linking_library(self.library)
