@@ -130,6 +130,13 @@ def with_following(place: Path | None = None) -> Scenario:
     return island(grid_following=neighbour, capacitors=banks)
 
 
+def with_motor(place: Path | None = None) -> Scenario:
+    load = {"node": "far", "P": 0.2, "Q": 0.05, "share_I": 0.4, "share_Z": 0.3}
+    motor = {"M": {"node": "far", "S": 0.5, "H": 0.4}}
+    banks = {"bank": {"node": "far", "Q": 0.1}}
+    return island(induction_motors=motor, constant_power={"zip": load}, capacitors=banks)
+
+
 def with_waves(place: Path | None = None) -> Scenario:
     line = {"start": "bus", "end": "far", "L": 0.1, "R": 0.02, "B": 0.1}
     banks = {"b": {"node": "bus", "Q": 0.1}, "f": {"node": "far", "Q": 0.1}}
@@ -181,6 +188,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_synchronous_machine,
         with_controls,
         with_following,
+        with_motor,
         with_waves,
         with_finite_grid,
         with_pll,

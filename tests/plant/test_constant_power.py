@@ -43,7 +43,8 @@ def exact(plant: Network, u: np.ndarray, seconds: float) -> np.ndarray:
     """w and v_f by DOP853 of the equations written anew."""
     r = plant.par[0]
     (load,) = plant.of(ConstantPowerLoad)
-    S, tau, least = complex(load["S"]), float(load["tau"]), float(load["least_v2"])
+    S, tau, least = complex(load["S"]), float(load["tau"]), math.sqrt(load["least_v2"])
+    a_I, a_Z = float(load["a_I"]), float(load["a_Z"])
     opened = "p" in plant.wiring.opened
     delta = [cmath.phase(plant.now["unit"][0, k]) for k in range(2)]
 
@@ -53,7 +54,9 @@ def exact(plant: Network, u: np.ndarray, seconds: float) -> np.ndarray:
         e = np.array(
             [u[k, 2] * np.exp(1j * (delta[k] + W_B * (u[k, 1] - 1) * t)) for k in range(2)]
         )
-        i = 0.0 if opened else S.conjugate() * f / max(abs(f) ** 2, least)
+        V = max(abs(f), least)
+        power = (1 - a_I - a_Z) + a_I * V + a_Z * V**2
+        i = 0.0 if opened else S.conjugate() * power * f / V**2
         # i_l is the sum of both i_o: their node has no capacitor, and its voltage follows
         a, b = r["L_g"], 0.1
         v_m = (
@@ -156,7 +159,7 @@ def test_below_its_least_voltage_it_is_an_impedance():
     u = start_at(plant, [1.02, 1.02], 1.0)
     u[0] += [0.0, 2e-3, 0.04, 0.0]
     assert error(plant, u, 0.02, 1e-4) < 1e-4
-    i, _ = drawn(0.5 + 0.1j, 4.0, 1.0 + 0j, 0j)
+    i, _ = drawn(plant.of(ConstantPowerLoad)[0], 1.0 + 0j, 0j)
     assert i == pytest.approx(complex(0.5, -0.1) / 4)
 
 
@@ -171,9 +174,28 @@ def test_six_of_a_sixth_are_one():
     assert found[0] == pytest.approx(found[1], abs=1e-11)
 
 
+def test_shares_of_a_zip_load_against_dop853():
+    plant = make(share_I=0.3, share_Z=0.2)
+    u = start_at(plant, [1.02, 1.02], 1.0)
+    u[0] += [0.0, 2e-3, 0.04, 0.0]
+    assert error(plant, u, 0.02, 1e-4) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("shares", "exponent"), [({}, 0), ({"share_I": 1.0}, 1), ({"share_Z": 1.0}, 2)]
+)
+def test_power_goes_with_the_voltage_as_its_share_says(shares, exponent):
+    load = ConstantPowerLoad(node="n", P=0.5, Q=0.1, **shares)
+    for V in (0.8, 1.0, 1.2):
+        i = load.current(V * np.exp(0.3j), 0.0)[1]
+        power = V * np.exp(0.3j) * np.conj(i)
+        assert power == pytest.approx((0.5 + 0.1j) * V**exponent, rel=1e-12)
+
+
 @pytest.mark.parametrize("V", [1.03, 0.6])
-def test_the_admittance_is_the_derivative(V):
-    load = ConstantPowerLoad(node="n", P=0.5, Q=0.1)
+@pytest.mark.parametrize("shares", [{}, {"share_I": 0.4, "share_Z": 0.1}])
+def test_the_admittance_is_the_derivative(V, shares):
+    load = ConstantPowerLoad(node="n", P=0.5, Q=0.1, **shares)
     Y = load.admittance(V, 0.0)
     step = 1e-6
     for k, nudge in enumerate((step, 1j * step)):
@@ -188,9 +210,11 @@ def test_the_admittance_is_the_derivative(V):
 
 def test_its_slope_is_that_of_its_current():
     f, d, step = 0.9 + 0.2j, -3.0 + 5.0j, 1e-6
-    _, slope = drawn(0.5 + 0.1j, 0.49, f, d)
-    ends = [f + sign * step * d for sign in (1, -1)]
-    up, down = (complex(0.5, -0.1) / end.conjugate() for end in ends)
+    plant = make(share_I=0.4, share_Z=0.1)
+    (one,) = plant.of(ConstantPowerLoad)
+    _, slope = drawn(one, f, d)
+    load = plant.wiring.fed[0][1]
+    up, down = (load.current(f + sign * step * d, 0.0)[1] for sign in (1, -1))
     assert slope == pytest.approx((up - down) / (2 * step), rel=1e-8)
 
 
@@ -199,6 +223,7 @@ def test_its_slope_is_that_of_its_current():
     [
         ({"node": "m"}, "node m: p draws constant power, so the node needs a bank of"),
         ({"node": "x"}, "p is at node 'x', which has no path"),
+        ({"share_I": 0.7, "share_Z": 0.4}, "share_I = 0.7, share_Z = 0.4: at most 1 together"),
         ({"tau_s": 1e-4}, "network.constant_power.p: tau_s = 0.0001: must be >= 0.0005 s"),
     ],
 )

@@ -421,11 +421,11 @@ class _Writing:
         self.modes, self.sources = wiring.modes(wiring.blocked, None)
         self.w = now["w"][: len(wiring.order)]
         fed = [item for item in plant.fed() if item[1].is_voltage or item[0] not in wiring.opened]
-        voltages = [(name, one, record) for name, one, record in fed if one.is_voltage]
+        turning = [item for item in fed if "leads" in item[2].dtype.names]
         at_node = {m.name: unit.node for m, unit in zip(members, wiring.units, strict=True)}
-        at_node |= {name: one.nodes[0] for name, one, _ in voltages}
+        at_node |= {name: one.nodes[0] for name, one, _ in turning}
         speeds = [float(m.op.u[OMEGA_ROW]) for m in members]
-        speeds += [float(record["omega"]) for *_, record in voltages]
+        speeds += [float(record["omega"]) for *_, record in turning]
         if wiring.grid is not None and wiring.closed:
             at_node[GRID] = wiring.grid
             speeds.append(float(now["omega_g"]))

@@ -13,6 +13,7 @@ from gfm_plant.components.capacitor_bank import CapacitorBank
 from gfm_plant.components.constant_power import ConstantPowerLoad
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.grid_following import GridFollowing
+from gfm_plant.components.induction_motor import InductionMotor
 from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
@@ -46,6 +47,7 @@ class NetworkParts(Options):
     capacitors: dict[str, CapacitorBank] = Field({}, description="by name")
     machines: dict[str, Machine] = Field({}, description="by name")
     synchronous_machines: dict[str, SynchronousMachine] = Field({}, description="by name")
+    induction_motors: dict[str, InductionMotor] = Field({}, description="by name")
 
     def components(self) -> Iterator[tuple[str, str, Component]]:
         """Table, name and options of each, in the order of the fields above."""

@@ -1,25 +1,29 @@
-"""A load of constant power: the current that its control draws, along a piece of time.
+"""A load of constant power, in whole or in part (ZIP): the current that it draws, along a piece of
+time.
 
 The load measures the voltage v of its node as v_f, a space vector in the common frame, with a lag:
 
-    tau dv_f/dt = v - v_f,    i = conj(S) v_f / max(|v_f|^2, V_least^2)
+    tau dv_f/dt = v - v_f,    i = conj(S) v_f g(max(|v_f|, V_least)),
+    g(V) = (1 - a_I - a_Z) / V^2 + a_I / V + a_Z,
 
-so that i = conj(S / v_f) while |v_f| is above V_least, and below it the load is an impedance, as
+where a_I and a_Z are the shares of constant current and impedance at 1 p.u. Without them
+i = conj(S / v_f) while |v_f| is above V_least, and below it the load is an impedance, as
 the constant-power loads of transmission programs are below 0.7 p.u. For the linear circuit the
 current is a source. In each half of a piece it is held at its value in the middle of that half,
 extrapolated from the beginning of the piece: the error falls with the square of the length of a
 piece. v_f itself follows the parabola through v at the beginning, the middle and the end.
 """
 
-from typing import Any, ClassVar
+import math
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from gfm_plant.components.part import DRAWN, Drawing, LinearPart, Matrix, see_middle
 from gfm_plant.layout import field
-from gfm_plant.parameters import Positive
+from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import draw
 from gfm_runtime.compiled import compiled
 
@@ -27,17 +31,17 @@ _LAG = 5.0  # shortest lag of the measurement, in sampling periods
 
 
 @compiled
-def drawn(S: complex, least_v2: float, f: complex, slope: complex) -> tuple[complex, complex]:
+def drawn(one: Any, f: complex, slope: complex) -> tuple[complex, complex]:
     """Return the current at a measured voltage f, and its d/dt when that has this slope."""
     size = f.real * f.real + f.imag * f.imag
     grow = 2.0 * (f.real * slope.real + f.imag * slope.imag)
-    if size < least_v2:
-        size, grow = least_v2, 0.0
-    by_S, slope_by_S = S.conjugate() * f, S.conjugate() * slope
-    i = complex(by_S.real / size, by_S.imag / size)
-    return i, complex(
-        slope_by_S.real / size - i.real * grow / size, slope_by_S.imag / size - i.imag * grow / size
-    )
+    if size < one.least_v2:
+        size, grow = one.least_v2, 0.0
+    per_V = one.a_I / math.sqrt(size)
+    power = (1.0 - one.a_I - one.a_Z) / size
+    g, g_slope = power + per_V + one.a_Z, -(power + 0.5 * per_V) * grow / size
+    own = one.S.conjugate()
+    return own * f * g, own * (slope * g + f * g_slope)
 
 
 @compiled
@@ -46,7 +50,7 @@ def _draw(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     h, v, f = field(n, "half_h")[part], field(now, "w")[one.sees], one.v_f
     one.v_begin = v
     slope = complex((v.real - f.real) / one.tau, (v.imag - f.imag) / one.tau)
-    i, di = drawn(one.S, one.least_v2, f, slope)
+    i, di = drawn(one, f, slope)
     draw(
         n, now, c, part, one.source,
         complex(i.real + 0.5 * h * di.real, i.imag + 0.5 * h * di.imag),
@@ -77,15 +81,16 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 @compiled
 def _flow(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    field(now, "flow_i")[one.source] = drawn(one.S, one.least_v2, one.v_f, 0j)[0]
+    field(now, "flow_i")[one.source] = drawn(one, one.v_f, 0j)[0]
 
 
 class ConstantPowerLoad(Drawing):
     """A load whose control holds P and Q, such as a drive or a charger: it draws the current
-    conj(S / v_f), where v_f follows the voltage of its node with a lag. Its node needs a capacitor,
-    as the filter of such a load is."""
+    conj(S / v_f), where v_f follows the voltage of its node with a lag. Shares of it may be a
+    constant current or a constant impedance (ZIP). Its node needs a capacitor, as the filter of
+    such a load is."""
 
-    title: ClassVar = "Load of constant power"
+    title: ClassVar = "Load of constant power, and ZIP load"
     symbol: ClassVar = "load"
     example: ClassVar = {
         "constant_power": {"x": {"node": "bus", "P": 0.1}},
@@ -99,6 +104,7 @@ class ConstantPowerLoad(Drawing):
             ("S", "c16"),  # P + jQ, p.u. of the network
             ("tau", "f8"),  # s
             ("least_v2", "f8"),  # the square of V_least
+            ("a_I", "f8"), ("a_Z", "f8"),
             ("v_f", "c16"), ("v_f_before", "c16"),  # now, and at the last tick
         ],
         align=True,
@@ -109,13 +115,29 @@ class ConstantPowerLoad(Drawing):
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
-    P: float = Field(description="active power, p.u. of the first converter; negative: it feeds in")
-    Q: float = Field(0.0, description="reactive power, p.u.")
+    P: float = Field(
+        description="active power at 1 p.u., p.u. of the first converter; negative: it feeds in"
+    )
+    Q: float = Field(0.0, description="reactive power at 1 p.u., p.u.")
+    share_I: NonNegative = Field(
+        0.0, le=1.0, description="share of P and Q that goes with the voltage: a constant current"
+    )
+    share_Z: NonNegative = Field(
+        0.0, le=1.0, description="share that goes with its square: a constant impedance"
+    )
     tau_s: Positive = Field(0.005, description="lag of its measurement of the voltage, s")
     V_least: Positive = Field(
         0.7, description="below this voltage it is an impedance that draws P and Q there, p.u."
     )
     closed: bool = Field(True, description="its breaker at the start")
+
+    @model_validator(mode="after")
+    def _shares(self) -> Self:
+        if self.share_I + self.share_Z > 1.0:
+            raise ValueError(
+                f"share_I = {self.share_I:g}, share_Z = {self.share_Z:g}: at most 1 together"
+            )
+        return self
 
     @property
     def S(self) -> complex:
@@ -123,7 +145,8 @@ class ConstantPowerLoad(Drawing):
         return complex(self.P, self.Q)
 
     def label(self) -> str:
-        return f"constant P {self.P:g}, Q {self.Q:g} p.u."
+        shares = f", I {self.share_I:g}, Z {self.share_Z:g}" * (self.share_I + self.share_Z > 0.0)
+        return f"constant P {self.P:g}, Q {self.Q:g} p.u.{shares}"
 
     def lag(self) -> float:
         return self.tau_s
@@ -134,12 +157,20 @@ class ConstantPowerLoad(Drawing):
                 f"{where}: tau_s = {self.tau_s:g}: must be >= {_LAG * T_s:g} s at this T_s"
             )
         record["S"], record["tau"], record["least_v2"] = self.S, self.tau_s, self.V_least**2
+        record["a_I"], record["a_Z"] = self.share_I, self.share_Z
+
+    def _by_voltage(self, V: float) -> tuple[float, float]:
+        """g at the size V of a voltage, and the d/dV of V g(V)."""
+        u = max(V, self.V_least)
+        power = (1.0 - self.share_I - self.share_Z) / u**2
+        g = power + self.share_I / u + self.share_Z
+        return g, self.share_Z - power if self.V_least < V else g
 
     def current(self, v: complex, slip: float) -> tuple[complex, complex]:
         """The measured voltage and the current that it draws at rest, at a voltage v that turns
         with ``slip``, rad/s, in the common frame."""
         f = v / complex(1.0, slip * self.tau_s)
-        return f, self.S.conjugate() * f / max(abs(f) ** 2, self.V_least**2)
+        return f, self.S.conjugate() * f * self._by_voltage(abs(f))[0]
 
     def steady(
         self, v: complex, omega: float, omega_b: float, z: Matrix
@@ -154,8 +185,8 @@ class ConstantPowerLoad(Drawing):
         """The small-signal admittance at a resting voltage that turns at nominal speed: the exact
         derivative of the equations above.
 
-        Its d axis lies on the voltage. Above V_least the load has the negative conductance -P/V^2
-        there at low frequencies, which ends at 1/tau.
+        Its d axis lies on the voltage. Above V_least a load of constant power has the negative
+        conductance -P/V^2 there at low frequencies, which ends at 1/tau.
 
         Args:
             V: magnitude of the voltage, p.u., > 0.
@@ -164,10 +195,8 @@ class ConstantPowerLoad(Drawing):
         Returns:
             (i_d, i_q) per (v_d, v_q), shape (*s.shape, 2, 2).
         """
-        if self.V_least < V:
-            J = np.array([[-self.P, self.Q], [self.Q, self.P]]) / V**2
-        else:
-            J = np.array([[self.P, self.Q], [-self.Q, self.P]]) / self.V_least**2
+        across, along = self._by_voltage(V)
+        J = np.array([[self.P * along, self.Q * across], [-self.Q * along, self.P * across]])
         return np.multiply.outer(1.0 / (1.0 + np.asarray(s) * self.tau_s), J)
 
     def linear(
