@@ -125,7 +125,7 @@ def with_controls(place: Path | None = None) -> Scenario:
 
 
 def with_following(place: Path | None = None) -> Scenario:
-    neighbour = {"G": {"node": "far", "S": 0.8, "P": 0.4, "Q": 0.1}}
+    neighbour = {"G": {"node": "far", "S": 0.8, "P": 0.4, "Q": 0.1, "k_V": 3.0, "band": 0.0}}
     banks = {"bank": {"node": "far", "Q": 0.1}}
     return island(grid_following=neighbour, capacitors=banks)
 
