@@ -132,8 +132,7 @@ def test_at_rest_it_is_its_equivalent_circuit():
 
 
 def test_its_poles_on_a_stiff_voltage():
-    """Those of the five equations of its flux linkages, of which the stator's are those of its
-    branch, by differences."""
+    """They are those of the five equations of its flux linkages, linearised by differences."""
     plant = make()
     started(plant)
     (one,), v = plant.of(InductionMotor), 1.0 + 0j

@@ -421,6 +421,7 @@ class _Writing:
         self.modes, self.sources = wiring.modes(wiring.blocked, None)
         self.w = now["w"][: len(wiring.order)]
         fed = [item for item in plant.fed() if item[1].is_voltage or item[0] not in wiring.opened]
+        # the rotor of a motor turns at another speed than its island
         turning = [item for item in fed if "leads" in item[2].dtype.names]
         at_node = {m.name: unit.node for m, unit in zip(members, wiring.units, strict=True)}
         at_node |= {name: one.nodes[0] for name, one, _ in turning}

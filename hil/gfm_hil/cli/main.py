@@ -137,7 +137,8 @@ def program() -> int:
     try:
         code = main()
     except SystemExit as stop:  # of argparse
-        code = stop.code if isinstance(stop.code, int) else 0
+        code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        raise
     except KeyboardInterrupt:
         code = 130
         raise

@@ -9,9 +9,9 @@ X' = X_s + k X_r:
     2 H d omega/dt = T - T_load (omega / omega_0)^m,    T = k Im(conj(psi) i),
 
 where omega is the speed of the rotor and omega_0 that at the start (Krause, Analysis of Electric
-Machinery, 4.5). So the stator's own transients are in it too. Within a tick e is held at its value
-in the middle of the tick, extrapolated, and the rotor goes on under the mean current of the tick:
-the error falls with the square of T_s.
+Machinery, symmetrical induction machines). So the stator's own transients are in it too. Within a
+tick e is held at its value in the middle of the tick, extrapolated, and the rotor goes on under the
+mean current of the tick: the error falls with the square of T_s.
 """
 
 import cmath
@@ -66,21 +66,21 @@ def _tick(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     half = cmath.exp(complex(-one.r, omega - 1.0) * (0.5 * T_s * b))
     psi = half * (half * one.psi + T_s * b * one.r * one.X_m * i)
     one.psi, one.charge = psi, 0j
-    i = field(now, "w")[one.sees] * (-1.0 / one.S)
-    one.slope = (_torque(one, psi, i) - _load(one, one.omega)) / (2.0 * one.H)
-    psi_slope = b * (one.r * one.X_m * i + complex(-one.r, one.omega - 1.0) * psi)
-    turn = complex(-one.r, one.omega)
-    one.E = one.k * turn * psi
-    slope = one.k * (turn * psi_slope + 1j * one.slope * psi)
-    one.E_middle, one.psi_middle = one.E + 0.5 * T_s * slope, psi + 0.5 * T_s * psi_slope
-    field(now, "emf")[one.source] = one.E
+    _look_ahead(n, now, one, c, part)
 
 
 @compiled
-def _at_rest(n: Any, now: Any, one: Any, c: int, part: int) -> None:
-    turn = 1j * n.omega_b * n.T_s * (now.omega_g - 1.0)  # of all space vectors in a tick
-    one.E_middle = one.E * (1.0 + 0.5 * turn)
-    one.psi_middle = one.psi * (1.0 + 0.5 * turn)
+def _look_ahead(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Set e, and extrapolate e and psi to the middle of the tick that begins."""
+    psi, i = one.psi, field(now, "w")[one.sees] * (-1.0 / one.S)
+    one.slope = (_torque(one, psi, i) - _load(one, one.omega)) / (2.0 * one.H)
+    psi_slope = n.omega_b * (one.r * one.X_m * i + complex(-one.r, one.omega - 1.0) * psi)
+    turn = complex(-one.r, one.omega)
+    one.E = one.k * turn * psi
+    slope = one.k * (turn * psi_slope + 1j * one.slope * psi)
+    one.E_middle = one.E + 0.5 * n.T_s * slope
+    one.psi_middle = psi + 0.5 * n.T_s * psi_slope
+    field(now, "emf")[one.source] = one.E
 
 
 @compiled
@@ -96,8 +96,7 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 class InductionMotor(Fed):
     """An induction motor with one cage, in all its electric transients, and a load whose torque
     goes with a power of the speed. It slows down in a sag, may stall, and draws many times its
-    current until it has run up again. The defaults are those of a large industrial motor (IEEE Task
-    Force, Standard load models, IEEE Trans. Power Systems 10, 1995, type 6)."""
+    current until it has run up again. The defaults are typical of a large industrial motor."""
 
     title: ClassVar = "Induction motor"
     symbol: ClassVar = "M"
@@ -120,7 +119,7 @@ class InductionMotor(Fed):
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
+        "at_rest": _look_ahead, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
         "tick": _tick, "keep": _keep, "go_back": _go_back,
     }  # fmt: skip
 
@@ -160,9 +159,8 @@ class InductionMotor(Fed):
     def impedance(self, slip: Any, omega: float = 1.0) -> Any:
         """That of its equivalent circuit, p.u. of its rating, at a slip, p.u. of nominal speed, any
         shape, and a speed of the voltage."""
-        of_rotor = 1j * omega * self.X_r + self.R_r * omega / np.where(slip == 0, 1e-12, slip)
-        magnetising = 1j * omega * self.X_m
-        return self.R_s + 1j * omega * self.X_s + magnetising * of_rotor / (magnetising + of_rotor)
+        by_rotor = slip / (self.R_r + 1j * slip * self.X_r)
+        return self.R_s + 1j * omega * self.X_s + omega / (1 / (1j * self.X_m) + by_rotor)
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
         draws = (1.0 / self.impedance(np.linspace(-1.0, 1.0, 20_001))).real
