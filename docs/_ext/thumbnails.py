@@ -1,4 +1,4 @@
-"""Sphinx extension: the gallery shows the first figure of each of its pages."""
+"""Sphinx extension: the gallery, a section of a page, shows the first figure of each program."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Any
 
 from docutils import nodes
 
-_GALLERY = "gallery"
+_PAGE, _SECTION = "notebook", "gallery"
 
 
 def _show(app: Any, doctree: nodes.document, docname: str) -> None:
-    if docname != _GALLERY:
+    if docname != _PAGE:
         return
     grid = nodes.container(classes=["thumbnails"])
-    for page in app.env.toctree_includes[_GALLERY]:
+    for page in app.env.toctree_includes[_PAGE]:
         title = app.env.titles[page].astext()
         card = nodes.reference("", "", refuri=app.builder.get_relative_uri(docname, page))
         images = (image["uri"] for image in app.env.get_doctree(page).findall(nodes.image))
@@ -22,7 +22,7 @@ def _show(app: Any, doctree: nodes.document, docname: str) -> None:
             card += nodes.image(uri=picture, candidates={"*": picture}, alt=title)
         card += nodes.inline("", title)
         grid += nodes.paragraph("", "", card)
-    next(doctree.findall(nodes.section)).append(grid)
+    next(s for s in doctree.findall(nodes.section) if _SECTION in s["ids"]).append(grid)
 
 
 def setup(app: Any) -> dict[str, Any]:
