@@ -39,79 +39,54 @@ def test_a_run_without_misses_has_no_causes():
     assert counts(attribute(good(), T).causes) == dict.fromkeys(CAUSES, 0)
 
 
-def test_late_wake_up():
+PLANT = ("plant_woke", "plant_measured", "plant_sent")
+CONTROLLER = ("controller_received", "controller_computed", "controller_sent")
+ONE, FIFTH = slice(7, 8), slice(None, None, 5)  # every fifth tick: not an outlier
+
+
+@pytest.mark.parametrize(
+    ("late", "ns", "ticks", "events", "cause"),
+    [
+        pytest.param((*PLANT, *CONTROLLER), 90_000, ONE, (), "late wake-up", id="woken late"),
+        pytest.param(("plant_stall",), 85_000, ONE, (), "stalled host", id="plant stood still"),
+        pytest.param(("controller_stall", *CONTROLLER), 85_000, ONE, (), "stalled host",
+                     id="controller stood still"),
+        pytest.param(CONTROLLER[1:], 95_000, FIFTH, (), "own work", id="too much work"),
+        pytest.param(CONTROLLER[1:], 95_000, ONE, (), "stalled host", id="work interrupted"),
+        pytest.param(PLANT, 90_000, ONE, (7,), "own work", id="event on the tick"),
+        # a write to a pseudo terminal may take longer than a tick: it is no work of ours
+        pytest.param(("plant_sent",), 95_000, FIFTH, (), "link", id="plant's send"),
+        pytest.param(("controller_sent",), 95_000, FIFTH, (), "link", id="controller's send"),
+    ],
+)  # fmt: skip
+def test_a_late_tick_has_one_cause(late, ns, ticks, events, cause):
     timing = good()
-    timing["plant_woke"][7] += 90_000
-    timing["plant_sent"][7] += 90_000
-    timing["plant_measured"][7] += 90_000
-    timing["controller_received"][7] += 90_000
-    timing["controller_sent"][7] += 90_000
-    timing["controller_computed"][7] += 90_000
-    timing["plant_received"][7] = -1
-    assert found(timing) == ["late wake-up"]
+    for name in late:
+        timing[name][ticks] += ns
+    timing["plant_received"][ticks] = -1
+    assert found(timing, *events) == [cause] * len(range(TICKS)[ticks])
 
 
 def test_frame_that_never_came_is_the_links():
     timing = good()
-    for name in ("controller_received", "controller_computed", "controller_sent", "plant_received"):
+    for name in (*CONTROLLER, "plant_received"):
         timing[name][7] = -1
     assert found(timing) == ["link"]
 
 
-@pytest.mark.parametrize("role", ["plant", "controller"])
-def test_role_that_stood_still_while_it_looked(role):
-    timing = good()
-    timing[f"{role}_stall"][7] = 85_000
-    if role == "controller":
-        timing["controller_received"][7] += 85_000
-        timing["controller_sent"][7] += 85_000
-        timing["controller_computed"][7] += 85_000
-    timing["plant_received"][7] = -1
-    assert found(timing) == ["stalled host"]
-
-
-def test_work_that_is_too_long_for_the_tick():
-    timing = good()
-    timing["controller_sent"][::5] += 95_000  # every fifth tick: not an outlier
-    timing["controller_computed"][::5] += 95_000  # every fifth tick: not an outlier
-    timing["plant_received"][::5] = -1
-    assert found(timing) == ["own work"] * (TICKS // 5)
-
-
-@pytest.mark.parametrize("sent", ["plant_sent", "controller_sent"])
-def test_a_call_that_sends_for_too_long_is_the_links(sent):
-    """A write to a pseudo terminal may take longer than a tick: it is no work of ours."""
-    timing = good()
-    timing[sent][::5] += 95_000
-    timing["plant_received"][::5] = -1
-    assert found(timing) == ["link"] * (TICKS // 5)
-
-
-def test_work_that_was_interrupted_is_a_stall():
-    timing = good()
-    timing["controller_sent"][7] += 95_000
-    timing["controller_computed"][7] += 95_000
-    timing["plant_received"][7] = -1
-    assert found(timing) == ["stalled host"]
-
-
-def test_event_on_the_tick_is_own_work():
-    timing = good()
-    timing["plant_woke"][7] += 90_000
-    timing["plant_sent"][7] += 90_000
-    timing["plant_measured"][7] += 90_000
-    timing["plant_received"][7] = -1
-    assert found(timing, 7) == ["own work"]
+def catches_up(timing: dict[str, np.ndarray], ticks: range, back: int) -> None:
+    """The controller is back, and processes the frames of these ticks, 900 ns each."""
+    for k in ticks:
+        timing["controller_received"][k] = back + 900 * (k - ticks[0])
+        timing["controller_computed"][k] = timing["controller_received"][k] + 500
+        timing["controller_sent"][k] = timing["controller_received"][k] + 800
 
 
 def test_ticks_that_follow_have_the_cause_of_the_first():
     """The controller stalls for three ticks, then processes the queued frames."""
     timing = good()
     back = timing["plant_scheduled"][7] + 3 * T + 20_000
-    for k in (7, 8, 9, 10):
-        timing["controller_received"][k] = back + 900 * (k - 7)
-        timing["controller_sent"][k] = back + 900 * (k - 7) + 800
-        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
+    catches_up(timing, range(7, 11), back)
     timing["controller_stall"][7] = 3 * T
     timing["plant_received"][[7, 8, 9]] = -1
     assert found(timing) == ["stalled host"] * 3
@@ -121,12 +96,9 @@ def test_frames_lost_while_the_controller_stood_still_are_not_the_links():
     """It stalled for six ticks; the ring had room for two of the frames sent meanwhile."""
     timing = good()
     back = timing["plant_scheduled"][12] + 95_000
-    for k, late in ((7, 0), (8, 900)):
-        timing["controller_received"][k] = back + late
-        timing["controller_sent"][k] = back + late + 800
-        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
+    catches_up(timing, range(7, 9), back)
     timing["controller_stall"][7] = back - timing["plant_scheduled"][6] - 20_000
-    for name in ("controller_received", "controller_computed", "controller_sent"):
+    for name in CONTROLLER:
         timing[name][9:13] = -1
     timing["controller_stall"][9:13] = -1
     timing["plant_received"][7:13] = -1
@@ -137,10 +109,7 @@ def test_answer_that_was_held_up_with_its_sender_is_not_the_links():
     """The controller stalls after its send of u, before the link's own thread has sent it."""
     timing = good()
     back = timing["plant_scheduled"][9] + 80_000
-    for k in (8, 9):
-        timing["controller_received"][k] = back + 900 * (k - 8)
-        timing["controller_sent"][k] = back + 900 * (k - 8) + 800
-        timing["controller_computed"][k] = timing["controller_sent"][k] - 300
+    catches_up(timing, range(8, 10), back)
     timing["controller_stall"][8] = back - timing["controller_sent"][7]
     timing["plant_received"][[7, 8]] = -1
     assert found(timing) == ["stalled host"] * 2
