@@ -130,9 +130,10 @@ def golden(modules: Sequence[Module], ticks: int) -> Golden:
         if counts:
             op, ys = _adc(op, seed, module.record)
         op[0] = SWITCH if k and now[2] == OK else INIT
-        for nth, at in enumerate(range(SEGMENT // 3, ticks, SEGMENT) if module.tuning else ()):
+        sets = len(module.sets())
+        for nth, at in enumerate(range(SEGMENT // 3, ticks, SEGMENT) if sets else ()):
             if op[at] == STEP:
-                op[at] = TUNE + nth % len(module.sets())
+                op[at] = TUNE + nth % sets
         n_u = len(carried("u", COUNTS if counts else stages))
         result, u = np.zeros(ticks, np.int64), np.zeros((ticks, n_u), real)
         bump = np.zeros(ticks, real)
