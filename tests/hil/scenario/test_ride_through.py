@@ -68,7 +68,7 @@ def test_no_clearing_on_the_line_stops_the_law():
         references = {"P_ref": chance.uniform(-0.8, 0.8)}
         for clearing, stops in ended.items():
             after = {**event, "clearing": clearing}
-            found = run(after, 1.0, plant=plant, references=references)
+            found = run(after, 0.3, plant=plant, references=references)
             since = found.signals["t"][-1] - 0.2 - lasts
             if found.status != "completed" and 0.0 <= since < 0.03:
                 stops.append((after, found.summary["reason"]))

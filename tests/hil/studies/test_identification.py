@@ -32,7 +32,7 @@ REAL = {
 @pytest.fixture(scope="module")
 def measured() -> gfmhil.FrequencyScan:
     law = gfmhil.Law.load("droop-2")
-    return gfmhil.scan(law, "pref_step", start_hz=100, stop_hz=1000, points=7)
+    return gfmhil.scan(law, "pref_step", start_hz=100, stop_hz=1000, points=7, settle_s=0.2)
 
 
 def test_agrees_with_the_linear_model(measured):
@@ -56,7 +56,7 @@ def test_stage_delay_sensors_and_frequency(more):
     scenario = gfmhil.load_scenario({**REAL, "plant": {**REAL["plant"], **more}})
     found = gfmhil.scan(
         "droop-5", scenario, inner="virtual-stator",
-        start_hz=100, stop_hz=900, points=6, settle_s=1.0,
+        start_hz=100, stop_hz=900, points=6, settle_s=0.2,
     )  # fmt: skip
     assert found.deviation is not None and found.deviation.max() < 0.01
 
@@ -73,11 +73,12 @@ def test_one_percent_from_1_hz_to_1_khz(law, inner):
     assert found.nfp == pytest.approx(found.nfp_model, rel=0.01)
 
 
-def switched(law, bridge, **how):
+def switched(law, bridge, settle_s=2.0, **how):
     """A scan with a bridge of 10 kHz and 10,000 counts, one sample of delay and real sensors."""
     plant = {**REAL["plant"], "delay": {"samples": 1}, "dc_source": {"mode": "regulated"}}
     plant |= {"bridge": {"kind": "two-level", **bridge}, "grid": {}}
-    return gfmhil.scan(law, gfmhil.load_scenario("pref_step", plant=plant), settle_s=2.0, **how)
+    scenario = gfmhil.load_scenario("pref_step", plant=plant)
+    return gfmhil.scan(law, scenario, settle_s=settle_s, **how)
 
 
 @pytest.mark.full  # two scans of a switched bridge
@@ -93,7 +94,7 @@ def test_a_switched_bridge_has_the_admittance_of_its_average():
 
 def test_dead_time_changes_the_admittance_as_its_describing_function_says():
     """From 60 Hz on it is off by more, but without it all is wrong. VSG-2 has an unstable swing."""
-    how = {"start_hz": 5, "stop_hz": 40, "points": 5}
+    how = {"start_hz": 5, "stop_hz": 40, "points": 5, "settle_s": 1.0}
     with_it = switched("mimo-gfm", {"dead_time_s": 2e-6}, **how)
     without = switched("mimo-gfm", {}, **how)
     assert with_it.deviation is not None and with_it.deviation.max() < 0.17
