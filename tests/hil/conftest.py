@@ -52,10 +52,22 @@ def run(make: Make, tmp_path: Path) -> RunIt:
     return call
 
 
+@pytest.fixture(scope="session", autouse=True)
+def draw_run() -> Iterator[Callable[..., Any]]:
+    """Reports are without the figures of a run, which take most of their time, see ``drawn``; this
+    is what draws them."""
+    from gfm_hil.results import figures
+
+    with pytest.MonkeyPatch.context() as patch:
+        draw = figures.draw_run
+        patch.setattr(figures, "draw_run", lambda *_: nullcontext())
+        yield draw
+
+
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without the figures of a run, which take most of their time."""
-    monkeypatch.setattr("gfm_hil.results.figures.draw_run", lambda *_: nullcontext())
+def drawn(draw_run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have the figures of a run, for tests that look at them."""
+    monkeypatch.setattr("gfm_hil.results.figures.draw_run", draw_run)
 
 
 @contextmanager

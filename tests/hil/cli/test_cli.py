@@ -1,5 +1,6 @@
 """The command line: what each command prints, writes and returns."""
 
+import io
 import json
 import os
 import re
@@ -185,7 +186,7 @@ def test_run_prints_summary_json_and_nothing_else(call):
     assert (found["link"], found["mode"], found["misses"]) == ("inproc", "lockstep", 0)
 
 
-def test_run_leaves_a_report_that_needs_nothing_else(call):
+def test_run_leaves_a_report_that_needs_nothing_else(call, drawn):
     call("run", scenario(**STEP, description="<b>bold</b>"), "--out", "run")
     report = Path("run/report.html").read_text()
     assert Path("run/signals.png").stat().st_size > 30_000
@@ -209,7 +210,7 @@ def test_run_ends_with_a_table_that_fits_the_terminal(call):
     assert out.rstrip().endswith("run folder: run")
 
 
-def test_without_figures_there_are_none(call):
+def test_without_figures_there_are_none(call, drawn):
     call("run", scenario(), "--out", "run", "--no-figures")
     assert not list(Path("run").glob("*.png")) + list(Path("run").glob("*.html"))
 
@@ -277,7 +278,7 @@ def test_compare_draws_the_laws_side_by_side(call):
         assert summary == json.loads(Path(f"both/{law}/summary.json").read_text())
 
 
-def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_json(call, undrawn):
+def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_json(call):
     content = {"link": {"type": "zmq"}, "mode": "realtime", "duration": 0.02}
     content["compare"] = ["vsg-2", "vsg-5"]
     code, out, _ = call("compare", scenario(**content), "--json", "--out", "x")
@@ -286,7 +287,7 @@ def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_
     assert found == dict.fromkeys(content["compare"], ("inproc", "lockstep"))
 
 
-def test_compare_lays_a_recording_beside_the_runs(call, tmp_path):
+def test_compare_lays_a_recording_beside_the_runs(call):
     content = {**STEP, "compare": ["vsg-2"]}
     made = gfmhil.run(scenario(**content), "vsg-2")
     names = {"p": "p", "q": "q", "V": "V"}
@@ -317,7 +318,7 @@ def test_names_of_laws_are_whole_in_a_terminal_and_in_a_pipe(call, monkeypatch):
     assert [row.split()[0] for row in rows] == listed  # no row is wrapped
 
 
-def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call, undrawn):
+def test_compare_returns_the_worst_of_its_runs_and_shows_every_event(call):
     content = {
         "events": [*TRIP["events"], {"t": 0.2, "type": "reference", "P_ref": 0.6}],
         "plant": {"protection": {"over_current": {"threshold": 1.5, "delay_s": 0.0}}},
@@ -379,12 +380,17 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 
 
 @pytest.mark.parametrize("arguments", [["laws", "--json"], ["scenarios"]])
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_disk_that_is_full_is_told_in_one_line(arguments, unbuffered):
-    with Path("/dev/full").open("w") as full:
+def test_a_disk_that_is_full_is_told_in_one_line(arguments, refused, monkeypatch):
+    """Where each line is written at once, and where the program's end writes all."""
+    full = Path("/dev/full")
+    with full.open("wb", buffering=0) as raw, monkeypatch.context() as patch:
+        patch.setattr("sys.stdout", io.TextIOWrapper(raw, write_through=True))
+        assert refused(*arguments) == "gfmhil: No space left on device\n"
+        raw.close()  # what is left in it cannot be written
+    with full.open("w") as disk:
         done = subprocess.run(
-            [sys.executable, "-m", "gfm_hil", *arguments], stdout=full, stderr=subprocess.PIPE,
-            text=True, env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            [sys.executable, "-m", "gfm_hil", *arguments], stdout=disk, stderr=subprocess.PIPE,
+            text=True, env={**os.environ, "PYTHONUNBUFFERED": ""},
         )  # fmt: skip
     assert (done.returncode, done.stderr) == (2, "gfmhil: No space left on device\n")
 
@@ -403,7 +409,7 @@ def own_law(folder: Path, name: str, **gains: float) -> Path:
     return gfmhil.Law.load("vsg-2").with_gains(name, **gains).save(path)
 
 
-def test_results_call_a_law_by_its_name_and_never_by_its_path(tmp_path, capsys, undrawn):
+def test_results_call_a_law_by_its_name_and_never_by_its_path(tmp_path, capsys):
     own = str(own_law(tmp_path, "mine", D_p=0.011))
     content = {
         "title": "own", "duration": 0.03, "law": own, "link": {"type": "inproc"},
@@ -439,7 +445,7 @@ def test_laws_of_one_name_are_told_apart(tmp_path):
     assert [*titles.values()] == ["vsg-2 (file.toml)", "vsg-2", "vsg-2 (file.toml, 2)", "mine"]
 
 
-def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys, undrawn):
+def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     """By run, compare and laws show; of a stable one they say nothing."""
     own = str(own_law(tmp_path, "mine", k_34=50.0))
     mode = r"[\d.]+ Hz, \+[\d.e+]+ 1/s"

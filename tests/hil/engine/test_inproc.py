@@ -281,7 +281,7 @@ def test_the_same_seed_gives_the_same_noise_and_another_another(run):
     assert (one != other).mean() > 0.9
 
 
-def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path):
+def test_the_folder_of_a_run_holds_what_the_design_says(make, tmp_path, drawn):
     scenario = make(events=[at(0.05, type="reference", P_ref=0.6)])
     run_scenario(scenario, tmp_path / "run", report=write_report)
     assert {path.name for path in (tmp_path / "run").iterdir()} == {

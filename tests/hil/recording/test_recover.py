@@ -88,7 +88,9 @@ def left(make, tmp_path):
     "7.1", "kill -9 of a whole run, then its folder is opened", "“the run is not over”, for ever"
 )
 @pytest.mark.parametrize(("link", "mode"), [("shm", "realtime"), ("zmq", "lockstep")])
-def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsys, attack_now):
+def test_a_run_killed_as_a_whole_is_recovered(
+    link, mode, start, tmp_path, capsys, drawn, attack_now
+):
     folder = tmp_path / "run"
     scenario = write(
         tmp_path, mode=mode, law="vsg-2", duration=60.0, link={"type": link},
@@ -125,7 +127,7 @@ def test_a_run_killed_as_a_whole_is_recovered(link, mode, start, tmp_path, capsy
     "7.2", "kill -9 while the folder is put together, before any change of a name",
     "BadZipFile or EOFError at the next np.load",
 )  # fmt: skip
-def test_a_kill_between_any_two_files_is_recovered(left, tmp_path, undrawn, attack_now):
+def test_a_kill_between_any_two_files_is_recovered(left, tmp_path, attack_now):
     scenario, folder, *rest = left
     whole, count = tmp_path / "whole", 0
     shutil.copytree(folder, whole)
@@ -174,7 +176,7 @@ def finish_killed_at(number: int, scenario, folder: Path, rest) -> bool:
     return os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
-def test_a_run_in_process_that_was_killed_is_recovered(start, tmp_path):
+def test_a_run_in_process_that_was_killed_is_recovered(start, tmp_path, drawn):
     folder = tmp_path / "run"
     scenario = write(tmp_path, duration=60.0, link={"type": "inproc"}, mode="lockstep")
     process = start("run", scenario, "--out", str(folder))
@@ -229,10 +231,10 @@ def test_no_room_for_a_file_leaves_what_recover_needs(
     name, left, monkeypatch, capsys, request, attack_now
 ):
     scenario, folder, laws, wall_s, _, outside = left
-    expected = DRAWN
-    if name not in FIGURES:
-        request.getfixturevalue("undrawn")
-        expected = DRAWN - FIGURES
+    expected = DRAWN - FIGURES
+    if name in FIGURES:
+        request.getfixturevalue("drawn")
+        expected = DRAWN
     replace = Path.replace
 
     def full(self, target):
@@ -279,7 +281,7 @@ def fill(place: Path) -> Path:
 @pytest.mark.attack(
     "7.4", "the disk fills up during a run (a real file system of 8 MiB)", "OSError and a traceback"
 )
-def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, attack_now):
+def test_a_disk_that_fills_up_ends_the_run_in_order(small_disk, make, drawn, attack_now):
     events = [{"type": "reference", "tick": 10 * k, "P_ref": 0.5} for k in range(1, 250)]
     folder = small_disk / "run"
     filled: list[Path] = []
@@ -342,7 +344,7 @@ def test_a_disk_without_room_is_said_before_the_run(small_disk, make):
 @pytest.mark.full
 @pytest.mark.timeout(600)
 @pytest.mark.attack("7.5", "8,000 events in a run", "more than 8 minutes, nearly all of it drawing")
-def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, attack_now):
+def test_8000_events_are_summarised_in_one_pass(make, tmp_path, monkeypatch, drawn, attack_now):
     ticks, labels, read = 24_000, [], 0
     annotate = "matplotlib.axes.Axes.annotate"
     monkeypatch.setattr(annotate, lambda self, text, *_, **__: labels.append(text))
@@ -392,7 +394,7 @@ def test_metrics_do_not_depend_on_how_much_is_read_at_a_time(piece, run, monkeyp
         assert found[name] == (value if value is None else pytest.approx(value, rel=1e-12)), name
 
 
-def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
+def test_finishing_takes_the_memory_of_pieces(make, tmp_path, drawn):
     """A run of 24 s, whose columns take 63 MB."""
     scenario = make(duration=24.0)
     # imports and compiles, which take more
@@ -413,7 +415,7 @@ def test_finishing_takes_the_memory_of_pieces(make, tmp_path):
 @pytest.mark.attack(
     "7.6", "a recording of 5·10⁶ ticks, with times, is put together", "2.6 GB of memory"
 )
-def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, attack_now):
+def test_the_memory_of_recover_does_not_grow_with_the_run(make, tmp_path, drawn, attack_now):
     ticks = 2_000_000  # 0.6 GB
     scenario = make(duration=ticks * 1e-4, mode="realtime", link={"type": "shm"})
     folder = tmp_path / "run"

@@ -297,7 +297,7 @@ def test_the_figure_shows_the_cycles_around_the_first_event(run):
     assert draw_waveforms(Figure(), one.scenario, one.columns, one.summary, (0.5, 0.6)) == []
 
 
-def test_the_window_of_the_report_is_that_of_the_scenario(make, tmp_path):
+def test_the_window_of_the_report_is_that_of_the_scenario(make, tmp_path, drawn):
     file = tmp_path / "scenario.toml"
     file.write_text('title = "t"\nduration = 0.05\nlink.type = "inproc"\n', encoding="utf-8")
     folder = tmp_path / "run"

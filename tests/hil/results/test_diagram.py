@@ -156,7 +156,7 @@ def test_every_shipped_scenario_is_drawn_within_its_picture(name, fill):
         assert box.x0 >= 0 and box.x1 <= 1 and box.y0 >= 0 and box.y1 <= 1, text.get_text()
 
 
-def test_the_report_shows_it(make, tmp_path, undrawn):
+def test_the_report_shows_it(make, tmp_path):
     one = gfmhil.run(make(events=[FAULT]), folder=tmp_path / "run")
     report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert "fault, 0.02 s" in report and 'href="#of-' not in report

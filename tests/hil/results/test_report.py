@@ -53,7 +53,7 @@ def test_it_says_which_operator_did_what(tmp_path):
 def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of three converters in a mesh, a line that opens and a fault, at 10 kHz."""
     folder = tmp_path_factory.mktemp("report") / "run"
-    gfmhil.run_network("dynawo_three_converters", folder, duration=2.5, T_s=1e-4)
+    gfmhil.run_network("dynawo_three_converters", folder, duration=1.7, T_s=1e-4)
     return folder / "report.html"
 
 

@@ -83,9 +83,7 @@ def test_the_shipped_experiment_ends_as_it_expects(tmp_path):
         ({"expect": "safe"}, "expect = 'safe'"),
     ],
 )
-def test_terminal_summary_report_and_exit_code_agree(
-    expected, part, make, tmp_path, capsys, undrawn
-):
+def test_terminal_summary_report_and_exit_code_agree(expected, part, make, tmp_path, capsys):
     (tmp_path / "trip.toml").write_text(scenario_toml(make(**{**TRIP, **expected})))
     folder = tmp_path / "run"
     code = main(["run", str(tmp_path / "trip.toml"), "--out", str(folder), "--quiet"])

@@ -733,7 +733,7 @@ def test_exit_code_tells_failed_from_not_judged_and_every_clause_that_fails_is_p
 def test_several_laws_give_a_matrix(lab):
     laws = ["droop-3", gfmhil.Law.load("vsg-2").with_gains("stiff", D_p=0.05)]
     (lab / "strict.toml").write_text(STRICT)
-    found = gfmhil.conform(laws, lab, lab.parent / "out")
+    found = gfmhil.conform(laws, lab, lab.parent / "out", figures=False)
     tests = ("lab/jump", "lab/strict")
     assert found.matrix == {
         (law, test): verdict
@@ -1097,7 +1097,7 @@ def test_the_gate_fails_a_test_with_each_part_and_the_report(lab):
     (lab / "strict.toml").write_text(STRICT)
     folders = iter([lab.parent / "first", lab.parent / "second"])
     conform = gate(lab.parent, lambda: next(folders))
-    assert conform("droop-3", against="lab/jump.toml").passed
+    assert conform("droop-3", against="lab/jump.toml", figures=False).passed
     with pytest.raises(
         AssertionError, match="droop-3, lab/strict: fail: The one-cycle mean"
     ) as why:
@@ -1196,7 +1196,7 @@ def test_a_law_of_another_name_and_a_test_that_is_gone(tmp_path, capsys):
 def test_a_report_as_the_command_writes_it_is_read_again(lab, capsys):
     (lab / "none.toml").write_text(LAB + NONE)
     for law, name in (("droop-3", "old"), ("vsg-2", "new")):
-        gfmhil.conform(law, lab, lab.parent / name)
+        gfmhil.conform(law, lab, lab.parent / name, figures=False)
     assert main(["conform", "diff", str(lab.parent / "old"), str(lab.parent / "new")]) == 0
     assert "droop-3 and is vsg-2" in capsys.readouterr().out
     (lab.parent / "old" / "results.json").write_text("[]")
