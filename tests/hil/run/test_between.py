@@ -168,6 +168,7 @@ def test_ripple_of_a_triangle_is_its_height():
 def test_the_command_prints_writes_and_refuses(tmp_path, capsys, refused):
     run(duration=0.25).save(tmp_path / "run")
     words = ["waveforms", str(tmp_path / "run"), "0.05:0.25", "--data-sheet", str(SHEET), "--json"]
+    words += ["--step", "5e-6"]
     files = [tmp_path / f"out{ending}" for ending in (".png", ".csv", ".npz")]
     assert main([*words, *(word for file in files for word in ("-o", str(file)))]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -183,10 +184,10 @@ def test_the_command_prints_writes_and_refuses(tmp_path, capsys, refused):
     assert "step = 1: must lie in [1e-08, 0.0001] s" in refused(
         "waveforms", folder, "0.06:0.1", "--step", "1"
     )
-    assert "must end in one of .png" in refused("waveforms", folder, "0.06:0.1", "-o", "x.txt")
+    assert "must end in one of .png" in refused("waveforms", folder, "0.06:0.08", "-o", "x.txt")
     bad = tmp_path / "bad.toml"
     bad.write_text(SHEET.read_text(encoding="utf-8").replace("E_on = 2.0e-3", "E_on = -1.0"))
-    said = refused("waveforms", folder, "0.05:0.25", "--data-sheet", str(bad))
+    said = refused("waveforms", folder, "0.06:0.08", "--data-sheet", str(bad))
     assert "E_on" in said and "greater than or equal to 0" in said
     gfmhil.run("pref_step", duration=0.1, events=[]).save(tmp_path / "average")
     assert "kind = 'average': has nothing between" in refused(
