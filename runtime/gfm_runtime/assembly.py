@@ -198,7 +198,7 @@ class Controller:
         k = int(self.ctl["active"][0])
         self.states[k] = np.zeros((), self.states.dtype)
         self.states["x"][k, : len(x_law)] = x_law
-        self.states["u"][k] = u
+        self.states["u"][k], self.states["ref"][k] = u, self.ctl["ref"][0]
         self.ctl["u"] = u
         if y is not None and e is not None:
             settle(self.laws[k : k + 1], self.states[k : k + 1], np.asarray(u), y, e.real, e.imag)

@@ -118,6 +118,13 @@ class BuiltLaw:
                     if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
                         raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
                     _check(cell_name(matrix, cell), element)
+                with mistakes.noting():
+                    if self.inner is not None and cell[0] not in self.inner.rows:
+                        raise LawError(
+                            cell_name(matrix, cell),
+                            f"acts on {U_NAMES[cell[0]]}, which the inner stage {self.inner.kind}"
+                            " gives itself; leave the cell out, or take another stage",
+                        )
         for name, value in zip(U_NAMES, self.u_0, strict=True):
             with mistakes.noting():
                 if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):

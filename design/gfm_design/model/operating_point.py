@@ -24,6 +24,7 @@ from gfm_plant.records import Record
 from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.inner import GridFollowing
 from gfm_runtime.tustin import DiscreteLaw
 
 Vector = NDArray[np.float64]
@@ -331,9 +332,17 @@ class _ConverterEquilibrium:
         dx = compiled_f(x, u, np.array([omega_g, V_g]), self.par)
         dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = dx[self._steady]
-        u[2] = abs(_internal(law, x, u, self._command(x, u), limited=False))
+        e = self._command(x, u)
+        if isinstance(inner := law.law.inner, GridFollowing):
+            i, v = complex(x[0], x[1]), complex(x[2], x[3])
+            wanted = inner.wanted(ref[1], ref[3], abs(v), omega_g) * v / abs(v)
+            miss = wanted - inner.reference(i, v, e, omega_g)
+            rest = [miss.real, miss.imag]
+        else:
+            E = _internal(law, x, u, e, limited=False)
+            rest = [u_law[1] - omega_g, u_law[2] - abs(E)]
         change = (x_next - x_law)[self.kept] / law.T_s
-        return np.concatenate([ac, [dc, u_law[1] - omega_g, u_law[2] - u[2]], change])
+        return np.concatenate([ac, [dc, *rest], change])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
         """The operating point at the unknowns z."""

@@ -1,4 +1,5 @@
 from .dual_sequence import DualSequence
+from .grid_following import GridFollowing
 from .kinds import (
     INNER_CONSTANTS,
     INNER_NUMBERS,
@@ -41,6 +42,7 @@ __all__ = [
     "STIFF",
     "Cascaded",
     "DualSequence",
+    "GridFollowing",
     "Inner",
     "InnerStage",
     "PowerLimiter",

@@ -16,6 +16,11 @@ from pydantic import Field
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
+from gfm_runtime.inner.grid_following import (
+    GridFollowing,
+    grid_following,
+    settle_following,
+)
 from gfm_runtime.inner.stage import (
     I_D,
     I_OD,
@@ -47,7 +52,7 @@ from gfm_runtime.inner.voltage_loop import (
 from gfm_runtime.signals import NU
 
 Inner = Annotated[
-    VirtualStator | Cascaded | ThresholdImpedance | DualSequence | StiffSource,
+    VirtualStator | Cascaded | ThresholdImpedance | DualSequence | StiffSource | GridFollowing,
     Field(discriminator="type"),
 ]
 
@@ -56,7 +61,7 @@ STAGES: dict[str, type[InnerStage]] = {
 }
 KINDS = {name: code for code, name in enumerate(("none", *STAGES))}
 NONE, STATOR, DUAL = KINDS["none"], KINDS["virtual-stator"], KINDS["dual-sequence"]
-STIFF = KINDS["stiff-source"]
+STIFF, FOLLOWING = KINDS["stiff-source"], KINDS["grid-following"]
 
 #: integers of the stage in ``law_dtype``: places in ``KINDS`` and ``PRIORITIES``, and yes or no
 INNER_NUMBERS = [("inner", "i8"), ("priority", "i8"), ("freeze", "i8")]
@@ -117,6 +122,8 @@ def shape(law, state):
             dual_sequence(law, state, E_d, E_q)
         elif law.inner == STIFF:
             stiff_source(law, state)
+        elif law.inner == FOLLOWING:
+            grid_following(law, state)
         else:
             voltage_loop(law, state, E_d, E_q)
         if law.inner != DUAL and law.inner != STIFF:
@@ -168,7 +175,7 @@ def settle_inner(law, state, e_d, e_q):
         state.x_v[0], state.x_v[1] = through_d, through_q
         state.i_p[0], state.i_p[1] = through_d, through_q
         state.drop[0] = state.drop[1] = 0
-        if law.inner != STATOR and law.inner != DUAL:
+        if law.inner != STATOR and law.inner != DUAL and law.inner != FOLLOWING:
             through_d, through_q = settle_voltage_loop(law, state)
         X = state.omega * law.X_v
         need_d = m[V_D] + law.R_v * through_d - X * through_q + state.drop[0]
@@ -176,7 +183,10 @@ def settle_inner(law, state, e_d, e_q):
     E = state.now[2]
     if law.inner == STIFF:
         E = held_voltage(law, state)
-    state.away[0], state.away[1] = need_d - E, need_q
+    if law.inner == FOLLOWING:
+        settle_following(law, state)
+    else:
+        state.away[0], state.away[1] = need_d - E, need_q
     state.E_p[0], state.E_p[1] = need_d, need_q
 
 

@@ -11,7 +11,7 @@ limit.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -54,7 +54,7 @@ INNER_STATE = (
     ("E_p", 2, "positive sequence of E"),
     ("E_n", 2, "negative sequence of E"),
     ("slow", 2, "low-pass filtered P and Q of a stiff source"),
-    ("level", 2, "low-pass filtered V and I_d of a stiff source"),
+    ("level", 2, "low-pass filtered V, and I_d of a stiff source"),
     ("x_Q", 2, "integrals of the limits of Q"),
     ("window", 2, "largest and least angle of E against the PLL, rad"),
 )
@@ -78,6 +78,9 @@ class PowerLimiter(TomlTable):
 
 class InnerStage(TomlTable):
     """Base of the inner stages; in a law file a number may be an expression."""
+
+    rows: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    """Rows of Phi that act, zero-based."""
 
     m: Positive = Field(PAPER_M, description="limit of abs(e) over v_dc, p.u.")
     freeze: bool = Field(
@@ -159,9 +162,13 @@ class InnerStage(TomlTable):
         Raises:
             LawError: the limit does not let the stage rest there.
         """
-        i_ref = i if self.k_ci > 0.0 else i + (e - v - 1j * omega * self.L_f * i) / self.k_c
+        i_ref = self.reference(i, v, e, omega)
         self.check_current(abs(i_ref))
         return v + self.voltage_drop(i, i_o, i_ref, omega)
+
+    def reference(self, i: complex, v: complex, e: complex, omega: float) -> complex:
+        """The i* with which the current loop rests; arguments as of ``internal_voltage``."""
+        return i if self.k_ci > 0.0 else i + (e - v - 1j * omega * self.L_f * i) / self.k_c
 
     def check_current(self, size: float) -> None:
         """Raise LawError if a steady current of this size, p.u., is beyond the limit."""
@@ -251,26 +258,37 @@ def limit_power(law, state, p):
 
 
 @inlined
+def passes_limit(law, state):
+    """Whether i* is longer than I_max."""
+    d, q = state.i_ref[0], state.i_ref[1]
+    return d * d + q * q > law.I_max * law.I_max
+
+
+@inlined
+def keep_q(law, state):
+    """i* cut to I_max, with what i_q* leaves for i_d*."""
+    q = limited(state.i_ref[1], -law.I_max, law.I_max)
+    rest = math.sqrt(law.I_max * law.I_max - q * q)
+    state.i_ref[0], state.i_ref[1] = limited(state.i_ref[0], -rest, rest), q
+
+
+@inlined
 def limit_current(law, state):
     """i* cut to I_max, and whether that was needed."""
-    d, q = state.i_ref[0], state.i_ref[1]
-    size = d * d + q * q
-    most = law.I_max * law.I_max
-    state.limited = size > most
+    state.limited = passes_limit(law, state)
     if not state.limited:
         return
+    d, q = state.i_ref[0], state.i_ref[1]
     if law.priority == _ANGLE:
         state.i_ref[0], state.i_ref[1] = law.I_cos, law.I_sin
     elif law.priority == _D:
         d = limited(d, -law.I_max, law.I_max)
-        rest = math.sqrt(most - d * d)
+        rest = math.sqrt(law.I_max * law.I_max - d * d)
         state.i_ref[0], state.i_ref[1] = d, limited(q, -rest, rest)
     elif law.priority == _Q:
-        q = limited(q, -law.I_max, law.I_max)
-        rest = math.sqrt(most - q * q)
-        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
+        keep_q(law, state)
     else:
-        scale = law.I_max / math.sqrt(size)
+        scale = law.I_max / math.sqrt(d * d + q * q)
         state.i_ref[0], state.i_ref[1] = d * scale, q * scale
 
 

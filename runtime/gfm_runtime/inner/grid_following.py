@@ -1,0 +1,118 @@
+"""Grid-following: a current by set-points of P and Q in the frame of a PLL, and the current loop.
+
+With theta and omega the angle and frequency of the PLL, V the low-pass filtered abs(v), and y the
+references and measurements of the law's own columns, the current behind the filter's capacitor is
+
+    i* = (P*/V + j (omega C_f V - Q*/V - b)) e^(j theta),    P* = P_ref + k_f dead(1 - omega),
+    b = k_V dead(1 - V),
+
+where dead(x) is what x is beyond its dead band: a droop of the power by the frequency, and the
+reactive current that supports the voltage. While b is not 0, the reactive current has the first
+place within I_max. E_u and omega_u of the law do not act: it has row 1 only.
+
+Source: Yazdani and Iravani, "Voltage-Sourced Converters in Power Systems", chapter 8.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from gfm_runtime.compiled import inlined
+from gfm_runtime.inner.stage import InnerStage, keep_q, limit_current, limited, passes_limit
+from gfm_runtime.toml_file import NotNegative, Positive
+
+
+class GridFollowing(InnerStage):
+    """A current by set-points of P and Q in the frame of a PLL, a limit, and a current loop."""
+
+    rows: ClassVar = (0,)
+
+    type: Literal["grid-following"] = Field("grid-following", description="kind of stage")
+    f_pll: Positive = Field(10.0, description="bandwidth of the PLL, Hz")  # type: ignore[assignment]
+    freeze: Literal[False] = Field(False, description="no row of the law acts on the current")  # type: ignore[assignment]
+    k_ci: NotNegative = Field(20.0, description="current loop, 1/s")
+    C_f: NotNegative = Field(0.2268, description="the converter's filter capacitor, p.u.")
+    DwPLLmax: Positive = Field(0.2, description="limit of the PLL's deviation, p.u.")
+    T_V: Positive = Field(0.005, description="low-pass on abs(v), s")
+    V_least: Positive = Field(0.2, description="least V by which P and Q are divided, p.u.")
+    k_V: NotNegative = Field(
+        0.0, description="reactive current by the voltage beyond the dead band, p.u./p.u."
+    )
+    band_V: Positive = Field(0.1, description="dead band of V around 1 p.u.")
+    k_f: NotNegative = Field(
+        0.0, description="power by the frequency beyond the dead band, p.u./p.u."
+    )
+    band_f: NotNegative = Field(0.0, description="dead band of the frequency around 1 p.u.")
+
+    @model_validator(mode="after")
+    def _without_limiter(self) -> GridFollowing:
+        if self.power is not None:
+            raise ValueError("power: a power limiter moves omega_u, which is the PLL's here")
+        return self
+
+    def constants(self, T_s: float, omega_b: float) -> dict[str, float]:
+        own = ("C_f", "V_least", "k_V", "band_V", "k_f", "band_f")
+        return super().constants(T_s, omega_b) | {name: getattr(self, name) for name in own} | {
+            "follow_V": -math.expm1(-T_s / self.T_V),
+            "Dw_max": self.DwPLLmax,
+        }  # fmt: skip
+
+    def internal_voltage(
+        self, i: complex, v: complex, i_o: complex, e: complex, omega: float
+    ) -> complex:
+        self.check_current(abs(self.reference(i, v, e, omega)))
+        return v
+
+    def wanted(self, P_ref: float, Q_ref: float, V: float, omega: float) -> complex:
+        """i* in the PLL's frame before its limit, p.u., at rest at V and omega, p.u."""
+        P = P_ref + self.k_f * beyond.py_func(1.0 - omega, self.band_f)
+        of, b = max(V, self.V_least), self.k_V * beyond.py_func(1.0 - V, self.band_V)
+        return complex(P / of, omega * self.C_f * V - Q_ref / of - b)
+
+
+@inlined
+def beyond(x, band):
+    """What x is beyond a dead band around 0."""
+    return x - limited(x, -band, band)
+
+
+@inlined
+def ask_current(law, state):
+    """i* from P_ref and Q_ref, at the frequency, the voltage V and the angle that are measured."""
+    V = state.level[0]
+    of = max(V, law.V_least)
+    b = law.k_V * beyond(law.one - V, law.band_V)
+    power = state.ref[1] + law.k_f * beyond(law.one - state.omega, law.band_f)
+    state.i_ref[0] = power / of
+    state.i_ref[1] = state.omega * law.C_f * V - state.ref[3] / of - b
+    if b == 0:
+        limit_current(law, state)
+    else:
+        state.limited = passes_limit(law, state)
+        if state.limited:
+            keep_q(law, state)
+    d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
+    state.i_ref[0], state.i_ref[1] = cosine * d - sine * q, cosine * q + sine * d
+
+
+@inlined
+def grid_following(law, state):
+    """One tick, after that of the PLL: i*."""
+    omega = limited(state.omega_pll, law.one - law.Dw_max, law.one + law.Dw_max)
+    state.omega = state.omega_pll = omega
+    size = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
+    state.level[0] += law.follow_V * (size - state.level[0])
+    ask_current(law, state)
+    for k in range(2):
+        state.i_ref[k] += state.away[k]
+
+
+@inlined
+def settle_following(law, state):
+    """What i* lacks of the current that ``state.i_ref`` holds, into away."""
+    through_d, through_q = state.i_ref[0], state.i_ref[1]
+    ask_current(law, state)
+    state.away[0], state.away[1] = through_d - state.i_ref[0], through_q - state.i_ref[1]
