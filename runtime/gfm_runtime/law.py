@@ -123,7 +123,7 @@ class BuiltLaw:
                         raise LawError(
                             cell_name(matrix, cell),
                             f"acts on {U_NAMES[cell[0]]}, which the inner stage {self.inner.kind}"
-                            " gives itself; leave the cell out, or take another stage",
+                            " gives itself; a law for it has row 1 only",
                         )
         for name, value in zip(U_NAMES, self.u_0, strict=True):
             with mistakes.noting():

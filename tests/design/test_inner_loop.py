@@ -23,7 +23,7 @@ from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
 from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import Cascaded, InnerStage, PowerLimiter, ThresholdImpedance, VirtualStator
+from gfm_runtime.inner import Cascaded, GridFollowing, InnerStage, PowerLimiter, ThresholdImpedance, VirtualStator
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER
@@ -40,6 +40,8 @@ STAGES = {
     **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},
     "stator with integral and PLL": VirtualStator(k_ci=20.0, f_pll=15.0),
     "voltage loop without integral": Cascaded(k_vi=0.0, k_ci=10.0, f_pll=30.0),
+    "grid-following": GridFollowing(k_f=3.0),
+    "grid-following without integral": GridFollowing(k_ci=0.0),
 }
 
 
@@ -69,11 +71,11 @@ class Kernel:
     def places(self) -> list[tuple[str, int]]:
         """Where the states of ``LinearStage.states`` are kept; an angle has no place of its own."""
         short = {name: name for name in ("v_f", "x_v", "x_c", "i_p", "i_n", "E_p", "E_n")}
-        short["i*"] = "x_v"
+        short |= {"i*": "x_v", "V": "level"}
         assert self.loop.stage is not None
         names = [name.split()[0] for name in self.loop.stage.states]
         both = [name for name in names if name in short]
-        return [(short[name], k % 2) for k, name in enumerate(both)]
+        return [(short[name], both[:k].count(name)) for k, name in enumerate(both)]
 
     def __call__(self, x: np.ndarray, y: np.ndarray, ref: np.ndarray) -> np.ndarray:
         """(next states, out) of deviations of the states, of y (11,) and of the references (5,)."""
@@ -102,7 +104,7 @@ class Kernel:
 @pytest.mark.parametrize("stage", STAGES)
 def test_law_and_stage_are_the_compiled_kernels_slopes(stage, law):
     # differences of 1e-6 p.u. have an error of 1e-12 by curvature and of 1e-10 by rounding
-    loop = loop_of(STAGES[stage], law)
+    loop = loop_of(STAGES[stage], "grid-following" if stage.startswith("grid") else law)
     c, kernel, h = loop.controller, Kernel(loop), 1e-6
     m = len(c.A)
     A, B, B_r = (np.vstack(pair) for pair in ((c.A, c.C), (c.B, c.D), (c.B_r, c.D_r)))

@@ -99,7 +99,7 @@ def test_golden_rows_are_what_the_controller_does(name, real):
             bench.ctl["state"] = RUNNING
         state = bench.states[int(bench.ctl["active"][0])]
         if op == SPOIL:
-            state["offset"][1] = np.nan
+            state["offset"][0] = np.nan
         elif op == SPOIL_STAGE:
             state["away"][0] = np.nan
         bench.step(ys[k], u)

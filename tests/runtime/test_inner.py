@@ -2,18 +2,19 @@
 
 import cmath
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gfm_runtime import LawError, LawSet, get_law, load_law
+from gfm_runtime import LawError, LawSet, load_law
 from gfm_runtime.assembly import Controller
 from gfm_runtime.inner import PRIORITIES, STAGES, Cascaded, InnerStage, PowerLimiter, VirtualStator
 from gfm_runtime.inner_file import inner_names
 from gfm_runtime.signals import NU_INNER
+
+from ..support.laws import behind
 
 T_S, OMEGA_B = 1e-4, 100 * math.pi
 REF = [1.0, 0.5, 1.0, 0.0, 1.0]
@@ -22,7 +23,7 @@ REF = [1.0, 0.5, 1.0, 0.0, 1.0]
 def controller(*stages: InnerStage | None, law: str = "droop-1") -> Controller:
     """A droop law whose E_u is V_ref, once for each stage."""
     laws = [
-        LawSet(f"law {k}", (replace(get_law(law), inner=stage),)) for k, stage in enumerate(stages)
+        LawSet(f"law {k}", (behind(law, stage),)) for k, stage in enumerate(stages)
     ]
     return Controller(laws, T_S, REF, omega_b=OMEGA_B)
 
@@ -159,7 +160,9 @@ def test_the_power_limiter_lowers_the_frequency_only_beyond_its_limit():
 def test_shipped_stages_load_and_differ():
     found = {name: load_law("vsg-2", name).laws[0].inner for name in inner_names()}
     assert found.pop("none") is None
-    assert {stage.kind for stage in found.values() if stage} == set(STAGES)
+    kinds = {stage.kind for stage in found.values() if stage}
+    follows = load_law("grid-following").laws[0].inner
+    assert follows is not None and {*kinds, follows.kind} == {*STAGES}
 
 
 @pytest.mark.parametrize(
@@ -173,6 +176,12 @@ def test_shipped_stages_load_and_differ():
             'type = "cascaded"\n[power]\nP_max = 0.1\nP_min = 0.5',
             "power: P_max = 0.1 must be above",
         ),
+        (
+            'type = "grid-following"',
+            "phi_22: acts on omega_u, which the inner stage grid-following gives itself",
+        ),
+        ('type = "grid-following"\n[power]\nP_max = 1.0\nP_min = 0.0', "power: "),
+        ('type = "grid-following"\nf_pll = 0.0', "f_pll: must be > 0, not 0.0"),
         ('type = "cascaded"\npriority = "both"', "priority: .*'circular', 'd', 'q' or 'angle'"),
     ],
 )

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +9,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gfm_runtime import LawSet, get_law
+from gfm_runtime import LawSet
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import KINDS, PRIORITIES, STAGES, InnerStage, PowerLimiter
+from gfm_runtime.inner import KINDS, PRIORITIES, STAGES, GridFollowing, InnerStage, PowerLimiter
 from gfm_runtime.signals import NU_INNER, carried_rows
 from gfm_runtime.states import RUNNING
+
+from ..support.laws import behind
 
 T_S, OMEGA_B = 1e-4, 100 * math.pi
 REF = [1.0, 0.5, 1.0, 0.0, 1.0]
@@ -39,7 +40,7 @@ def controller(
 ) -> Controller:
     """Laws with stages; the first one starts with the bridge's voltage at 1 p.u."""
     laws = [
-        LawSet(str(k), (replace(get_law(law), inner=stage),)) for k, (law, stage) in enumerate(made)
+        LawSet(str(k), (behind(law, stage),)) for k, (law, stage) in enumerate(made)
     ]
     c = Controller(laws, T_S, REF, real=real, omega_b=OMEGA_B)
     start = at_rest() if y is None else y
@@ -67,8 +68,9 @@ def stages(kinds: Iterable[str] = tuple(STAGES)) -> st.SearchStrategy[InnerStage
         "f_pll": st.sampled_from([0.0, 20.0]),
         "power": st.sampled_from([None, PowerLimiter(P_max=0.8, P_min=-math.inf)]),
     }
+    of = {GridFollowing: {"f_pll": st.just(20.0), "power": st.none(), "k_V": st.floats(0.0, 5.0)}}
     return st.one_of(
-        st.builds(one, **{key: numbers[key] for key in numbers if key in one.model_fields})
+        st.builds(one, **{k: v for k, v in {**numbers, **of.get(one, {})}.items() if k in one.model_fields})
         for one in map(STAGES.__getitem__, kinds)
     )
 
@@ -129,7 +131,8 @@ def test_a_change_of_law_and_stage_leaves_the_bridges_voltage_where_it_was(
 def test_float32_stays_close_to_float64(kind, priority):
     """Over 0.3 s with a sag that the stage limits; the laws themselves agree to 2e-4, which the
     virtual impedance and the current loop turn into 1e-3 at most."""
-    stage = STAGES[kind](priority=priority, angle=-20.0, power=POWER, f_pll=20.0)
+    power = None if kind == "grid-following" else POWER
+    stage = STAGES[kind](priority=priority, angle=-20.0, power=power, f_pll=20.0)
     rng = np.random.default_rng(5)
     noise = np.cumsum(rng.normal(0, 1e-3, (3000, 11)), axis=0)
     noise -= noise.mean(axis=0)

@@ -14,7 +14,15 @@ from gfm_runtime.counts import align, measure, modulate
 from gfm_runtime.firmware import export
 from gfm_runtime.firmware.golden import inputs
 from gfm_runtime.firmware.module import at_rest
-from gfm_runtime.inner import PRIORITIES, STAGES, DualSequence, PowerLimiter, StiffSource, settle
+from gfm_runtime.inner import (
+    PRIORITIES,
+    STAGES,
+    DualSequence,
+    GridFollowing,
+    PowerLimiter,
+    StiffSource,
+    settle,
+)
 from gfm_runtime.inner_file import NO_INNER, inner_names
 from gfm_runtime.kernel import advance_with_inner, look_with_inner
 from gfm_runtime.lawfile import LawFile
@@ -41,8 +49,16 @@ def _staged() -> dict[str, BuiltLaw]:
         for k, stage in enumerate(shipped)
         for law in ("vsg-2", *SOME[k :: len(shipped)])
     }
+    follows = load_law("grid-following").laws[0]
     for kind, one in STAGES.items():
         for k, priority in enumerate(PRIORITIES):
+            if one is GridFollowing:
+                stage = one(
+                    priority=priority, angle=-30.0, k_ci=5.0 * (k % 2), f_pll=20.0, k_f=3.0,
+                    k_V=2.0 * (k > 1),
+                )  # fmt: skip
+                laws[f"{kind} {priority}"] = replace(follows, inner=stage)
+                continue
             stage = one(
                 priority=priority, angle=-30.0, k_ci=5.0 * (k % 2), freeze=k != 2,
                 power=PowerLimiter(P_max=1.0, P_min=-1.0), f_pll=20.0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from gfm_runtime import (
     step,
 )
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
+from gfm_runtime.inner import GridFollowing, InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
 from .files import text_of
@@ -43,6 +44,12 @@ LAWS = {
     for s in map(load_law, law_names())
     for k, law in enumerate(s.laws)
 }
+
+
+def behind(law: str, stage: InnerStage | None) -> BuiltLaw:
+    """A law of the catalogue with a stage; the grid-following one where the stage takes no other."""
+    follows = isinstance(stage, GridFollowing)
+    return replace(get_law("grid-following" if follows else law), inner=stage)
 
 
 def structure(name: str) -> tuple[object, ...]:

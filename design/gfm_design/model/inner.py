@@ -19,6 +19,7 @@ from gfm_plant import NoEquilibrium
 from gfm_runtime.inner import (
     INNER_NUMBERS,
     DualSequence,
+    GridFollowing,
     InnerStage,
     StiffSource,
     ThresholdImpedance,
@@ -38,20 +39,24 @@ _ROUNDING = 1e-6  # p.u., of an operating point; exactly at a limit the stage do
 class LinearStage:
     """An inner stage from tick to tick, as deviations in p.u. from its operating point:
 
-        x' = A x + B_u u + B_y y,   (i_u, omega_u, e_d, e_q) = C x + D_u u + D_y y.
+        x' = A x + B_u u + B_y y + B_r r,
+        (i_u, omega_u, e_d, e_q) = C x + D_u u + D_y y + D_r r.
 
-    u (3,) is the law's output and y (11,) what the run measures. With a PLL the law sees
-    C_pll x + D_pll y in place of its reference omega_g; without one both are 0. Shapes: A (n,n),
-    B_u (n,3), B_y (n,11), C (4,n), D_u (4,3), D_y (4,11), C_pll (1,n), D_pll (1,11); several
-    stages have one leading axis more. ``states`` names the states.
+    u (3,) is the law's output, y (11,) what the run measures, and r (5,) the references, which
+    most stages leave to the law. With a PLL the law sees C_pll x + D_pll y in place of its
+    reference omega_g; without one both are 0. Shapes: A (n,n), B_u (n,3), B_y (n,11), B_r (n,5),
+    C (4,n), D_u (4,3), D_y (4,11), D_r (4,5), C_pll (1,n), D_pll (1,11); several stages have one
+    leading axis more. ``states`` names the states.
     """
 
     A: Matrix
     B_u: Matrix
     B_y: Matrix
+    B_r: Matrix
     C: Matrix
     D_u: Matrix
     D_y: Matrix
+    D_r: Matrix
     C_pll: Matrix
     D_pll: Matrix
     states: tuple[str, ...] = field(kw_only=True)
@@ -87,8 +92,8 @@ class LinearStage:
             _block([B], [self.B_u @ D + self.B_y]),
             _block([self.D_u @ law.C, self.C + self.D_u @ u_by]),
             self.D_u @ D + self.D_y,
-            _block([B_r], [self.B_u @ D_r]),
-            self.D_u @ D_r,
+            _block([B_r], [self.B_u @ D_r + self.B_r]),
+            self.D_u @ D_r + self.D_r,
             rows=law.rows,
         )
 
@@ -122,12 +127,13 @@ def linearise_stage(
     i_0, v_0, i_o_0 = (complex(op.x[k], op.x[k + 1]) for k in (0, 2, 4))
     _check_limits(inner, op, abs(i_0))
     both, states = _states(inner, c)
-    # A quantity is a row over w = (x, u, y): its real and its imaginary part are those of row @ w.
+    # A quantity is a row over w = (x, u, y, r): its real and its imaginary part are those of row @ w.
     n = len(states)
-    w = np.eye(n + NU + NY_INNER)
-    omega, E, y = w[n + OMEGA_ROW], w[n + 2], w[n + NU :]
+    w = np.eye(n + NU + NY_INNER + NY)
+    omega, E, y, ref = w[n + OMEGA_ROW], w[n + 2], w[n + NU :], w[n + NU + NY_INNER :]
     i, v, i_o = (y[k] + 1j * y[k + 1] for k in (NY, NY + 2, NY + 4))
     x = {name: w[2 * k] + 1j * w[2 * k + 1] for k, name in enumerate(both)}
+    seen, after = np.zeros(len(w)), list[NDArray[np.float64]]()
     then = {"v_f": x["v_f"] + c["follow_v"] * (v - x["v_f"])}
     if dual:  # steady, there is no negative sequence: the turning of its frame is constant
         h = 2.0 * omega_0 * c["half_turn"]
@@ -141,7 +147,24 @@ def linearise_stage(
             return ahead + lack
 
         E = E - split_sequences("E", E) - (c["R_more"] + 1j * c["X_more"]) * x["i_n"]
-    if stator:
+    if inner.f_pll > 0.0:
+        angle, frequency = w[n - 2], w[n - 1]
+        error = (v / v_0).imag - angle
+        seen = frequency + c["T_k_pll"] * error
+        turned = angle + 2.0 * c["half_turn"] * (seen + c["k_pll"] * error - y[OMEGA_COLUMN])
+        after = [turned, seen]
+    if isinstance(inner, GridFollowing):
+        V, ahead, omega = w[n - 3], v_0 / abs(v_0), seen + c["give_back"] * turned
+        V = V + c["follow_V"] * ((then["v_f"] / ahead).real - V)
+        after = [V, *after]
+        i_0 = inner.reference(i_0, v_0, op.e, omega_0)  # at rest
+        P_of, Q_of = (i_0 / ahead).real, omega_0 * c["C_f"] * abs(v_0) - (i_0 / ahead).imag
+        droops = abs(1.0 - omega_0) >= inner.band_f
+        along = (ref[1] - (c["k_f"] * droops) * seen - P_of * V) / abs(v_0)
+        across = (Q_of * V - ref[3]) / abs(v_0) + c["C_f"] * (omega_0 * V + abs(v_0) * seen)
+        i_ref = ahead * (along + 1j * across) + 1j * i_0 * turned
+        i_0 = complex(op.x[0], op.x[1])
+    elif stator:
         lacks = op.e - v_0 - 1j * omega_0 * c["L_f"] * i_0
         i_ref_0 = i_0 if inner.k_ci > 0.0 else i_0 + lacks / c["k_c"]
         turn = 1j * omega_0 * c["half_turn"]
@@ -163,20 +186,14 @@ def linearise_stage(
     if "x_c" in x:
         then["x_c"] = x["x_c"] + c["T_k_ci"] * (i_ref - i)
     rows = [part for name in both for part in (then[name].real, then[name].imag)]
-    seen = np.zeros(len(w))
-    if inner.f_pll > 0.0:
-        angle, frequency = w[n - 2], w[n - 1]
-        error = (v / v_0).imag - angle
-        seen = frequency + c["T_k_pll"] * error
-        turns = 2.0 * c["half_turn"] * (seen + c["k_pll"] * error - y[OMEGA_COLUMN])
-        rows += [angle + turns, seen]
     out = np.array([w[n], omega, e.real, e.imag])
-    split = [n, n + NU]
-    A, B_u, B_y = np.split(np.array(rows), split, axis=1)
-    C, D_u, D_y = np.split(out, split, axis=1)
-    C_pll, _, D_pll = np.split(seen[None, :], split, axis=1)
+    split = [n, n + NU, n + NU + NY_INNER]
+    A, B_u, B_y, B_r = np.split(np.array([*rows, *after]), split, axis=1)
+    C, D_u, D_y, D_r = np.split(out, split, axis=1)
+    C_pll, _, D_pll, _ = np.split(seen[None, :], split, axis=1)
     assert C.shape == (NU_INNER, n)
-    return LinearStage(A, B_u, B_y, C, D_u, D_y, C_pll, D_pll, states=tuple(states))
+    of = A, B_u, B_y, B_r, C, D_u, D_y, D_r, C_pll, D_pll
+    return LinearStage(*of, states=tuple(states))
 
 
 def _without_states() -> LinearStage:
@@ -184,17 +201,20 @@ def _without_states() -> LinearStage:
     none, D_u = np.zeros((0, 0)), np.eye(NU_INNER, NU)
     B_u, B_y, C = np.zeros((0, NU)), np.zeros((0, NY_INNER)), np.zeros((NU_INNER, 0))
     D_y, C_pll = np.zeros((NU_INNER, NY_INNER)), np.zeros((1, 0))
-    return LinearStage(none, B_u, B_y, C, D_u, D_y, C_pll, D_y[:1], states=())
+    B_r, D_r = np.zeros((0, NY)), np.zeros((NU_INNER, NY))
+    return LinearStage(none, B_u, B_y, B_r, C, D_u, D_y, D_r, C_pll, D_y[:1], states=())
 
 
 def _states(inner: InnerStage, c: np.void) -> tuple[list[str], list[str]]:
     """The states that have both axes, by their symbols; and all states, one axis each, in words."""
     stator = isinstance(inner, VirtualStator)
+    follows = isinstance(inner, GridFollowing)
     acts = {"v_f": True, "i*": stator, "x_v": not stator and c["T_k_vi"] > 0.0}
     acts["x_c"] = c["T_k_ci"] > 0.0
     acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), isinstance(inner, DualSequence))
     both = [name for name, there in acts.items() if there]
     states = [f"{name} of the inner stage, {axis}" for name in both for axis in "dq"]
+    states += ["V of the inner stage"] if follows else []
     states += ["angle of the PLL", "frequency of the PLL"] if inner.f_pll > 0.0 else []
     return both, states
 
@@ -209,6 +229,8 @@ def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
         )
     elif isinstance(inner, ThresholdImpedance) and size > inner.I_thr:
         why = f"the threshold impedance acts: |i| is {size:.4g} p.u., I_thr is {inner.I_thr:g}"
+    elif isinstance(inner, GridFollowing) and abs(1.0 - op.y[4]) >= inner.band_V:
+        why = f"the support of the voltage acts: V is {op.y[4]:.4g} p.u., its dead band ends there"
     elif isinstance(inner, StiffSource) and not inner.rests(e, float(op.y[3])):
         why = f"a limit of E or q acts: E is {e:.4g} p.u., q {op.y[3]:.4g} p.u."
     elif e > most + _ROUNDING:

@@ -277,7 +277,7 @@ def _carry_out(laws, instances, fresh, op, k, tuned, now, c, inner, counts):
         if state.suspect >= 0:
             now[2] = BAD_SENSOR
     elif op == SPOIL:
-        instances[now[0], now[1]].offset[1] = math.nan
+        instances[now[0], now[1]].offset[0] = math.nan
     elif op == SPOIL_STAGE:
         instances[now[0], now[1]].away[0] = math.nan
     elif op >= TUNE:

@@ -18,11 +18,13 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_runtime.compiled import inlined
 from gfm_runtime.inner.stage import InnerStage, keep_q, limit_current, limited, passes_limit
 from gfm_runtime.toml_file import NotNegative, Positive
+
+_RETURN = 10.0  # 1/s
 
 
 class GridFollowing(InnerStage):
@@ -33,7 +35,8 @@ class GridFollowing(InnerStage):
     type: Literal["grid-following"] = Field("grid-following", description="kind of stage")
     f_pll: Positive = Field(10.0, description="bandwidth of the PLL, Hz")  # type: ignore[assignment]
     freeze: Literal[False] = Field(False, description="no row of the law acts on the current")  # type: ignore[assignment]
-    k_ci: NotNegative = Field(20.0, description="current loop, 1/s")
+    power: None = Field(None, description="no limiter of power: it moves omega_u, which is the PLL's")
+    k_ci: NotNegative = Field(5.0, description="current loop, 1/s")
     C_f: NotNegative = Field(0.2268, description="the converter's filter capacitor, p.u.")
     DwPLLmax: Positive = Field(0.2, description="limit of the PLL's deviation, p.u.")
     T_V: Positive = Field(0.005, description="low-pass on abs(v), s")
@@ -47,15 +50,10 @@ class GridFollowing(InnerStage):
     )
     band_f: NotNegative = Field(0.0, description="dead band of the frequency around 1 p.u.")
 
-    @model_validator(mode="after")
-    def _without_limiter(self) -> GridFollowing:
-        if self.power is not None:
-            raise ValueError("power: a power limiter moves omega_u, which is the PLL's here")
-        return self
-
     def constants(self, T_s: float, omega_b: float) -> dict[str, float]:
         own = ("C_f", "V_least", "k_V", "band_V", "k_f", "band_f")
         return super().constants(T_s, omega_b) | {name: getattr(self, name) for name in own} | {
+            "give_back": _RETURN / omega_b,
             "follow_V": -math.expm1(-T_s / self.T_V),
             "Dw_max": self.DwPLLmax,
         }  # fmt: skip
@@ -80,15 +78,34 @@ def beyond(x, band):
 
 
 @inlined
+def support(law, state):
+    """b, the reactive current that supports the voltage, p.u."""
+    return law.k_V * beyond(law.one - state.level[0], law.band_V)
+
+
+@inlined
 def ask_current(law, state):
-    """i* from P_ref and Q_ref, at the frequency, the voltage V and the angle that are measured."""
+    """i* in the PLL's frame, not limited, from P_ref and Q_ref at what V and omega are."""
     V = state.level[0]
     of = max(V, law.V_least)
-    b = law.k_V * beyond(law.one - V, law.band_V)
-    power = state.ref[1] + law.k_f * beyond(law.one - state.omega, law.band_f)
+    power = state.ref[1] + law.k_f * beyond(law.one - state.omega_pll, law.band_f)
     state.i_ref[0] = power / of
-    state.i_ref[1] = state.omega * law.C_f * V - state.ref[3] / of - b
-    if b == 0:
+    state.i_ref[1] = state.omega_pll * law.C_f * V - state.ref[3] / of - support(law, state)
+
+
+@inlined
+def grid_following(law, state):
+    """One tick, after that of the PLL: i*."""
+    low, high = law.one - law.Dw_max, law.one + law.Dw_max
+    state.omega_pll = limited(state.omega_pll, low, high)
+    # the frame turns to the PLL, which a change of law may have left at an angle
+    state.omega = limited(state.omega_pll + law.give_back * state.pll[1], low, high)
+    size = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
+    state.level[0] += law.follow_V * (size - state.level[0])
+    ask_current(law, state)
+    state.i_ref[0] += state.away[0]
+    state.i_ref[1] += state.away[1]
+    if support(law, state) == 0:
         limit_current(law, state)
     else:
         state.limited = passes_limit(law, state)
@@ -99,20 +116,10 @@ def ask_current(law, state):
 
 
 @inlined
-def grid_following(law, state):
-    """One tick, after that of the PLL: i*."""
-    omega = limited(state.omega_pll, law.one - law.Dw_max, law.one + law.Dw_max)
-    state.omega = state.omega_pll = omega
-    size = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
-    state.level[0] += law.follow_V * (size - state.level[0])
-    ask_current(law, state)
-    for k in range(2):
-        state.i_ref[k] += state.away[k]
-
-
-@inlined
 def settle_following(law, state):
-    """What i* lacks of the current that ``state.i_ref`` holds, into away."""
-    through_d, through_q = state.i_ref[0], state.i_ref[1]
+    """Into away what i* lacks of the current that ``state.i_ref`` holds."""
+    d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
     ask_current(law, state)
-    state.away[0], state.away[1] = through_d - state.i_ref[0], through_q - state.i_ref[1]
+    state.away[0] = cosine * d + sine * q - state.i_ref[0]
+    state.away[1] = cosine * q - sine * d - state.i_ref[1]
+    state.i_ref[0], state.i_ref[1] = d, q

@@ -27,6 +27,7 @@ from gfm_runtime.inner.stage import (
     I_OQ,
     I_Q,
     LEAST_V,
+    OMEGA,
     P_HIGH,
     P_LOW,
     V_D,
@@ -148,7 +149,7 @@ def settle_inner(law, state, e_d, e_q):
         e_d, e_q: p.u.
     """
     m = state.m
-    state.omega = state.omega_pll = state.now[1]
+    state.omega = state.omega_pll = m[OMEGA] if law.inner == FOLLOWING else state.now[1]
     size = math.sqrt(m[V_D] * m[V_D] + m[V_Q] * m[V_Q])
     state.pll[0], state.pll[1] = law.one, 0
     if size > law.least_v:

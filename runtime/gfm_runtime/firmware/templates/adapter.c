@@ -126,7 +126,7 @@ static void @P@_do_spoil(int k, int stage)
     (void)k;
     (void)stage;
 /* @else@ */
-    golden_real *place = &@P@_of[k].offset[1];
+    golden_real *place = &@P@_of[k].offset[0];
 /* @if stages@ */
     if (stage)
         place = &@P@_of[k].stage.away[0];
