@@ -16,7 +16,6 @@ from pathlib import Path
 
 from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import LawError, meant
-from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import BuiltLaw
 from gfm_runtime.lawfile import LawFile, Schedule, build_law, parse_law, read_law_file, shipped_law
 
@@ -125,16 +124,14 @@ def load_law(
     """A law by catalogue name or path, with parameters changed by name if wanted.
 
     Args:
-        inner: an inner stage in place of the file's own: a shipped name, a file, or ``none``.
+        inner: an inner stage in place of the file's own, see ``LawFile.behind``.
         counts: measurement and modulation in place of the file's own, likewise.
         changed: values of parameters.
 
     Raises:
         LawError: as ``law_file`` and ``build_law``.
     """
-    file = law_file(name)
-    if inner is not None:
-        file = file.model_copy(update={"inner": named_inner(inner)})
+    file = law_file(name).behind(inner)
     stages = file.schedule.in_order if file.schedule else []
     sets = [{**stage.parameters, **changed} for stage in stages] or [changed]
     try:

@@ -118,13 +118,17 @@ class BuiltLaw:
                     if not (0 <= cell[0] < NU and 0 <= cell[1] < NY):
                         raise LawError(cell_name(matrix, cell), "row must be 1..3, column 1..5")
                     _check(cell_name(matrix, cell), element)
-                with mistakes.noting():
-                    if self.inner is not None and cell[0] not in self.inner.rows:
-                        raise LawError(
-                            cell_name(matrix, cell),
-                            f"acts on {U_NAMES[cell[0]]}, which the inner stage {self.inner.kind}"
-                            " gives itself; a law for it has row 1 only",
-                        )
+        if self.inner is not None:
+            idle = sorted(
+                cell_name(matrix, cell)
+                for matrix, filled in (("phi", self.phi), ("psi", self.psi))
+                for cell in filled
+                if cell[0] not in self.inner.rows
+            )
+            with mistakes.noting():
+                if idle:
+                    why = "which gives omega_u and the current itself; a law for it has row 1 only"
+                    raise LawError(", ".join(idle), f"do not act on {self.inner.kind}, {why}")
         for name, value in zip(U_NAMES, self.u_0, strict=True):
             with mistakes.noting():
                 if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):

@@ -21,7 +21,7 @@ from gfm_runtime.elements import Element
 from gfm_runtime.error_maps import ERROR_MAPS, WITH_IMPEDANCE
 from gfm_runtime.errors import LawError, Mistakes, allowed, meant
 from gfm_runtime.expressions import evaluate, evaluated
-from gfm_runtime.inner import Inner
+from gfm_runtime.inner import Inner, InnerStage
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.law import BuiltLaw, Cell, HomeGrid, Limits, Parameter, cell_name
 from gfm_runtime.mistakes import lines
@@ -242,6 +242,17 @@ class LawFile(TomlTable):
         if self.measure is None or self.modulate is None:
             return None
         return Counts(measure=self.measure, modulate=self.modulate)
+
+    def behind(self, inner: str | None) -> LawFile:
+        """The same with another inner stage: a shipped name, a file, ``none``, or None for its own.
+        A law without the rows of omega_u and E_u keeps its own in place of one that needs them.
+        Raises LawError: no such stage, or a mistake in its file."""
+        if inner is None:
+            return self
+        stage, own = named_inner(inner), self.inner
+        needs = InnerStage.rows if stage is None else stage.rows
+        kept = own is not None and own.rows != InnerStage.rows == needs
+        return self if kept else self.model_copy(update={"inner": stage})
 
     model_config = ConfigDict(json_schema_extra=_base_or_whole)
 

@@ -23,7 +23,14 @@ from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
 from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_file, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import Cascaded, GridFollowing, InnerStage, PowerLimiter, ThresholdImpedance, VirtualStator
+from gfm_runtime.inner import (
+    Cascaded,
+    GridFollowing,
+    InnerStage,
+    PowerLimiter,
+    ThresholdImpedance,
+    VirtualStator,
+)
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import tied
 from gfm_runtime.signals import NU_INNER, NY_INNER
@@ -146,11 +153,14 @@ def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame():
         np.testing.assert_allclose(plant.B[:, j], slope, atol=1e-4)
 
 
-def bench_of(stage: str, law: str, ticks: int, plant: dict[str, Any], place: Any) -> Bench:
+def bench_of(
+    stage: str, law: str, ticks: int, plant: dict[str, Any], place: Any, **ref: float
+) -> Bench:
     path = place / "stage.toml"
     path.write_text(stage)
     content = {"title": "", "duration": ticks * T_S, "law": law, "plant": plant}
-    return make_bench(check_scenario({**content, "inner": str(path)}, "test"))
+    content |= {"inner": str(path), "references": ref}
+    return make_bench(check_scenario(content, "test"))
 
 
 def recorded(bench: Bench, ticks: int) -> dict[str, np.ndarray]:
@@ -161,6 +171,7 @@ def recorded(bench: Bench, ticks: int) -> dict[str, np.ndarray]:
     return dict(zip(names, rows[0].T, strict=True))
 
 
+FOLLOWS = 'type = "grid-following"\nk_f = 20.0'
 PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
 
 
@@ -174,6 +185,9 @@ PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
         (PLL, "vsg-5",
          {"delay": {"fraction": 0.7}, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}),
         (PLL, "vsg-5", {"dc_source": {"mode": "regulated"}, "delay": {"samples": 0}}),
+        (FOLLOWS, "grid-following", {}),
+        (FOLLOWS, "grid-following", {"dc_source": {"mode": "regulated"},
+         "grid": {"scr": 8.0, "x_over_r": 6.0, "omega_g": 1.002}}),
     ],
 )  # fmt: skip
 def test_a_step_is_that_of_the_nonlinear_bench(stage, law, plant, tmp_path):
@@ -195,6 +209,23 @@ def test_the_bench_rests_where_a_pll_measures_another_frequency(tmp_path):
     plant = {**PLANT, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}
     bench = bench_of(PLL, "vsg-5", 300, plant, tmp_path)
     assert np.ptp(recorded(bench, 300)["true_p"]) < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("grid", "P", "Q"),
+    [({"scr": 3.0}, 0.5, 0.1), ({"scr": 8.0, "omega_g": 0.996}, 0.5 + 20.0 * (0.004 - 0.001), 0.1),
+     ({"scr": 5.0, "V_g": 0.75}, 0.5, None)],
+)  # fmt: skip
+def test_a_grid_following_law_rests_at_its_set_points(grid, P, Q, tmp_path):
+    """Also where its droop or its support acts: the reactive power is then the support's too."""
+    stage = FOLLOWS + "\nband_f = 0.001\nk_V = 2.0"
+    plant = {**PLANT, "grid": {"x_over_r": 6.0, **grid}}
+    rows = recorded(bench_of(stage, "grid-following", 300, plant, tmp_path, Q_ref=0.1), 300)
+    assert max(np.ptp(rows[name]) for name in ("true_p", "true_q", "true_V")) < 1e-10
+    assert rows["true_p"][0] == pytest.approx(P, abs=1e-9)
+    V = rows["true_V"][0]
+    Q = 0.1 + V * 2.0 * (0.9 - V) if Q is None else Q
+    assert rows["true_q"][0] == pytest.approx(Q, abs=1e-4)  # C_f of the stage has four digits
 
 
 def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues():

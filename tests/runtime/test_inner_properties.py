@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,9 +40,7 @@ def controller(
     y: NDArray[np.float64] | None = None,
 ) -> Controller:
     """Laws with stages; the first one starts with the bridge's voltage at 1 p.u."""
-    laws = [
-        LawSet(str(k), (behind(law, stage),)) for k, (law, stage) in enumerate(made)
-    ]
+    laws = [LawSet(str(k), (behind(law, stage),)) for k, (law, stage) in enumerate(made)]
     c = Controller(laws, T_S, REF, real=real, omega_b=OMEGA_B)
     start = at_rest() if y is None else y
     c.start(np.zeros(c.active_law.order), np.array([0.5, 1.0, 1.0]), start, 1.0 + 0j)
@@ -68,11 +67,13 @@ def stages(kinds: Iterable[str] = tuple(STAGES)) -> st.SearchStrategy[InnerStage
         "f_pll": st.sampled_from([0.0, 20.0]),
         "power": st.sampled_from([None, PowerLimiter(P_max=0.8, P_min=-math.inf)]),
     }
-    of = {GridFollowing: {"f_pll": st.just(20.0), "power": st.none(), "k_V": st.floats(0.0, 5.0)}}
-    return st.one_of(
-        st.builds(one, **{k: v for k, v in {**numbers, **of.get(one, {})}.items() if k in one.model_fields})
-        for one in map(STAGES.__getitem__, kinds)
-    )
+    others = {"f_pll": st.just(20.0), "power": st.none(), "k_V": st.floats(0.0, 5.0)}
+
+    def of(one: type[InnerStage]) -> dict[str, st.SearchStrategy[Any]]:
+        mine = numbers | (others if one is GridFollowing else {})
+        return {key: mine[key] for key in mine if key in one.model_fields}
+
+    return st.one_of(st.builds(one, **of(one)) for one in map(STAGES.__getitem__, kinds))
 
 
 @given(stages(), st.lists(measurements, min_size=1, max_size=12), reals, st.sampled_from(LAWS))

@@ -47,7 +47,7 @@ LAWS = {
 
 
 def behind(law: str, stage: InnerStage | None) -> BuiltLaw:
-    """A law of the catalogue with a stage; the grid-following one where the stage takes no other."""
+    """A law of the catalogue with a stage: the grid-following one where it takes no other."""
     follows = isinstance(stage, GridFollowing)
     return replace(get_law("grid-following" if follows else law), inner=stage)
 

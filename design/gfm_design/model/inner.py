@@ -127,7 +127,7 @@ def linearise_stage(
     i_0, v_0, i_o_0 = (complex(op.x[k], op.x[k + 1]) for k in (0, 2, 4))
     _check_limits(inner, op, abs(i_0))
     both, states = _states(inner, c)
-    # A quantity is a row over w = (x, u, y, r): its real and its imaginary part are those of row @ w.
+    # A quantity is a row over w = (x, u, y, r): its real and imaginary part are those of row @ w.
     n = len(states)
     w = np.eye(n + NU + NY_INNER + NY)
     omega, E, y, ref = w[n + OMEGA_ROW], w[n + 2], w[n + NU :], w[n + NU + NY_INNER :]
@@ -154,7 +154,9 @@ def linearise_stage(
         turned = angle + 2.0 * c["half_turn"] * (seen + c["k_pll"] * error - y[OMEGA_COLUMN])
         after = [turned, seen]
     if isinstance(inner, GridFollowing):
-        V, ahead, omega = w[n - 3], v_0 / abs(v_0), seen + c["give_back"] * turned
+        V, ahead = w[n - 3], v_0 / abs(v_0)
+        E = then["v_f"] + (c["R_v"] + 1j * c["X_v"]) * i
+        omega = seen + c["give_back"] * E.imag / op.u[2]
         V = V + c["follow_V"] * ((then["v_f"] / ahead).real - V)
         after = [V, *after]
         i_0 = inner.reference(i_0, v_0, op.e, omega_0)  # at rest

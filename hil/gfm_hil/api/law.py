@@ -309,10 +309,7 @@ class Law:
         if converter not in names and (names or converter is not None):
             allowed = f"one of {names}" if names else "left out: the scenario has no network"
             raise UserError(f"converter = {converter!r}: must be {allowed}")
-        inner = (scenario if converter is None else scenario.each[converter]).inner
-        if inner is None:
-            return self.file
-        return self.file.model_copy(update={"inner": named_inner(inner)})
+        return self.file.behind((scenario if converter is None else scenario.each[converter]).inner)
 
     def to_c(
         self,

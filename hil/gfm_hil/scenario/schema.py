@@ -394,7 +394,7 @@ class Scenario(StrictSchema):
         counts = named_counts(self.counts) if self.counts is not None else None
         if any(counts if self.counts is not None else file.counts for _, file in files):
             return COUNTS
-        inner = (file.inner if one.inner is None else named_inner(one.inner) for one, file in files)
+        inner = (file.behind(one.inner).inner for one, file in files)
         return INNER if any(stage is not None for stage in inner) else PLAIN
 
     @property

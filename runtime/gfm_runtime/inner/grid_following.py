@@ -1,14 +1,17 @@
 """Grid-following: a current by set-points of P and Q in the frame of a PLL, and the current loop.
 
-With theta and omega the angle and frequency of the PLL, V the low-pass filtered abs(v), and y the
-references and measurements of the law's own columns, the current behind the filter's capacitor is
+With theta and omega the angle and frequency of the PLL, and V the low-pass filtered abs(v), at
+least V_least where it divides, the reference of the filter's current is
 
-    i* = (P*/V + j (omega C_f V - Q*/V - b)) e^(j theta),    P* = P_ref + k_f dead(1 - omega),
-    b = k_V dead(1 - V),
+    i* = (P/V + j (omega C_f V - Q_ref/V - b)) e^(j theta),
+    P = P_ref + k_f dead(1 - omega),    b = k_V dead(1 - V),
 
 where dead(x) is what x is beyond its dead band: a droop of the power by the frequency, and the
 reactive current that supports the voltage. While b is not 0, the reactive current has the first
-place within I_max. E_u and omega_u of the law do not act: it has row 1 only.
+place within I_max. omega_u and E_u of the law do not act: it has row 1 only.
+
+The converter's frame turns with the PLL, and slowly to the angle of v + (R_v + j X_v) i, where the
+E of a grid-forming law with such a virtual impedance is, so that each may take over from the other.
 
 Source: Yazdani and Iravani, "Voltage-Sourced Converters in Power Systems", chapter 8.
 """
@@ -21,10 +24,10 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.inner.stage import InnerStage, keep_q, limit_current, limited, passes_limit
+from gfm_runtime.inner.stage import I_D, I_Q, InnerStage, limit_current, limited
 from gfm_runtime.toml_file import NotNegative, Positive
 
-_RETURN = 10.0  # 1/s
+_RETURN = 10.0  # 1/s, of the converter's frame to the angle of E
 
 
 class GridFollowing(InnerStage):
@@ -33,10 +36,14 @@ class GridFollowing(InnerStage):
     rows: ClassVar = (0,)
 
     type: Literal["grid-following"] = Field("grid-following", description="kind of stage")
-    f_pll: Positive = Field(10.0, description="bandwidth of the PLL, Hz")  # type: ignore[assignment]
-    freeze: Literal[False] = Field(False, description="no row of the law acts on the current")  # type: ignore[assignment]
-    power: None = Field(None, description="no limiter of power: it moves omega_u, which is the PLL's")
+    f_pll: Positive = Field(10.0, description="bandwidth of the PLL, Hz")
+    freeze: Literal[False] = Field(False, description="no row of the law acts on the current")
+    power: None = Field(
+        None, description="none: omega_u, which a power limiter moves, is the PLL's"
+    )
     k_ci: NotNegative = Field(5.0, description="current loop, 1/s")
+    R_v: NotNegative = Field(0.1, description="virtual resistance of laws that take over, p.u.")
+    X_v: NotNegative = Field(0.3, description="virtual reactance of laws that take over, p.u.")
     C_f: NotNegative = Field(0.2268, description="the converter's filter capacitor, p.u.")
     DwPLLmax: Positive = Field(0.2, description="limit of the PLL's deviation, p.u.")
     T_V: Positive = Field(0.005, description="low-pass on abs(v), s")
@@ -51,7 +58,7 @@ class GridFollowing(InnerStage):
     band_f: NotNegative = Field(0.0, description="dead band of the frequency around 1 p.u.")
 
     def constants(self, T_s: float, omega_b: float) -> dict[str, float]:
-        own = ("C_f", "V_least", "k_V", "band_V", "k_f", "band_f")
+        own = ("R_v", "X_v", "C_f", "V_least", "k_V", "band_V", "k_f", "band_f")
         return super().constants(T_s, omega_b) | {name: getattr(self, name) for name in own} | {
             "give_back": _RETURN / omega_b,
             "follow_V": -math.expm1(-T_s / self.T_V),
@@ -62,7 +69,7 @@ class GridFollowing(InnerStage):
         self, i: complex, v: complex, i_o: complex, e: complex, omega: float
     ) -> complex:
         self.check_current(abs(self.reference(i, v, e, omega)))
-        return v
+        return v + complex(self.R_v, self.X_v) * i
 
     def wanted(self, P_ref: float, Q_ref: float, V: float, omega: float) -> complex:
         """i* in the PLL's frame before its limit, p.u., at rest at V and omega, p.u."""
@@ -94,23 +101,36 @@ def ask_current(law, state):
 
 
 @inlined
+def limit_reactive_first(law, state):
+    """i* cut to I_max, with what i_q* leaves for i_d*, and whether that was needed."""
+    d, q = state.i_ref[0], state.i_ref[1]
+    most = law.I_max * law.I_max
+    state.limited = d * d + q * q > most
+    if state.limited != 0:
+        q = limited(q, -law.I_max, law.I_max)
+        rest = math.sqrt(most - q * q)
+        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
+
+
+@inlined
 def grid_following(law, state):
     """One tick, after that of the PLL: i*."""
     low, high = law.one - law.Dw_max, law.one + law.Dw_max
     state.omega_pll = limited(state.omega_pll, low, high)
-    # the frame turns to the PLL, which a change of law may have left at an angle
-    state.omega = limited(state.omega_pll + law.give_back * state.pll[1], low, high)
-    size = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
-    state.level[0] += law.follow_V * (size - state.level[0])
+    E_d = state.v_f[0] + law.R_v * state.m[I_D] - law.X_v * state.m[I_Q]
+    E_q = state.v_f[1] + law.R_v * state.m[I_Q] + law.X_v * state.m[I_D]
+    E = math.sqrt(E_d * E_d + E_q * E_q)
+    E = max(E, law.least_v)
+    state.omega = limited(state.omega_pll + law.give_back * (E_q / E), low, high)
+    V = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
+    state.level[0] += law.follow_V * (V - state.level[0])
     ask_current(law, state)
     state.i_ref[0] += state.away[0]
     state.i_ref[1] += state.away[1]
     if support(law, state) == 0:
         limit_current(law, state)
     else:
-        state.limited = passes_limit(law, state)
-        if state.limited:
-            keep_q(law, state)
+        limit_reactive_first(law, state)
     d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
     state.i_ref[0], state.i_ref[1] = cosine * d - sine * q, cosine * q + sine * d
 

@@ -16,11 +16,7 @@ from pydantic import Field
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
-from gfm_runtime.inner.grid_following import (
-    GridFollowing,
-    grid_following,
-    settle_following,
-)
+from gfm_runtime.inner.grid_following import GridFollowing, grid_following, settle_following
 from gfm_runtime.inner.stage import (
     I_D,
     I_OD,

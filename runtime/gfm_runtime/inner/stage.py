@@ -258,37 +258,26 @@ def limit_power(law, state, p):
 
 
 @inlined
-def passes_limit(law, state):
-    """Whether i* is longer than I_max."""
-    d, q = state.i_ref[0], state.i_ref[1]
-    return d * d + q * q > law.I_max * law.I_max
-
-
-@inlined
-def keep_q(law, state):
-    """i* cut to I_max, with what i_q* leaves for i_d*."""
-    q = limited(state.i_ref[1], -law.I_max, law.I_max)
-    rest = math.sqrt(law.I_max * law.I_max - q * q)
-    state.i_ref[0], state.i_ref[1] = limited(state.i_ref[0], -rest, rest), q
-
-
-@inlined
 def limit_current(law, state):
     """i* cut to I_max, and whether that was needed."""
-    state.limited = passes_limit(law, state)
+    d, q = state.i_ref[0], state.i_ref[1]
+    size = d * d + q * q
+    most = law.I_max * law.I_max
+    state.limited = size > most
     if not state.limited:
         return
-    d, q = state.i_ref[0], state.i_ref[1]
     if law.priority == _ANGLE:
         state.i_ref[0], state.i_ref[1] = law.I_cos, law.I_sin
     elif law.priority == _D:
         d = limited(d, -law.I_max, law.I_max)
-        rest = math.sqrt(law.I_max * law.I_max - d * d)
+        rest = math.sqrt(most - d * d)
         state.i_ref[0], state.i_ref[1] = d, limited(q, -rest, rest)
     elif law.priority == _Q:
-        keep_q(law, state)
+        q = limited(q, -law.I_max, law.I_max)
+        rest = math.sqrt(most - q * q)
+        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
     else:
-        scale = law.I_max / math.sqrt(d * d + q * q)
+        scale = law.I_max / math.sqrt(size)
         state.i_ref[0], state.i_ref[1] = d * scale, q * scale
 
 

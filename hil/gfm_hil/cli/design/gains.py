@@ -22,7 +22,6 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_runtime import law_file
-from gfm_runtime.inner_file import named_inner
 from gfm_runtime.lawfile import LawFile
 
 
@@ -34,10 +33,7 @@ def add(kinds: Any) -> None:
 def chosen_law(options: argparse.Namespace) -> LawFile:
     """The law file of --law, with the inner stage of --inner if it is given. Raises LawError: no
     such law or stage, or a mistake in its file."""
-    file = law_file(options.law)
-    if options.inner is None:
-        return file
-    return file.model_copy(update={"inner": named_inner(options.inner)})
+    return law_file(options.law).behind(options.inner)
 
 
 def problem_title(file: LawFile, on: Scenario | None = None, *more: Any) -> str:

@@ -27,7 +27,6 @@ from gfm_hil.studies.conformity.shared_start import SharedStart, after_settling,
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
 from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import get_law, law_file
-from gfm_runtime.inner_file import named_inner
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ def make_jobs(
     each: list[tuple[str, str, ControllerUnderTest | None]] = [(*law, None) for law in laws.items()]
     if external is not None:
         start = next(iter(laws.values()), Scenario.model_fields["law"].default)
-        stage = law_file(start).inner if inner is None else named_inner(inner)
+        stage = law_file(start).behind(inner).inner
         controllers.check_currents(external.name, stage is not None)
         each.append((external.name, start, external))
     declared = {file: declared_for(under, file) for _, file, _ in each}
