@@ -2,8 +2,8 @@
 
 ``laws/tuned`` holds the same laws with the gains that the law comparison found for the paper's
 converter, ``laws/grid`` those for grid codes, with a declared droop of 5 %, ``laws/industry`` the
-models that grid operators know by name, for the converter of their own. They load by name like the
-others, but ``law_names`` does not list them.
+models that grid operators know by name, for the converter of their own, and a grid-following law.
+They load by name like the others, but ``law_names`` does not list them.
 """
 
 import contextlib

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import gfmhil
 from deployable.box import Point
 from deployable.robust import Loops
 from gfm_design.margins.all_margins import loop_margins
@@ -226,6 +227,15 @@ def test_a_grid_following_law_rests_at_its_set_points(grid, P, Q, tmp_path):
     V = rows["true_V"][0]
     Q = 0.1 + V * 2.0 * (0.9 - V) if Q is None else Q
     assert rows["true_q"][0] == pytest.approx(Q, abs=1e-4)  # C_f of the stage has four digits
+
+
+@pytest.mark.parametrize("laws", [("grid-following", "vsg-2"), ("vsg-2", "grid-following")])
+def test_following_and_forming_take_over_from_each_other(laws):
+    content = {"title": "", "duration": 0.8, "law": laws[0], "inner": "virtual-stator",
+               "references": {"P_ref": 0.7}, "plant": PLANT,
+               "events": [{"t": 0.2, "type": "law", "law": laws[1]}]}  # fmt: skip
+    p = gfmhil.run(content).signals["true_p"]
+    assert np.ptp(p[:2000]) < 1e-10 and 1e-5 < np.abs(p - 0.7).max() < 0.03
 
 
 def test_margins_are_those_at_the_bridge_and_hold_on_eigenvalues():

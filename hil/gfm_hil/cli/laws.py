@@ -43,7 +43,9 @@ def add(command: argparse.ArgumentParser) -> None:
         "--grid", action="store_true", help="those for grid codes, with a droop of 5 %%"
     )
     command.add_argument(
-        "--industry", action="store_true", help="models of the industry: REGFM_A1, REGFM_B1"
+        "--industry",
+        action="store_true",
+        help="those of the industry: REGFM_A1, REGFM_B1, a grid-following converter",
     )
     kinds = command.add_subparsers(metavar="show|import|export")
     show = kinds.add_parser("show", help="one law, with its transfer functions")
