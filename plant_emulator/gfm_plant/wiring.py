@@ -377,13 +377,16 @@ class Wiring:
 
     def islands(self) -> list[tuple[str, ...]]:
         """The nodes in groups that closed lines connect, each in the order of ``nodes``."""
-        groups = {node: {node} for node in self.nodes}
+        groups = {node: [node] for node in self.nodes}
         lines = [b for b in self.branches if b.end != GROUND and b.name not in self.opened]
-        for start, end in [*((b.start, b.end) for b in lines), *self.by_waves]:
-            both = groups[start] | groups[end]
-            groups.update(dict.fromkeys(both, both))
-        each = (tuple(n for n in self.nodes if n in groups[node]) for node in self.nodes)
-        return list(dict.fromkeys(each))
+        for ends in [*((b.start, b.end) for b in lines), *self.by_waves]:
+            less, more = sorted((groups[node] for node in ends), key=len)
+            if less is not more:
+                more += less
+                groups.update(dict.fromkeys(less, more))
+        place = {node: k for k, node in enumerate(groups)}
+        each = {id(group): group for group in groups.values()}
+        return [tuple(sorted(group, key=place.__getitem__)) for group in each.values()]
 
     @property
     def by_waves(self) -> list[tuple[str, ...]]:

@@ -8,9 +8,10 @@ it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act.
 
 import cmath
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 import scipy  # loads its sparse matrices when they are first used: of large networks
@@ -206,8 +207,9 @@ class _NetworkEquilibrium:
         met = [part for node in self.free for part in (missing[node].real, missing[node].imag)]
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
 
-    def _rows(self) -> list[set[int]]:
-        """The rows of ``residual`` that each unknown acts on; a speed may act on all."""
+    def _reach(self) -> list[tuple[set[int], set[int]]]:
+        """The rows of ``residual`` that each unknown acts on: those whose slopes are to be measured,
+        and all, with those of ``_slopes``. A speed may act on all."""
         wiring = self.wiring
         fed = sorted(enumerate(wiring.fed), key=lambda item: item[1][1].is_voltage)
         lengths = [side.size for side in self.sides]
@@ -216,16 +218,11 @@ class _NetworkEquilibrium:
         ]
         starts = np.cumsum([0, *lengths])
         blocks = [{*range(a, b)} for a, b in pairwise(starts)]
-        place = {node: int(starts[-1]) + 2 * k for k, node in enumerate(self.free)}
-        at = {node: {k, k + 1} for node, k in place.items()}
+        at = {node: {k, k + 1} for node, k in self._places(int(starts[-1])).items()}
         reached = {node: set(rows) for node, rows in at.items()}  # by the voltage of each node
         for k, nodes in enumerate(self.islands):
             reached[nodes[0]].add(int(starts[-1]) + 2 * len(self.free) + k)
-        for branch in wiring.branches:
-            for one, other in ((branch.start, branch.end), (branch.end, branch.start)):
-                if one in reached:
-                    reached[one] |= at.get(other, set())
-        own = [blocks[k] | at.get(unit.node, set()) for k, unit in enumerate(wiring.units)]
+        own = [set(block) for block in blocks[: len(wiring.units)]]
         terminals = {unit.terminal: k for k, unit in enumerate(wiring.units)}
         for k, unit in enumerate(wiring.units):
             reached.get(unit.node, set()).update(blocks[k])
@@ -238,16 +235,57 @@ class _NetworkEquilibrium:
                 if node in terminals:
                     own[terminals[node]] |= rows
                 reached.get(node, set()).update(rows)
-        found = [rows for rows, side in zip(own, self.sides, strict=True) for _ in range(side.size)]
-        found += [reached[node] for node in self.free for _ in range(2)]
+        beyond = {node: set(rows) for node, rows in reached.items()}
+        for branch in wiring.branches:
+            for one, other in ((branch.start, branch.end), (branch.end, branch.start)):
+                if one in beyond:
+                    beyond[one] |= at.get(other, set())
+        reach = list[tuple[set[int], set[int]]]()
+        for unit, side, rows in zip(wiring.units, self.sides, own, strict=True):
+            reach += [(rows, rows | at.get(unit.node, set()))] * side.size
+        reach += [(reached[node], beyond[node]) for node in self.free for _ in range(2)]
         for k, (_, component) in enumerate(wiring.fed):
-            found += [mine[k]] * component.unknowns
+            reach += [(mine[k], mine[k])] * component.unknowns
         everything = {*range(int(starts[-1]) + 2 * len(self.free) + len(self.islands))}
-        return found + [everything] * len(self.islands)
+        return reach + [(everything, everything)] * len(self.islands)
+
+    def _places(self, first: int) -> dict[str, int]:
+        """The first of the two rows, or unknowns, of each node, where those of nodes begin."""
+        return {node: first + 2 * k for k, node in enumerate(self.free)}
+
+    def _slopes(self, z: Vector) -> Iterator[tuple[int, int, float]]:
+        """The slopes that are known: by row and unknown, those of the current that meets at a node
+        by the voltage of another one, and by the current and the angle of a converter."""
+        wiring, (own, _, speeds) = self.wiring, self._split(z)
+        rows = self._places(
+            sum(side.size for side in self.sides)
+            + sum(c.unknowns for name, c in wiring.fed if c.is_voltage or name not in wiring.opened)
+        )
+        unknowns, first = self._places(sum(side.size for side in self.sides)), 0
+        for side, unit, mine in zip(self.sides, wiring.units, own, strict=False):
+            if (row := rows.get(unit.node)) is not None:
+                turn = cmath.exp(1j * mine[DELTA]) / float(side.par[0]["current"])
+                for k, slope in (
+                    (4, turn), (5, 1j * turn), (DELTA, 1j * complex(mine[4], mine[5]) * turn),
+                ):  # fmt: skip
+                    yield row, first + k, slope.real
+                    yield row + 1, first + k, slope.imag
+            first += side.size
+        for branch in wiring.branches:
+            if branch.name not in wiring.opened:
+                y = 1.0 / complex(branch.R, speeds[branch.start] * branch.L)
+                for node, sign in branch.taken():
+                    for other, sign_of_other in branch.taken():
+                        if node != other and node in rows and other in unknowns:
+                            slope, k = -sign * sign_of_other * y, unknowns[other]
+                            yield rows[node], k, slope.real
+                            yield rows[node], k + 1, -slope.imag
+                            yield rows[node] + 1, k, slope.imag
+                            yield rows[node] + 1, k + 1, slope.real
 
     def solved(self) -> Vector:
         """The unknowns. Raises NoEquilibrium: there is none, or the search does not find it."""
-        z = _newton(self.residual, self.first(), self._rows())
+        z = _newton(self.residual, self.first(), self._reach(), self._slopes)
         if z is None:
             each = zip(self.wiring.units, self.laws, strict=True)
             names = ", ".join(f"{unit.name} ({law.law.name})" for unit, law in each)
@@ -390,33 +428,42 @@ class _ConverterEquilibrium:
         )
 
 
+def _no_slopes(z: Vector) -> Iterator[tuple[int, int, float]]:
+    return iter(())
+
+
 def _newton(
-    residual: Callable[[Vector], Vector], z: Vector, rows: Sequence[set[int]] = ()
+    residual: Callable[[Vector], Vector],
+    z: Vector,
+    reach: Sequence[tuple[set[int], set[int]]] = (),
+    known: Callable[[Vector], Iterator[tuple[int, int, float]]] = _no_slopes,
 ) -> Vector | None:
     """A zero of ``residual`` near z, or None.
 
-    The slopes are found anew only when a step was not much shorter than the one before it.
+    Slopes are measured anew only when a step was not much shorter than the one before it.
 
     Args:
         residual, z: what must vanish, and where the search begins.
-        rows: those that each unknown acts on; none: each acts on all.
+        reach: of each unknown the rows whose slopes are to be measured, and all that it acts on;
+            none: each acts on all.
+        known: the other slopes at z, by row and unknown.
     """
-    groups = _apart(rows or [{0}] * len(z))
-    before, largest, jacobian = 0.0, math.inf, np.empty((0, 0))
+    everything = {*range(len(z))}
+    reach = reach or [(everything, everything)] * len(z)
+    groups, before, largest, step_of = _apart(reach), 0.0, math.inf, _steps([], (0, 0))
     for _ in range(_ROUNDS):
         now = residual(z)
         if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
             return z
         if not largest < 0.1 * before:
-            jacobian = np.zeros((len(now), len(z)))
+            jacobian = [*known(z)]
             for group in groups:
                 nudge = np.zeros(len(z))
                 nudge[group] = _NUDGE
                 slopes = (residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE)
-                for column in group:
-                    those = [*rows[column]] if rows else slice(None)
-                    jacobian[those, column] = slopes[those]
-        step = _solve(jacobian, now)
+                jacobian += [(j, column, slopes[j]) for column in group for j in reach[column][0]]
+            step_of = _steps(jacobian, (len(now), len(z)))
+        step = step_of(now)
         before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
         if not np.isfinite(z).all():
@@ -426,30 +473,36 @@ def _newton(
     return None
 
 
-def _apart(rows: Sequence[set[int]]) -> list[list[int]]:
-    """The unknowns in groups, no two of which act on the same row."""
-    groups: list[tuple[list[int], set[int]]] = []
-    for column, those in enumerate(rows):
-        for group, taken in groups:
-            if not those & taken:
+def _apart(reach: Sequence[tuple[set[int], set[int]]]) -> list[list[int]]:
+    """The unknowns in groups, none of which acts on a row that is measured for another one."""
+    groups: list[tuple[list[int], set[int], set[int]]] = []
+    for column, (measured, moved) in enumerate(reach):
+        for group, all_measured, all_moved in groups:
+            if not (measured & all_moved or moved & all_measured):
                 group.append(column)
-                taken |= those
+                all_measured |= measured
+                all_moved |= moved
                 break
         else:
-            groups.append(([column], set(those)))
-    return [group for group, _ in groups]
+            groups.append(([column], set(measured), set(moved)))
+    return [group for group, _, _ in groups]
 
 
-def _solve(jacobian: NDArray[np.float64], right: Vector) -> Vector:
-    """The step of Newton's method: of least squares, but for a large network whose rows are
-    independent."""
-    if len(right) > _MOST_BY_SQUARES and len(right) == jacobian.shape[1]:
+def _steps(
+    slopes: Sequence[tuple[int, int, float]], shape: tuple[int, int]
+) -> Callable[[Vector], Vector]:
+    """The step of Newton's method by what must vanish, for slopes by row and unknown: of least
+    squares, but for a large network whose rows are independent."""
+    rows, columns, values = (np.array(each) for each in zip(*slopes)) if slopes else ([], [], [])
+    if shape[0] == shape[1] > _MOST_BY_SQUARES:
         try:
-            sparse = scipy.sparse.csc_matrix(jacobian)
-            return np.asarray(scipy.sparse.linalg.splu(sparse).solve(right))
+            sparse = scipy.sparse.csc_matrix((values, (rows, columns)), shape)
+            return cast(Callable[[Vector], Vector], scipy.sparse.linalg.splu(sparse).solve)
         except RuntimeError:  # a part without a voltage
             pass
-    return np.asarray(np.linalg.lstsq(jacobian, right, rcond=1e-12)[0])
+    jacobian = np.zeros(shape)
+    np.add.at(jacobian, (rows, columns), values)
+    return lambda right: np.asarray(np.linalg.lstsq(jacobian, right, rcond=1e-12)[0])
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, e: complex, limited: bool = True) -> complex:
