@@ -32,6 +32,7 @@ from .network import Network
 from .options import Plant
 from .parameters import ConverterParameters, load_converter
 from .protection import trip_reason, wait_reason
+from .pv_array import set_irradiance
 from .records import PlantRecords
 from .sensors import plant_sample
 from .steady_state import NoEquilibrium, plant_equilibrium
@@ -75,6 +76,7 @@ __all__ = [
     "plant_sample",
     "plant_step",
     "plant_truth",
+    "set_irradiance",
     "start_again",
     "take_out",
     "trip_reason",

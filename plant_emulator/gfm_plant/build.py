@@ -22,6 +22,7 @@ from gfm_plant.names import TRIPS
 from gfm_plant.network import Network
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
+from gfm_plant.pv_array import diode
 from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
 from gfm_plant.sparse import entries_of
 from gfm_plant.wiring import ConverterCircuit, Wiring
@@ -354,7 +355,12 @@ def _pack_converter_circuit(
         par["P_most"] = battery.P_discharge, battery.P_charge
     if (chopper := source.chopper) is not None:
         par["chopper"] = chopper.P, chopper.v_on, chopper.v_off
-    if source.mode == "controlled":
+    if (pv := source.pv) is not None:
+        par["I_0"], par["v_T"] = diode(pv.V_oc, pv.I_sc, pv.V_mp, pv.I_mp)
+        par["I_sc"], par["irradiance"] = pv.I_sc, pv.irradiance
+    if source.mode == "array":
+        par["across"] = 1
+    elif source.mode == "controlled":
         par["i_u_gain"] = 1.0
     else:
         par["k_p"], par["k_i"] = source.k_p, source.k_i
@@ -390,6 +396,11 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
     par["counts"] = max(1, round(bridge.timer_hz * T_s / max(1, round(carriers)) / 2))
     if bridge.kind == "average":
         return
+    if par[0]["across"]:
+        raise ValueError(
+            f"{where}.kind = {bridge.kind!r}: a PV array straight across C_dc (dc_source.mode ="
+            " 'array') needs an averaged bridge"
+        )
     if min(abs(carriers - 1), abs(carriers - 2)) > 1e-9:
         raise ValueError(
             f"{where}.carrier_hz = {bridge.carrier_hz:g}: must be {1 / T_s:g} or {2 / T_s:g} Hz, so"

@@ -18,6 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.period import advance, go_back, keep, length
 from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
+from gfm_plant.pv_array import array_current
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
 from gfm_plant.records import COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
@@ -48,12 +49,13 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
                 s.u[age, j] = u0[k, j]
         p, q, v = terminal(x0[k, 2], x0[k, 3], x0[k, 4], x0[k, 5])
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[k, V_DC], p, q, v
-        if r.i_u_gain == 0.0:
+        if r.i_u_gain == 0.0 and r.across == 0:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
         s.ahead = complex(1.0, 0.0)
         for x in range(3):  # a period of the carrier begins at its lower end, all legs above it
             s.level[x], s.gate[x], s.on_at[x] = r.levels - 1, 2 * (r.levels - 1), math.inf
+        s.irradiance = s.irradiance_to = r.irradiance
         s.soc, s.i_most[0], s.i_most[1] = r.soc[0], r.i_max, -r.i_max
         limit_dc_source(r, s)
     every_at_rest(plant, circuit(n, now), 0)
@@ -197,6 +199,8 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     out[9] = s.trip
     if r.tau_dc > 0.0:
         out[10] = s.i_source
+    elif r.across:
+        out[10] = array_current(r, s.irradiance, s.x[V_DC]) if s.trip == 0 else 0.0
     else:
         i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg
         out[10] = min(max(i_dc, s.i_most[1]), s.i_most[0]) if s.trip == 0 else 0.0

@@ -551,11 +551,14 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
     for r in plant.par:
         per_C = r["omega_b"] / r["C_dc"]
         rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
+        if r["across"]:  # the diode, at the open-circuit voltage
+            rate = per_C * (r["I_sc"] * max(1.0, r["irradiance"]) + r["I_0"]) / r["v_T"]
         if r["tau_dc"] > 0.0:
             rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
         if rate * longest > _DC_STEP * _MOST:
+            what = "pv" if r["across"] else "k_p, k_i, tau_s"
             raise ValueError(
-                f"plant.dc_source k_p, k_i, tau_s: with C_dc they are as fast as {rate:.6g}"
+                f"plant.dc_source {what}: with C_dc as fast as {rate:.6g}"
                 f" rad/s; allowed are {_DC_STEP * _MOST / longest:.6g} rad/s at this T_s"
             )
         r["dc_steps"] = max(1, math.ceil(rate * 2 * max(net["half_h"][:parts]) / _DC_STEP))

@@ -24,6 +24,7 @@ from gfm_plant.parameters import (
     check_factors,
     load_converter,
 )
+from gfm_plant.pv_array import MOST_IRRADIANCE
 from gfm_plant.records import MAX_DELAY, N_OVERLOADS
 from gfm_runtime.signals import (
     COUNTS,
@@ -86,13 +87,36 @@ class Chopper(Options):
         return self
 
 
+class PvArray(Options):
+    """A PV array, by four values of its data sheet at an irradiance of 1000 W/m2."""
+
+    V_oc: Positive = Field(description="open-circuit voltage, p.u. of V_dcref")
+    I_sc: Positive = Field(description="short-circuit current, p.u. of S_n/V_dcref")
+    V_mp: Positive = Field(description="voltage at the point of maximum power, p.u.")
+    I_mp: Positive = Field(description="current at the point of maximum power, p.u.")
+    irradiance: float = Field(
+        1.0, ge=0, le=MOST_IRRADIANCE, description="at the start, of 1000 W/m2"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_knee(self) -> PvArray:
+        for most, value in (("V_oc", "V_mp"), ("I_sc", "I_mp")):
+            if not 0.5 < (share := getattr(self, value) / (full := getattr(self, most))) < 0.995:
+                raise ValueError(
+                    f"{value} = {getattr(self, value):g}: must be more than {0.5 * full:g} and less"
+                    f" than {0.995 * full:g}, by {most}; it is {share:.4g} of it"
+                )
+        return self
+
+
 class DcSource(Options):
     """The current source that feeds C_dc, Eq. (8)."""
 
-    mode: Literal["controlled", "regulated"] = Field(
+    mode: Literal["controlled", "regulated", "array"] = Field(
         "controlled",
         description="controlled: the law's i_u flows (the paper's simulation); regulated: the "
-        "source holds v_dc = 1 with its own PI and i_u is ignored (the paper's rig)",
+        "source holds v_dc = 1 with its own PI and i_u is ignored (the paper's rig); array: the PV "
+        "array is straight across C_dc in place of a source, and i_u is ignored",
     )
     k_p: NonNegative = Field(90.0, description="PI of the regulated source, p.u./p.u.")
     k_i: NonNegative = Field(400.0, description="PI of the regulated source, p.u./(p.u. s)")
@@ -103,7 +127,25 @@ class DcSource(Options):
         "flows, s; none if not given",
     )
     battery: Battery | None = Field(None, description="what feeds it; no limit if none")
+    pv: PvArray | None = Field(
+        None,
+        description="PV array: across C_dc with mode = 'array'; else behind the source, a DC/DC "
+        "converter with an ideal tracker, whose power it limits to the most it gives; none if not "
+        "given",
+    )
     chopper: Chopper | None = Field(None, description="a brake of the DC link; none if not given")
+
+    @model_validator(mode="after")
+    def _has_one_origin(self) -> DcSource:
+        if self.mode == "array":
+            if self.pv is None:
+                raise ValueError("mode = 'array': needs a table pv")
+            for name in ("i_max", "tau_s", "battery"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name}: not with mode = 'array', which has no source")
+        if self.pv is not None and self.battery is not None:
+            raise ValueError("pv, battery: give one of them; the power of one source is limited")
+        return self
 
 
 class Grid(Options):

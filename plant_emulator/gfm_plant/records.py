@@ -71,6 +71,14 @@ converter_par_dtype = np.dtype(
         ("R_battery", "f8"),
         # the chopper: its conductance (0: none), v_dc that turns it on and off
         ("chopper", "f8", (3,)),
+        # the PV array, see `pv_array`: photocurrent at an irradiance of 1 (0: there is none),
+        # saturation current and voltage of the diode, irradiance at the start; whether it is
+        # straight across C_dc, in place of the source
+        ("I_sc", "f8"),
+        ("I_0", "f8"),
+        ("v_T", "f8"),
+        ("irradiance", "f8"),
+        ("across", "i8"),
         ("dc_steps", "i8"),  # of the DC link in a piece, see `net`
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
@@ -150,6 +158,10 @@ converter_state_dtype = np.dtype(
         ("i_most", "f8", (2,)),
         ("chopper", "f8"),
         ("soc", "f8"),
+        # on the PV array, where it goes, and how fast, 1/s
+        ("irradiance", "f8"),
+        ("irradiance_to", "f8"),
+        ("irradiance_rate", "f8"),
         ("E", "f8", (2,)),  # the bridge's voltage at this instant, d and q
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first

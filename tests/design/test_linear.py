@@ -28,6 +28,12 @@ RIG = {
     "sensors": {"bandwidth_hz": 300.0},
     "factors": {"R_f": 0.5, "R_g": 0.5},
 }
+PV = {
+    "dc_source": {
+        "mode": "array",
+        "pv": {"V_oc": 1.25, "I_sc": 1.08, "V_mp": 1.0, "I_mp": 1.0, "irradiance": 0.7},
+    }
+}
 REGULATED = {"dc_source": {"mode": "regulated"}}
 
 
@@ -120,6 +126,8 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         ("vsg-2", {"dc_source": {"mode": "regulated", "tau_s": 0.001}}),
         ("vsg-2", {"grid": {"finite": {"S": 3.0, "H": 4.0, "D": 1.0}}}),
         ("hybrid-angle", {}),
+        ("matching-2", PV),
+        ("mimo-gfm-deployable-rig", {**PV, "delay": {"samples": 1}}),
         ("psc-dc", {"factors": {"L_g": 10.0, "R_g": 10.0}}),
         ("dvoc", {"factors": {"L_g": 10.0, "R_g": 10.0}, "delay": {"samples": 1}}),
     ],

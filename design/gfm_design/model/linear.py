@@ -22,6 +22,7 @@ from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.swing import swing_matrix
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
+from gfm_plant.pv_array import array_slope
 from gfm_plant.records import Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import BuiltLaw
@@ -146,7 +147,8 @@ def linearise_plant(
         x, u, d = np.split(z, [N_X, N_X + n_u])
         p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
         slopes[:, j] = np.concatenate([_rates(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
-    regulated, lags = int(r["i_u_gain"] == 0.0), int(r["tau_dc"] > 0.0)
+    controlled, lags = int(r["i_u_gain"] != 0.0), int(r["tau_dc"] > 0.0)
+    regulated = int(not controlled and not r["across"])
     finite, sensors = 2 * int(grid is not None), 4 * int(r["filtered"])
     source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
     n = swing + finite
@@ -160,13 +162,15 @@ def linearise_plant(
     B[V_DC, 0] = 0.0
     if regulated:
         asked[V_DC], asked[N_X], A[N_X, V_DC] = -r["k_p"], 1.0, -r["k_i"]
+    if r["across"]:
+        asked[V_DC] = array_slope(r, op.x[V_DC])
     if lags:
-        A[source], B[source, 0] = asked / r["tau_dc"], (1 - regulated) / r["tau_dc"]
+        A[source], B[source, 0] = asked / r["tau_dc"], controlled / r["tau_dc"]
         A[source, source] -= 1 / r["tau_dc"]
         A[V_DC, source] = per_i_dc
     else:
         A[V_DC] += per_i_dc * asked
-        B[V_DC, 0] = per_i_dc * (1 - regulated)
+        B[V_DC, 0] = per_i_dc * controlled
     if grid is not None:  # omega_g is a state, and so is the power of the turbines
         A[:, swing], B_d[:, 0] = B_d[:, 0], 0.0
         own, per_power = swing_matrix(grid.H, grid.D, grid.droop, grid.T_gov, grid.S)

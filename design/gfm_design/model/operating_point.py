@@ -3,7 +3,10 @@
 Unknowns are the plant's states, the DC current, E_u and the law's states; omega_u is the grid's.
 The equations are the plant's Eq. (1)-(8) (``gfm_plant.model.f``, not a copy of it), the law's
 x = A x + B (r, y) and u = u_0 + C x + D (r, y) at its sampling time, with y as the sensors report
-it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act.
+it. A regulated DC source holds v_dc = 1, and row 1 of the law does not act. Neither does it with a
+PV array straight across the link, whose current by v_dc is then the equation of the DC side: a law
+that answers to v_dc decides on v_dc and takes the power that the array gives there, and of one that
+does not v_dc is where the array gives what the law asks for, beyond the point of maximum power.
 """
 
 import cmath
@@ -21,6 +24,7 @@ from gfm_plant import Network, NoEquilibrium, plant_equilibrium
 from gfm_plant.circuit import GROUND
 from gfm_plant.model import DELTA, N_X, V_DC, compiled_f, g
 from gfm_plant.names import SENSED
+from gfm_plant.pv_array import array_current, most_power, open_circuit_voltage
 from gfm_plant.records import Record
 from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
@@ -52,7 +56,8 @@ class OperatingPoint:
     #: the plant's state, shape (8,), order as in ``gfm_plant.model``, in the frame of the law: its
     #: E_u lies on the d axis
     x: Vector
-    #: the law's output, shape (3,); i_u is the current of the DC source, also of a regulated one
+    #: the law's output, shape (3,); i_u is the current of the DC source, also of one that does
+    #: not follow the law
     u: Vector
     y: Vector  #: the outputs as the sensors report them, shape (5,)
     x_law: Vector  #: the law's state, shape (n,)
@@ -357,6 +362,9 @@ class _ConverterEquilibrium:
             NoEquilibrium: the line cannot carry P_ref.
         """
         x, u = plant_equilibrium(self.par, self.ref[1], self.ref[4], V_g, omega_g)
+        r = self.par[0]
+        if r["across"]:  # on the side of the curve where v_dc falls as more power is drawn
+            x[V_DC] = max(1.0, open_circuit_voltage(r, r["irradiance"]))
         return np.concatenate([x, [u[0], u[2]], np.zeros(len(self.kept))])
 
     def residual(self, z: Vector, V_g: float, omega_g: float, theta: float = 0.0) -> Vector:
@@ -368,7 +376,11 @@ class _ConverterEquilibrium:
         x[DELTA] -= theta
         u_law, x_next = self._law(x_law, ref, y)
         dx = compiled_f(x, u, np.array([omega_g, V_g]), self.par)
-        dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
+        r = self.par[0]
+        if r["across"]:
+            dc = array_current.py_func(r, r["irradiance"], x[V_DC]) - u[0]
+        else:
+            dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = dx[self._steady]
         e = self._command(x, u)
         if isinstance(inner := law.law.inner, GridFollowing):
@@ -416,7 +428,10 @@ class _ConverterEquilibrium:
 
     def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
-        cause = ""
+        cause, r = "", self.par[0]
+        if r["across"]:
+            P, v = most_power.py_func(r, r["irradiance"])
+            cause = f"; the PV array gives at most {P:.4g} p.u., at v_dc = {v:.4g} p.u."
         if self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any()):
             cause = (
                 "; nothing holds v_dc: row 1 answers to no measurement; give it phi.11, or the "

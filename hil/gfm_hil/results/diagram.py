@@ -312,7 +312,8 @@ def _converter(axes: Axes, row: int, name: str, plant: Plant, law: str) -> None:
     parameters = load_converter(plant.converter)
     pu = parameters.pu(plant.real_factors())
     axes.add_patch(Circle((0.25, y), 0.25, fc="white", ec=_INK, lw=1.1))
-    axes.text(0.25, y, "DC", ha="center", va="center", fontsize=6.5, color=_INK)
+    source = "PV" if plant.dc_source.mode == "array" else "DC"
+    axes.text(0.25, y, source, ha="center", va="center", fontsize=6.5, color=_INK)
     _wire(axes, (0.5, y), (1.4, y))
     _capacitor(axes, 0.95, y)
     _bridge(axes, 1.4, y)

@@ -187,6 +187,10 @@ class Steps:
         """The load of a finite grid changes, p.u. of the grid's rating."""
         self._step("grid-load", change=change)
 
+    def irradiance(self, irradiance: float, rate: float | None = None, **more: Any) -> None:
+        """Irradiance on the PV arrays, of 1000 W/m2: a step, or a ramp at ``rate`` [1/s]."""
+        self._step("irradiance", irradiance=irradiance, rate=rate, **more)
+
     def grid_unbalance(
         self,
         retained: tuple[float, float, float] = (1.0, 1.0, 1.0),

@@ -17,6 +17,7 @@ from gfm_hil.scenario.events.grid_load import GridLoad
 from gfm_hil.scenario.events.grid_profile import GridProfile
 from gfm_hil.scenario.events.grid_unbalance import GridUnbalance
 from gfm_hil.scenario.events.grid_voltage import GridVoltage
+from gfm_hil.scenario.events.irradiance import Irradiance
 from gfm_hil.scenario.events.law import LawChange
 from gfm_hil.scenario.events.note import Note
 from gfm_hil.scenario.events.phase_jump import PhaseJump
@@ -27,7 +28,7 @@ from gfm_hil.scenario.events.reset import Reset
 _KINDS: tuple[type[Event], ...] = (
     Reference, LawChange, GainChange, Reset, GridFrequency, GridVoltage, GridProfile, PhaseJump,
     GridImpedance, GridLoad, GridUnbalance, Fault, FaultClear, GridBreaker, LineBreaker,
-    Note,
+    Irradiance, Note,
 )  # fmt: skip
 EVENTS = {get_args(kind.model_fields["type"].annotation)[0]: kind for kind in _KINDS}
 """The kinds of events by what ``type`` says in a scenario."""
