@@ -23,7 +23,14 @@ from gfm_plant.network import Network
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.pv_array import diode
-from gfm_plant.records import COMPARE, N_RING, converter_par_dtype, converter_state_dtype
+from gfm_plant.records import (
+    ACROSS,
+    BEHIND,
+    COMPARE,
+    N_RING,
+    converter_par_dtype,
+    converter_state_dtype,
+)
 from gfm_plant.sparse import entries_of
 from gfm_plant.wiring import ConverterCircuit, Wiring
 from gfm_runtime.signals import CHANNELS, COUNT_BITS, SPACE_VECTOR
@@ -358,11 +365,10 @@ def _pack_converter_circuit(
     if (pv := source.pv) is not None:
         par["I_0"], par["v_T"] = diode(pv.V_oc, pv.I_sc, pv.V_mp, pv.I_mp)
         par["I_sc"], par["irradiance"] = pv.I_sc, pv.irradiance
-    if source.mode == "array":
-        par["across"] = 1
-    elif source.mode == "controlled":
+        par["array"] = ACROSS if source.mode == "array" else BEHIND
+    if source.mode == "controlled":
         par["i_u_gain"] = 1.0
-    else:
+    elif source.mode == "regulated":
         par["k_p"], par["k_i"] = source.k_p, source.k_i
     return ConverterCircuit(
         name, node,
@@ -396,7 +402,7 @@ def _pack_bridge(par: Record, where: str, options: Plant, T_s: float) -> None:
     par["counts"] = max(1, round(bridge.timer_hz * T_s / max(1, round(carriers)) / 2))
     if bridge.kind == "average":
         return
-    if par[0]["across"]:
+    if par[0]["array"] == ACROSS:
         raise ValueError(
             f"{where}.kind = {bridge.kind!r}: a PV array straight across C_dc (dc_source.mode ="
             " 'array') needs an averaged bridge"

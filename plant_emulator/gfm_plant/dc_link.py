@@ -7,6 +7,7 @@ from typing import Any
 
 from gfm_plant.model import V_DC
 from gfm_plant.pv_array import most_power, move_irradiance
+from gfm_plant.records import ACROSS, BEHIND
 from gfm_runtime.compiled import compiled, inlined
 
 _FINER = 16  # times as many steps where a series of five terms does not do
@@ -24,9 +25,9 @@ def limit_dc_source(r: Any, s: Any) -> None:
         gives = r.P_most[0] if s.soc > r.soc[1] else 0.0
         takes = r.P_most[1] if s.soc < r.soc[2] else 0.0
         s.i_most[0], s.i_most[1] = min(r.i_max, gives / v), max(-r.i_max, -takes / v)
-    if r.I_sc > 0.0:
+    if r.array != 0:
         move_irradiance(s, r.T_s)
-        if r.across == 0:
+        if r.array == BEHIND:
             s.i_most[0], s.i_most[1] = min(r.i_max, most_power(r, s.irradiance)[0] / v), 0.0
     if r.chopper[0] > 0.0:
         on = v > (r.chopper[2] if s.chopper > 0.0 else r.chopper[1])
@@ -63,7 +64,7 @@ def advance_dc_link(r: Any, s: Any, half_h: float) -> tuple[float, float]:
     Returns:
         v_dc in the middle and at the end, p.u.
     """
-    if r.across:
+    if r.array == ACROSS:
         return _advance_with_array(r, s, half_h)
     return _advance(r, s, half_h, False)
 

@@ -21,7 +21,7 @@ from gfm_plant.protection import follow_voltage, protect, trip
 from gfm_plant.pv_array import array_current
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
-from gfm_plant.records import COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
+from gfm_plant.records import ACROSS, COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
 from gfm_plant.solution import circuit, enter, mirror_sources, node_voltage, own
 from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.by_address import call_at
@@ -49,7 +49,7 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
                 s.u[age, j] = u0[k, j]
         p, q, v = terminal(x0[k, 2], x0[k, 3], x0[k, 4], x0[k, 5])
         s.sensed[0], s.sensed[1], s.sensed[2], s.sensed[3] = x0[k, V_DC], p, q, v
-        if r.i_u_gain == 0.0 and r.across == 0:
+        if r.i_u_gain == 0.0 and r.array != ACROSS:
             s.i_reg = u0[k, 0] - r.k_p * (1.0 - x0[k, V_DC])
         s.i_source, s.E[0], s.E[1] = u0[k, 0], s.u_now[2], s.u_now[3]
         s.ahead = complex(1.0, 0.0)
@@ -199,7 +199,7 @@ def plant_truth(plant: PlantRecords, k: int, out: NDArray[np.float64]) -> None:
     out[9] = s.trip
     if r.tau_dc > 0.0:
         out[10] = s.i_source
-    elif r.across:
+    elif r.array == ACROSS:
         out[10] = array_current(r, s.irradiance, s.x[V_DC]) if s.trip == 0 else 0.0
     else:
         i_dc = r.i_u_gain * s.u_now[0] + r.k_p * (1.0 - s.x[V_DC]) + s.i_reg

@@ -22,7 +22,7 @@ from gfm_plant.model import DELTA
 from gfm_plant.names import WAYS
 from gfm_plant.phases import convert_nothing
 from gfm_plant.port import pack_port
-from gfm_plant.records import COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
+from gfm_plant.records import ACROSS, COMPARE, N_COMMANDS, N_OWN, N_PHASES, PlantRecords
 from gfm_plant.solution import integrals
 from gfm_plant.sparse import pack_sparse
 from gfm_plant.ways import find_ways
@@ -551,12 +551,12 @@ def _pack_pieces(plant: Network, fastest: float) -> None:
     for r in plant.par:
         per_C = r["omega_b"] / r["C_dc"]
         rate = max(per_C * r["k_p"], math.sqrt(per_C * r["k_i"]))
-        if r["across"]:  # the diode, at the open-circuit voltage
+        if r["array"] == ACROSS:  # the diode, at the open-circuit voltage
             rate = per_C * (r["I_sc"] * max(1.0, r["irradiance"]) + r["I_0"]) / r["v_T"]
         if r["tau_dc"] > 0.0:
             rate = max(rate, 1 / r["tau_dc"], math.sqrt(per_C * r["k_p"] / r["tau_dc"]))
         if rate * longest > _DC_STEP * _MOST:
-            what = "pv" if r["across"] else "k_p, k_i, tau_s"
+            what = "pv" if r["array"] == ACROSS else "k_p, k_i, tau_s"
             raise ValueError(
                 f"plant.dc_source {what}: with C_dc as fast as {rate:.6g}"
                 f" rad/s; allowed are {_DC_STEP * _MOST / longest:.6g} rad/s at this T_s"

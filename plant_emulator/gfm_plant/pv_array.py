@@ -84,7 +84,7 @@ def set_irradiance(
     if rate is not None and not 0.0 < rate < math.inf:
         raise ValueError(f"rate = {rate}: must be > 0 1/s")
     names = [unit.name for unit in plant.wiring.units]
-    arrays = [k for k in range(len(names)) if plant.par[k]["I_sc"] > 0.0]
+    arrays = [k for k in range(len(names)) if plant.par[k]["array"]]
     those = [k for k in arrays if converter in (None, names[k])]
     if not those:
         of = "" if converter is None else f" of {converter}"

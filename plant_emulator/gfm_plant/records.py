@@ -28,6 +28,7 @@ N_OVERLOADS = 4  # steps of the overload profile, at most; their thresholds foll
 N_LIVE = 10  # states of a converter with a switched bridge, see ``ends``
 N_PATH = 4  # terms of its path between two edges, see ``ends``
 N_GATES = 6  # states of the gates of a leg, at most, see `bridge`
+ACROSS, BEHIND = 1, 2  # where a PV array is, see ``array``
 N_RING = 256  # places of a ring that holds one cycle
 
 
@@ -71,14 +72,7 @@ converter_par_dtype = np.dtype(
         ("R_battery", "f8"),
         # the chopper: its conductance (0: none), v_dc that turns it on and off
         ("chopper", "f8", (3,)),
-        # the PV array, see `pv_array`: photocurrent at an irradiance of 1 (0: there is none),
-        # saturation current and voltage of the diode, irradiance at the start; whether it is
-        # straight across C_dc, in place of the source
-        ("I_sc", "f8"),
-        ("I_0", "f8"),
-        ("v_T", "f8"),
-        ("irradiance", "f8"),
-        ("across", "i8"),
+        ("array", "i8"),  # a PV array is ACROSS the link or BEHIND its source; 0: there is none
         ("dc_steps", "i8"),  # of the DC link in a piece, see `net`
         # the bridge: |E| <= m_max v_dc, and |i| <= i_peak by blocking pulses
         ("m_max", "f8"),
@@ -143,6 +137,12 @@ converter_par_dtype = np.dtype(
         ("phase_top", "f8"),
         ("phase_weights", "f8", (3,)),
         ("phase_samples", "i8"),  # conversions in a period, whose sum is the count
+        # the PV array, see `pv_array`: photocurrent at an irradiance of 1, saturation current and
+        # voltage of the diode, irradiance at the start
+        ("I_sc", "f8"),
+        ("I_0", "f8"),
+        ("v_T", "f8"),
+        ("irradiance", "f8"),
     ],
     align=True,
 )
@@ -158,10 +158,6 @@ converter_state_dtype = np.dtype(
         ("i_most", "f8", (2,)),
         ("chopper", "f8"),
         ("soc", "f8"),
-        # on the PV array, where it goes, and how fast, 1/s
-        ("irradiance", "f8"),
-        ("irradiance_to", "f8"),
-        ("irradiance_rate", "f8"),
         ("E", "f8", (2,)),  # the bridge's voltage at this instant, d and q
         ("sensed", "f8", (4,)),  # the sensors' low-pass states
         ("u", "f8", (MAX_DELAY + 2, N_COMMANDS)),  # commands behind the D/A, u[k] first
@@ -239,6 +235,10 @@ converter_state_dtype = np.dtype(
         ("v_before", "f8", (2,)),
         ("i_rms", "f8"),
         ("omega_v", "f8"),
+        # the irradiance on the PV array, where it goes, and how fast, 1/s
+        ("irradiance", "f8"),
+        ("irradiance_to", "f8"),
+        ("irradiance_rate", "f8"),
     ],
     align=True,
 )

@@ -25,6 +25,7 @@ RIG: dict[str, Any] = {
     "sensors": {"bandwidth_hz": 300.0, "gain": {"p": 1.02}},
     "factors": {"R_f": 3.0, "R_g": 3.0},
 }
+PV = {"dc_source": {"mode": "array", "pv": {"V_oc": 1.25, "I_sc": 1.08, "V_mp": 1.0, "I_mp": 1.0}}}
 FINITE = {"finite": {"S": 2.0, "H": 3.0, "D": 1.0}}
 
 
@@ -63,6 +64,7 @@ def are_equal(found: np.ndarray, wanted: np.ndarray) -> bool:
         ("vsg-2", None, {}),
         ("mimo-gfm-deployable", None, RIG),
         ("vsg-2", "virtual-stator", RIG),
+        ("matching-2", None, PV),
         ("vsg-5", None, {**RIG, "dc_source": {"mode": "regulated", "tau_s": 3e-3}, "grid": FINITE}),
     ],
 )

@@ -41,7 +41,7 @@ def test_a_scenario_table():
         ({"factors": {"L": 1.0}}, "factors.L", "'L_f', 'R_f'"),
         ({"grid": {"load_R": 36.1}}, "grid", "load_R = 36.1, load_L = None: give both"),
         ({"grid": {"load_R": 36.1, "load_L": -0.1}}, "grid.load_L", "greater than 0"),
-        ({"dc_source": {"mode": "ideal"}}, "dc_source.mode", "'controlled', 'regulated' or 'array'"),
+        ({"dc_source": {"mode": "ideal"}}, "dc_source.mode", "'regulated' or 'array'"),
         ({"sensors": {"gain": {"omega_u": 1.0}}}, "sensors.gain.omega_u", "'v_dc', 'p'"),
         ({"sensors": {"bandwidth_hz": "1k"}}, "sensors.bandwidth_hz", "valid number"),
         ({"sensors": {"offset": {"p": float("nan")}}}, "sensors.offset.p", "finite"),

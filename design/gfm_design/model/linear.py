@@ -23,7 +23,7 @@ from gfm_plant.components.swing import swing_matrix
 from gfm_plant.model import DELTA, N_X, V_DC, f, g
 from gfm_plant.names import SENSED
 from gfm_plant.pv_array import array_slope
-from gfm_plant.records import Record
+from gfm_plant.records import ACROSS, Record
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.law import BuiltLaw
 from gfm_runtime.realisation import LawStateSpace
@@ -148,7 +148,7 @@ def linearise_plant(
         p_g = d[1] * (np.cos(x[DELTA]) * x[4] - np.sin(x[DELTA]) * x[5])
         slopes[:, j] = np.concatenate([_rates(x, u, d, par), g(x, u), [p_g]]).imag / _STEP
     controlled, lags = int(r["i_u_gain"] != 0.0), int(r["tau_dc"] > 0.0)
-    regulated = int(not controlled and not r["across"])
+    regulated = int(not controlled and r["array"] != ACROSS)
     finite, sensors = 2 * int(grid is not None), 4 * int(r["filtered"])
     source, swing = N_X + regulated, N_X + regulated + lags  # where the states begin
     n = swing + finite
@@ -162,7 +162,7 @@ def linearise_plant(
     B[V_DC, 0] = 0.0
     if regulated:
         asked[V_DC], asked[N_X], A[N_X, V_DC] = -r["k_p"], 1.0, -r["k_i"]
-    if r["across"]:
+    if r["array"] == ACROSS:
         asked[V_DC] = array_slope(r, op.x[V_DC])
     if lags:
         A[source], B[source, 0] = asked / r["tau_dc"], controlled / r["tau_dc"]

@@ -25,7 +25,7 @@ from gfm_plant.circuit import GROUND
 from gfm_plant.model import DELTA, N_X, V_DC, compiled_f, g
 from gfm_plant.names import SENSED
 from gfm_plant.pv_array import array_current, most_power, open_circuit_voltage
-from gfm_plant.records import Record
+from gfm_plant.records import ACROSS, BEHIND, Record
 from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
@@ -37,6 +37,7 @@ Vector = NDArray[np.float64]
 _ROUNDS = 40
 _ROUNDING = 1e-12  # p.u.; a residual that is smaller is none
 _MOST_BY_SQUARES = 500  # unknowns; the time of least squares grows with their cube
+_LEAST_P = 1e-9  # p.u. of power; less is rounding
 _NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
 _LOSES = 30  # rounds in which a command is found by what the bridge loses of it
 
@@ -363,7 +364,7 @@ class _ConverterEquilibrium:
         """
         x, u = plant_equilibrium(self.par, self.ref[1], self.ref[4], V_g, omega_g)
         r = self.par[0]
-        if r["across"]:  # on the side of the curve where v_dc falls as more power is drawn
+        if r["array"] == ACROSS:  # on the side of the curve where v_dc falls as more power is drawn
             x[V_DC] = max(1.0, open_circuit_voltage(r, r["irradiance"]))
         return np.concatenate([x, [u[0], u[2]], np.zeros(len(self.kept))])
 
@@ -377,7 +378,7 @@ class _ConverterEquilibrium:
         u_law, x_next = self._law(x_law, ref, y)
         dx = compiled_f(x, u, np.array([omega_g, V_g]), self.par)
         r = self.par[0]
-        if r["across"]:
+        if r["array"] == ACROSS:
             dc = array_current.py_func(r, r["irradiance"], x[V_DC]) - u[0]
         else:
             dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
@@ -395,8 +396,13 @@ class _ConverterEquilibrium:
         return np.concatenate([ac, [dc, *rest], change])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
-        """The operating point at the unknowns z."""
+        """The operating point at the unknowns z. Raises NoEquilibrium: the DC source would need
+        another power there than the PV array behind it can give."""
         x, u, y, x_law = self._unpack(z, omega_g)
+        if (r := self.par[0])["array"] == BEHIND:
+            most, P = most_power.py_func(r, r["irradiance"])[0], u[0] * x[V_DC]
+            if not -_LEAST_P <= P <= most + _LEAST_P:
+                raise NoEquilibrium(self.no_steady_state(f"omega_g = {omega_g:g} p.u."))
         x, u, e = _in_frame_of_law(self.law, x, u, self._command(x, u))
         return OperatingPoint(x, u, y, x_law, e)
 
@@ -429,9 +435,12 @@ class _ConverterEquilibrium:
     def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
         cause, r = "", self.par[0]
-        if r["across"]:
+        if r["array"] == ACROSS:
             P, v = most_power.py_func(r, r["irradiance"])
             cause = f"; the PV array gives at most {P:.4g} p.u., at v_dc = {v:.4g} p.u."
+        elif r["array"] == BEHIND:
+            most = most_power.py_func(r, r["irradiance"])[0]
+            cause = f"; the PV array behind the DC source gives 0 to {most:.4g} p.u."
         if self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any()):
             cause = (
                 "; nothing holds v_dc: row 1 answers to no measurement; give it phi.11, or the "

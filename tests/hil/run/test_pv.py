@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 
 SHEET = {"V_oc": 1.25, "I_sc": 1.08, "V_mp": 1.0, "I_mp": 1.0}
@@ -68,6 +69,45 @@ def test_a_regulated_source_gives_what_its_array_can():
     )
     assert run.status == "completed"
     assert np.abs(run.signals["true_v_dc"] - 1.0).max() < 1e-3
+
+
+def test_it_does_not_begin_beyond_what_the_array_behind_it_gives():
+    source = {"mode": "regulated", "pv": {**SHEET, "irradiance": 0.2}}
+    with pytest.raises(UserError, match=r"the PV array behind the DC source gives 0 to 0.17 p.u."):
+        gfmhil.run("pref_step", plant__dc_source=source)
+
+
+def test_of_two_converters_one_is_in_the_shade():
+    """By name; the other keeps its power, and the grid gives what is missing."""
+    content = {
+        "title": "", "duration": 1.5, "link": {"type": "inproc"}, "law": "matching-2",
+        "plant": {"dc_source": ACROSS, "factors": {"L_g": 3.0, "R_g": 3.0}},
+        "network": {
+            "grid": "g",
+            "converters": {"A": {"node": "bus"}, "B": {"node": "bus"}},
+            "lines": {"cable": {"start": "bus", "end": "g", "L": 0.05, "R": 0.005}},
+        },
+        "events": [{"t": 0.1, "type": "irradiance", "irradiance": 0.5, "converter": "B"}],
+    }  # fmt: skip
+    run = gfmhil.run_network(content)
+    A, B = (run.runs[name].signals for name in "AB")
+    for s in (A, B):
+        assert np.abs(s["true_v_dc"][:900] - 1.0).max() < 1e-9
+        assert s["true_v_dc"][-1] == pytest.approx(1.0, abs=1e-4)
+    assert A["true_i_dc"][-1] == pytest.approx(1.0, abs=1e-3)
+    assert B["true_i_dc"][-1] == pytest.approx(1.0 - 0.5 * 1.08, abs=1e-3)
+
+
+@pytest.mark.processes
+def test_over_a_link_the_bits_are_the_same(cloud, tmp_path):
+    code = main(
+        ["run", "cloud_over_pv", "--link", "shm", "--out", str(tmp_path / "run"), "--quiet",
+         "--no-figures"]
+    )  # fmt: skip
+    assert code == 0
+    there = gfmhil.load_run(tmp_path / "run")
+    for name in ("true_p", "true_v_dc", "true_i_dc"):
+        assert there.signals[name].tobytes() == cloud.signals[name].tobytes()
 
 
 def test_the_event_needs_an_array_of_the_converter():
