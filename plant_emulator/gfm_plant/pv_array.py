@@ -1,10 +1,11 @@
-"""A PV array: current by voltage of the single-diode model, from four values of a data sheet.
+"""A PV array: current by voltage, after the single-diode model, from four values of a data sheet.
 
 Without its resistances the model is i = I_sc (G - C_1 (exp(v / (C_2 V_oc)) - 1)). Its two constants
 follow from the point of maximum power, C_2 = (V_mp / V_oc - 1) / ln(1 - I_mp / I_sc) and
-C_1 = (1 - I_mp / I_sc) exp(-V_mp / (C_2 V_oc)); H. S. Rauschenbach, Solar Cell Array Design
-Handbook, 1980. The irradiance G moves the photocurrent alone, so that the open-circuit voltage
-follows ln G. An array has no blocking diode: above its open-circuit voltage it takes current.
+C_1 = (1 - I_mp / I_sc) exp(-V_mp / (C_2 V_oc)); it is usually cited from H. S. Rauschenbach, Solar
+Cell Array Design Handbook, 1980. The irradiance G moves the photocurrent alone, so that the
+open-circuit voltage follows ln G. An array has no blocking diode: above that voltage it takes
+current.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 MOST_IRRADIANCE = 1.5
 """Of 1000 W/m2: at the edge of a cloud it may exceed 1 by up to a half."""
 
-_ROUNDS = 6  # of Newton's method for the point of maximum power; the fourth is exact already
+_ROUNDS = 4  # of Newton's method for the point of maximum power, which is then exact to rounding
 
 
 def diode(V_oc: float, I_sc: float, V_mp: float, I_mp: float) -> tuple[float, float]:
@@ -86,7 +87,7 @@ def set_irradiance(
     names = [unit.name for unit in plant.wiring.units]
     arrays = [k for k in range(len(names)) if plant.par[k]["array"]]
     those = [k for k in arrays if converter in (None, names[k])]
-    if not those:
+    if not those and not plant.elsewhere:  # a part of a plant may have none
         of = "" if converter is None else f" of {converter}"
         raise ValueError(f"plant.dc_source.pv{of}: not set; there is no PV array")
     for k in those:

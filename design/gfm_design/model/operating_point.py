@@ -402,7 +402,10 @@ class _ConverterEquilibrium:
         if (r := self.par[0])["array"] == BEHIND:
             most, P = most_power.py_func(r, r["irradiance"])[0], u[0] * x[V_DC]
             if not -_LEAST_P <= P <= most + _LEAST_P:
-                raise NoEquilibrium(self.no_steady_state(f"omega_g = {omega_g:g} p.u."))
+                raise NoEquilibrium(
+                    f"{self.law.law.name} rests with {P:.4g} p.u. of the DC source; the PV array"
+                    f" behind it gives 0 to {most:.4g} p.u."
+                )
         x, u, e = _in_frame_of_law(self.law, x, u, self._command(x, u))
         return OperatingPoint(x, u, y, x_law, e)
 
@@ -438,9 +441,6 @@ class _ConverterEquilibrium:
         if r["array"] == ACROSS:
             P, v = most_power.py_func(r, r["irradiance"])
             cause = f"; the PV array gives at most {P:.4g} p.u., at v_dc = {v:.4g} p.u."
-        elif r["array"] == BEHIND:
-            most = most_power.py_func(r, r["irradiance"])[0]
-            cause = f"; the PV array behind the DC source gives 0 to {most:.4g} p.u."
         if self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any()):
             cause = (
                 "; nothing holds v_dc: row 1 answers to no measurement; give it phi.11, or the "

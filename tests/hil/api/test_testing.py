@@ -401,3 +401,13 @@ def test_controller_that_does_not_run_is_told(lab, command, error, says):
     bench.run(0.01)
     with pytest.raises(error, match=says):
         bench.assert_no_trip()
+
+
+def test_the_light_on_an_array_falls(lab):
+    pv = {"V_oc": 1.25, "I_sc": 1.08, "V_mp": 1.0, "I_mp": 1.0}
+    bench = lab(law="matching-2", plant__dc_source={"mode": "array", "pv": pv})
+    bench.run(0.1)
+    bench.irradiance(0.5, rate=5.0)
+    bench.run(0.8)
+    bench.assert_settles("v_dc", to=1.0, within=0.6, tolerance=1e-3)
+    assert bench.signals["true_i_dc"][-1] == pytest.approx(1.0 - 0.5 * 1.08, abs=1e-3)

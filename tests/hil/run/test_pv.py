@@ -73,7 +73,7 @@ def test_a_regulated_source_gives_what_its_array_can():
 
 def test_it_does_not_begin_beyond_what_the_array_behind_it_gives():
     source = {"mode": "regulated", "pv": {**SHEET, "irradiance": 0.2}}
-    with pytest.raises(UserError, match=r"the PV array behind the DC source gives 0 to 0.17 p.u."):
+    with pytest.raises(UserError, match=r"the PV array behind it gives 0 to 0.17 p.u."):
         gfmhil.run("pref_step", plant__dc_source=source)
 
 
