@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from gfm_plant.model import V_DC
-from gfm_plant.pv_array import most_power, move_irradiance
+from gfm_plant.pv_array import move_irradiance
 from gfm_plant.records import ACROSS, BEHIND
 from gfm_runtime.compiled import compiled, inlined
 
@@ -26,9 +26,9 @@ def limit_dc_source(r: Any, s: Any) -> None:
         takes = r.P_most[1] if s.soc < r.soc[2] else 0.0
         s.i_most[0], s.i_most[1] = min(r.i_max, gives / v), max(-r.i_max, -takes / v)
     if r.array != 0:
-        move_irradiance(s, r.T_s)
+        move_irradiance(r, s)
         if r.array == BEHIND:
-            s.i_most[0], s.i_most[1] = min(r.i_max, most_power(r, s.irradiance)[0] / v), 0.0
+            s.i_most[0], s.i_most[1] = min(r.i_max, s.P_array / v), 0.0
     if r.chopper[0] > 0.0:
         on = v > (r.chopper[2] if s.chopper > 0.0 else r.chopper[1])
         s.chopper = r.chopper[0] if on else 0.0

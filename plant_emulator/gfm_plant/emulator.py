@@ -18,7 +18,7 @@ from gfm_plant.names import BAD_COMMAND, DIVERGED, NOT_ASKED
 from gfm_plant.period import advance, go_back, keep, length
 from gfm_plant.phases import convert
 from gfm_plant.protection import follow_voltage, protect, trip
-from gfm_plant.pv_array import array_current
+from gfm_plant.pv_array import array_current, most_power
 from gfm_plant.quantise import quantise
 from gfm_plant.ramps import advance_grid
 from gfm_plant.records import ACROSS, COMPARE, I_F, MAX_DELAY, N_COMMANDS, PlantRecords, V
@@ -55,7 +55,9 @@ def plant_start(plant: PlantRecords, x0: NDArray[np.float64], u0: NDArray[np.flo
         s.ahead = complex(1.0, 0.0)
         for x in range(3):  # a period of the carrier begins at its lower end, all legs above it
             s.level[x], s.gate[x], s.on_at[x] = r.levels - 1, 2 * (r.levels - 1), math.inf
-        s.irradiance = s.irradiance_to = r.irradiance
+        if r.array != 0:
+            s.irradiance = s.irradiance_to = r.irradiance
+            s.P_array = most_power(r, r.irradiance)[0]
         s.soc, s.i_most[0], s.i_most[1] = r.soc[0], r.i_max, -r.i_max
         limit_dc_source(r, s)
     every_at_rest(plant, circuit(n, now), 0)

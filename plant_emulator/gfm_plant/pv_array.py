@@ -61,9 +61,11 @@ def most_power(r: Any, irradiance: float) -> tuple[float, float]:
 
 
 @inlined
-def move_irradiance(s: Any, T_s: float) -> None:
+def move_irradiance(r: Any, s: Any) -> None:
     """Move a ramp of the irradiance on by one tick."""
-    s.irradiance = towards(s.irradiance, s.irradiance_to, s.irradiance_rate * T_s)
+    if s.irradiance != s.irradiance_to:
+        s.irradiance = towards(s.irradiance, s.irradiance_to, s.irradiance_rate * r.T_s)
+        s.P_array = most_power(r, s.irradiance)[0]
 
 
 def set_irradiance(
@@ -95,3 +97,4 @@ def set_irradiance(
         s["irradiance_to"], s["irradiance_rate"] = irradiance, math.inf if rate is None else rate
         if rate is None:
             s["irradiance"] = irradiance
+            s["P_array"] = most_power.py_func(plant.par[k], irradiance)[0]

@@ -235,10 +235,11 @@ converter_state_dtype = np.dtype(
         ("v_before", "f8", (2,)),
         ("i_rms", "f8"),
         ("omega_v", "f8"),
-        # the irradiance on the PV array, where it goes, and how fast, 1/s
+        # the irradiance on the PV array, where it goes, and how fast, 1/s; the largest power there
         ("irradiance", "f8"),
         ("irradiance_to", "f8"),
         ("irradiance_rate", "f8"),
+        ("P_array", "f8"),
     ],
     align=True,
 )
