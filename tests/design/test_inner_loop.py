@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,13 @@ STAGES = {
     **{name: load_law("vsg-2", name).laws[0].inner for name in SHIPPED},
     "stator with integral and PLL": VirtualStator(k_ci=20.0, f_pll=15.0),
     "voltage loop without integral": Cascaded(k_vi=0.0, k_ci=10.0, f_pll=30.0),
-    "grid-following": GridFollowing(k_f=3.0),
-    "grid-following without integral": GridFollowing(k_ci=0.0),
 }
+FOLLOWING = {
+    "grid-following": GridFollowing(k_f=3.0),
+    "grid-following without integral": GridFollowing(k_ci=0.0, k_dc=2.0),
+}
+LAWS = ("vsg-2", "dvoc", "vsg-5")
+ARRAY = {"mode": "array", "pv": {"V_oc": 1.25, "I_sc": 0.6, "V_mp": 1.0, "I_mp": 0.55}}
 
 
 def upto(P_max: float) -> PowerLimiter:
@@ -108,11 +113,12 @@ class Kernel:
         return np.array([*after, *u])
 
 
-@pytest.mark.parametrize("law", ["vsg-2", "dvoc", "vsg-5"])
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize(
+    ("stage", "law"), [*product(STAGES, LAWS), *((name, "grid-following") for name in FOLLOWING)]
+)
 def test_law_and_stage_are_the_compiled_kernels_slopes(stage, law):
     # differences of 1e-6 p.u. have an error of 1e-12 by curvature and of 1e-10 by rounding
-    loop = loop_of(STAGES[stage], "grid-following" if stage.startswith("grid") else law)
+    loop = loop_of({**STAGES, **FOLLOWING}[stage], law)
     c, kernel, h = loop.controller, Kernel(loop), 1e-6
     m = len(c.A)
     A, B, B_r = (np.vstack(pair) for pair in ((c.A, c.C), (c.B, c.D), (c.B_r, c.D_r)))
@@ -155,12 +161,13 @@ def test_the_plant_under_a_turned_voltage_is_the_plant_in_a_turned_frame():
 
 
 def bench_of(
-    stage: str, law: str, ticks: int, plant: dict[str, Any], place: Any, **ref: float
+    stage: str | None, law: str, ticks: int, plant: dict[str, Any], place: Any, **ref: float
 ) -> Bench:
-    path = place / "stage.toml"
-    path.write_text(stage)
-    content = {"title": "", "duration": ticks * T_S, "law": law, "plant": plant}
-    content |= {"inner": str(path), "references": ref}
+    content = {"title": "", "duration": ticks * T_S, "law": law, "plant": plant, "references": ref}
+    if stage is not None:
+        path = place / "stage.toml"
+        path.write_text(stage)
+        content["inner"] = str(path)
     return make_bench(check_scenario(content, "test"))
 
 
@@ -187,6 +194,7 @@ PLL = 'type = "cascaded"\nk_ci = 5.0\nf_pll = 10.0'
          {"delay": {"fraction": 0.7}, "grid": {"scr": 3.0, "x_over_r": 6.0, "omega_g": 1.002}}),
         (PLL, "vsg-5", {"dc_source": {"mode": "regulated"}, "delay": {"samples": 0}}),
         (FOLLOWS, "grid-following", {}),
+        (None, "grid-following-pv", {"dc_source": ARRAY}),
         (FOLLOWS, "grid-following", {"dc_source": {"mode": "regulated"},
          "grid": {"scr": 8.0, "x_over_r": 6.0, "omega_g": 1.002}}),
     ],

@@ -133,7 +133,7 @@ def linearise_stage(
     omega, E, y, ref = w[n + OMEGA_ROW], w[n + 2], w[n + NU :], w[n + NU + NY_INNER :]
     i, v, i_o = (y[k] + 1j * y[k + 1] for k in (NY, NY + 2, NY + 4))
     x = {name: w[2 * k] + 1j * w[2 * k + 1] for k, name in enumerate(both)}
-    seen, after = np.zeros(len(w)), list[NDArray[np.float64]]()
+    seen, after, turns = np.zeros(len(w)), list[NDArray[np.float64]](), omega
     then = {"v_f": x["v_f"] + c["follow_v"] * (v - x["v_f"])}
     if dual:  # steady, there is no negative sequence: the turning of its frame is constant
         h = 2.0 * omega_0 * c["half_turn"]
@@ -156,13 +156,17 @@ def linearise_stage(
     if isinstance(inner, GridFollowing):
         V, ahead = w[n - 3], v_0 / abs(v_0)
         E = then["v_f"] + (c["R_v"] + 1j * c["X_v"]) * i
-        omega = seen + c["give_back"] * E.imag / op.u[2]
+        omega, turns = seen, seen + c["give_back"] * E.imag / op.u[2]
         V = V + c["follow_V"] * ((then["v_f"] / ahead).real - V)
         after = [V, *after]
         i_0 = inner.reference(i_0, v_0, op.e, omega_0)  # at rest
         P_of, Q_of = (i_0 / ahead).real, omega_0 * c["C_f"] * abs(v_0) - (i_0 / ahead).imag
         droops = abs(1.0 - omega_0) >= inner.band_f
-        along = (ref[1] - (c["k_f"] * droops) * seen - P_of * V) / abs(v_0)
+        error = y[0] - ref[0]
+        power = ref[1] - (c["k_f"] * droops) * seen + c["k_dc"] * error
+        if c["T_k_dci"] > 0.0:
+            power, after = power + w[n - 4], [w[n - 4] + c["T_k_dci"] * error, *after]
+        along = (power - P_of * V) / abs(v_0)
         across = (Q_of * V - ref[3]) / abs(v_0) + c["C_f"] * (omega_0 * V + abs(v_0) * seen)
         i_ref = ahead * (along + 1j * across) + 1j * i_0 * turned
         i_0 = complex(op.x[0], op.x[1])
@@ -188,7 +192,7 @@ def linearise_stage(
     if "x_c" in x:
         then["x_c"] = x["x_c"] + c["T_k_ci"] * (i_ref - i)
     rows = [part for name in both for part in (then[name].real, then[name].imag)]
-    out = np.array([w[n], omega, e.real, e.imag])
+    out = np.array([w[n], turns, e.real, e.imag])
     split = [n, n + NU, n + NU + NY_INNER]
     A, B_u, B_y, B_r = np.split(np.array([*rows, *after]), split, axis=1)
     C, D_u, D_y, D_r = np.split(out, split, axis=1)
@@ -216,6 +220,7 @@ def _states(inner: InnerStage, c: np.void) -> tuple[list[str], list[str]]:
     acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), isinstance(inner, DualSequence))
     both = [name for name, there in acts.items() if there]
     states = [f"{name} of the inner stage, {axis}" for name in both for axis in "dq"]
+    states += ["x_v of the inner stage"] if follows and c["T_k_dci"] > 0.0 else []
     states += ["V of the inner stage"] if follows else []
     states += ["angle of the PLL", "frequency of the PLL"] if inner.f_pll > 0.0 else []
     return both, states

@@ -214,8 +214,8 @@ class _NetworkEquilibrium:
         return np.concatenate([*rows, met, [volts[nodes[0]].imag for nodes in self.islands]])
 
     def _reach(self) -> list[tuple[set[int], set[int]]]:
-        """The rows of ``residual`` that each unknown acts on: those whose slopes are to be measured,
-        and all, with those of ``_slopes``. A speed may act on all."""
+        """The rows of ``residual`` that each unknown acts on: those whose slopes are to be
+        measured, and all, with those of ``_slopes``. A speed may act on all."""
         wiring = self.wiring
         fed = sorted(enumerate(wiring.fed), key=lambda item: item[1][1].is_voltage)
         lengths = [side.size for side in self.sides]
@@ -342,6 +342,13 @@ class _ConverterEquilibrium:
     def __init__(self, par: Record, law: DiscreteLaw, ref: Vector, drop: Drop = no_drop) -> None:
         self.par, self.law, self.ref, self.drop = par, law, ref, drop
         self.controlled = par[0]["i_u_gain"] != 0.0
+        if isinstance(inner := law.law.inner, GridFollowing) and inner.k_dci > 0.0:
+            held = 0 in law.rows if self.controlled else par[0]["array"] != ACROSS
+            if held:
+                raise NoEquilibrium(
+                    f"{law.law.name}: inner.k_dci = {inner.k_dci:g}: the DC source holds v_dc too;"
+                    ' it is for one that does not, as plant.dc_source.mode = "array"'
+                )
         # row 1's states are left out of a plant whose DC source ignores it
         self.kept = np.array(
             [i for i, row in enumerate(law.rows) if self.controlled or row != 0], dtype=int
@@ -386,9 +393,9 @@ class _ConverterEquilibrium:
         e = self._command(x, u)
         if isinstance(inner := law.law.inner, GridFollowing):
             i, v = complex(x[0], x[1]), complex(x[2], x[3])
-            wanted = inner.wanted(ref[1], ref[3], abs(v), omega_g) * v / abs(v)
-            miss = wanted - inner.reference(i, v, e, omega_g)
-            rest = [miss.real, miss.imag]
+            lack = inner.wanted(ref, y[0], abs(v), omega_g)
+            lack -= inner.reference(i, v, e, omega_g) * abs(v) / v
+            rest = [y[0] - ref[0] if inner.k_dci > 0.0 else lack.real, lack.imag]
         else:
             E = _internal(law, x, u, e, limited=False)
             rest = [u_law[1] - omega_g, u_law[2] - abs(E)]
@@ -474,7 +481,8 @@ def _newton(
     """
     everything = {*range(len(z))}
     reach = reach or [(everything, everything)] * len(z)
-    groups, before, largest, step_of = _apart(reach), 0.0, math.inf, _steps([], (0, 0))
+    groups, before, largest = _apart(reach), 0.0, math.inf
+    step_of: Callable[[Vector], Vector] = np.negative  # none yet: the first round makes it
     for _ in range(_ROUNDS):
         now = residual(z)
         if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
@@ -517,7 +525,7 @@ def _steps(
 ) -> Callable[[Vector], Vector]:
     """The step of Newton's method by what must vanish, for slopes by row and unknown: of least
     squares, but for a large network whose rows are independent."""
-    rows, columns, values = (np.array(each) for each in zip(*slopes)) if slopes else ([], [], [])
+    rows, columns, values = (np.array([one[k] for one in slopes]) for k in range(3))
     if shape[0] == shape[1] > _MOST_BY_SQUARES:
         try:
             sparse = scipy.sparse.csc_matrix((values, (rows, columns)), shape)

@@ -4,9 +4,10 @@ With theta and omega the angle and frequency of the PLL, and V the low-pass filt
 least V_least where it divides, the reference of the filter's current is
 
     i* = (P/V + j (omega C_f V - Q_ref/V - b)) e^(j theta),
-    P = P_ref + k_f dead(1 - omega),    b = k_V dead(1 - V),
+    P = P_ref + k_f dead(1 - omega) + (k_dc + k_dci/s) (v_dc - V_dcref),    b = k_V dead(1 - V),
 
-where dead(x) is what x is beyond its dead band: a droop of the power by the frequency, and the
+where dead(x) is what x is beyond its dead band: a droop of the power by the frequency, a control of
+v_dc for a DC side that does not hold it, such as a PV array straight across the link, and the
 reactive current that supports the voltage. While b is not 0, the reactive current has the first
 place within I_max. omega_u and E_u of the law do not act: it has row 1 only.
 
@@ -21,10 +22,12 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.inner.stage import I_D, I_Q, InnerStage, limit_current, limited
+from gfm_runtime.inner.stage import I_D, I_Q, V_DC, InnerStage, limit_current, limited
 from gfm_runtime.toml_file import NotNegative, Positive
 
 _RETURN = 10.0  # 1/s, of the converter's frame to the angle of E
@@ -56,10 +59,13 @@ class GridFollowing(InnerStage):
         0.0, description="power by the frequency beyond the dead band, p.u./p.u."
     )
     band_f: NotNegative = Field(0.0, description="dead band of the frequency around 1 p.u.")
+    k_dc: NotNegative = Field(0.0, description="power by v_dc, p.u./p.u.")
+    k_dci: NotNegative = Field(0.0, description="power by the integral of v_dc, 1/s")
 
     def constants(self, T_s: float, omega_b: float) -> dict[str, float]:
-        own = ("R_v", "X_v", "C_f", "V_least", "k_V", "band_V", "k_f", "band_f")
+        own = ("R_v", "X_v", "C_f", "V_least", "k_V", "band_V", "k_f", "band_f", "k_dc")
         return super().constants(T_s, omega_b) | {name: getattr(self, name) for name in own} | {
+            "T_k_dci": T_s * self.k_dci,
             "give_back": _RETURN / omega_b,
             "follow_V": -math.expm1(-T_s / self.T_V),
             "Dw_max": self.DwPLLmax,
@@ -71,9 +77,12 @@ class GridFollowing(InnerStage):
         self.check_current(abs(self.reference(i, v, e, omega)))
         return v + complex(self.R_v, self.X_v) * i
 
-    def wanted(self, P_ref: float, Q_ref: float, V: float, omega: float) -> complex:
-        """i* in the PLL's frame before its limit, p.u., at rest at V and omega, p.u."""
+    def wanted(self, ref: NDArray[np.float64], v_dc: float, V: float, omega: float) -> complex:
+        """i* in the PLL's frame before its limit, p.u., at rest at references (5,), v_dc, V and
+        omega, p.u.; without an integral of v_dc."""
+        P_ref, Q_ref = ref[1], ref[3]
         P = P_ref + self.k_f * beyond.py_func(1.0 - omega, self.band_f)
+        P += self.k_dc * (v_dc - ref[0])
         of, b = max(V, self.V_least), self.k_V * beyond.py_func(1.0 - V, self.band_V)
         return complex(P / of, omega * self.C_f * V - Q_ref / of - b)
 
@@ -96,6 +105,7 @@ def ask_current(law, state):
     V = state.level[0]
     of = max(V, law.V_least)
     power = state.ref[1] + law.k_f * beyond(law.one - state.omega_pll, law.band_f)
+    power += law.k_dc * (state.m[V_DC] - state.ref[0]) + state.x_v[0]
     state.i_ref[0] = power / of
     state.i_ref[1] = state.omega_pll * law.C_f * V - state.ref[3] / of - support(law, state)
 
@@ -114,14 +124,9 @@ def limit_reactive_first(law, state):
 
 @inlined
 def grid_following(law, state):
-    """One tick, after that of the PLL: i*."""
+    """One tick, after that of the PLL: i*. v_dc is integrated while no limit acts."""
     low, high = law.one - law.Dw_max, law.one + law.Dw_max
-    state.omega_pll = limited(state.omega_pll, low, high)
-    E_d = state.v_f[0] + law.R_v * state.m[I_D] - law.X_v * state.m[I_Q]
-    E_q = state.v_f[1] + law.R_v * state.m[I_Q] + law.X_v * state.m[I_D]
-    E = math.sqrt(E_d * E_d + E_q * E_q)
-    E = max(E, law.least_v)
-    state.omega = limited(state.omega_pll + law.give_back * (E_q / E), low, high)
+    state.omega = state.omega_pll = limited(state.omega_pll, low, high)
     V = math.sqrt(state.v_f[0] * state.v_f[0] + state.v_f[1] * state.v_f[1])
     state.level[0] += law.follow_V * (V - state.level[0])
     ask_current(law, state)
@@ -131,15 +136,33 @@ def grid_following(law, state):
         limit_current(law, state)
     else:
         limit_reactive_first(law, state)
+    if state.limited == 0:
+        state.x_v[0] += law.T_k_dci * (state.m[V_DC] - state.ref[0])
     d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
     state.i_ref[0], state.i_ref[1] = cosine * d - sine * q, cosine * q + sine * d
+
+
+@inlined
+def turn_frame(law, state):
+    """omega_u, with which the frame turns with the PLL and slowly to the angle of E."""
+    E_d = state.v_f[0] + law.R_v * state.m[I_D] - law.X_v * state.m[I_Q]
+    E_q = state.v_f[1] + law.R_v * state.m[I_Q] + law.X_v * state.m[I_D]
+    E = math.sqrt(E_d * E_d + E_q * E_q)
+    E = max(E, law.least_v)
+    low, high = law.one - law.Dw_max, law.one + law.Dw_max
+    state.omega = limited(state.omega_pll + law.give_back * (E_q / E), low, high)
 
 
 @inlined
 def settle_following(law, state):
     """Into away what i* lacks of the current that ``state.i_ref`` holds."""
     d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
+    state.x_v[0] = state.x_v[1] = 0
     ask_current(law, state)
-    state.away[0] = cosine * d + sine * q - state.i_ref[0]
+    lack = cosine * d + sine * q - state.i_ref[0]
+    if law.T_k_dci > 0:
+        of = max(state.level[0], law.V_least)
+        state.x_v[0], lack = lack * of, 0
+    state.away[0] = lack
     state.away[1] = cosine * q - sine * d - state.i_ref[1]
     state.i_ref[0], state.i_ref[1] = d, q

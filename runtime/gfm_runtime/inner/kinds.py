@@ -16,7 +16,12 @@ from pydantic import Field
 
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
-from gfm_runtime.inner.grid_following import GridFollowing, grid_following, settle_following
+from gfm_runtime.inner.grid_following import (
+    GridFollowing,
+    grid_following,
+    settle_following,
+    turn_frame,
+)
 from gfm_runtime.inner.stage import (
     I_D,
     I_OD,
@@ -125,6 +130,8 @@ def shape(law, state):
             voltage_loop(law, state, E_d, E_q)
         if law.inner != DUAL and law.inner != STIFF:
             current_loop(law, state)
+        if law.inner == FOLLOWING:
+            turn_frame(law, state)
         most = law.m * state.m[V_DC]
         size = state.e_now[0] * state.e_now[0] + state.e_now[1] * state.e_now[1]
         if size > most * most:  # the limit of the modulation

@@ -42,7 +42,7 @@ INNER_STATE = (
     ("v_f", 2, "low-pass filtered v"),
     ("i_f", 2, "low-pass filtered i"),
     ("x_c", 2, "integral of the current loop"),
-    ("x_v", 2, "integral of the voltage loop, or current of the virtual stator"),
+    ("x_v", 2, "integral of the voltage loop, or of v_dc, or current of the virtual stator"),
     ("away", 2, "voltage that a change of law left; decays"),
     ("e", 2, "the bridge's voltage of the last tick"),
     ("pll", 2, "unit phasor that follows v"),
