@@ -159,10 +159,10 @@ def settle_following(law, state):
     d, q, cosine, sine = state.i_ref[0], state.i_ref[1], state.pll[0], state.pll[1]
     state.x_v[0] = state.x_v[1] = 0
     ask_current(law, state)
-    lack = cosine * d + sine * q - state.i_ref[0]
+    state.away[0] = cosine * d + sine * q - state.i_ref[0]
     if law.T_k_dci > 0:
         of = max(state.level[0], law.V_least)
-        state.x_v[0], lack = lack * of, 0
-    state.away[0] = lack
+        state.x_v[0] = state.away[0] * of
+        state.away[0] = 0
     state.away[1] = cosine * q - sine * d - state.i_ref[1]
     state.i_ref[0], state.i_ref[1] = d, q

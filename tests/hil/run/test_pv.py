@@ -98,6 +98,18 @@ def test_of_two_converters_one_is_in_the_shade():
     assert B["true_i_dc"][-1] == pytest.approx(1.0 - 0.5 * 1.08, abs=1e-3)
 
 
+def test_a_grid_following_law_holds_v_dc_by_its_power():
+    run = gfmhil.run("cloud_over_pv", law="grid-following-pv")
+    t, v_dc, p = (run.signals[name] for name in ("t", "true_v_dc", "true_p"))
+    assert run.status == "completed" and np.abs(v_dc - 1.0).max() < 0.05
+    assert v_dc[t < 0.9] == pytest.approx(1.0, abs=1e-9)
+    gives = {0.9: 1.0, 4.0: 0.3 * 1.08 - 0.08}  # I_sc times the light, less the diode's current
+    for when, power in gives.items():  # less than 3 per mille of it is the filter's
+        assert p[t < when][-1] == pytest.approx(power, rel=3e-3)
+    with pytest.raises(UserError, match=r"k_dci = 20: the DC source holds v_dc too"):
+        gfmhil.run("pref_step", law="grid-following-pv")
+
+
 @pytest.mark.processes
 def test_over_a_link_the_bits_are_the_same(cloud, tmp_path):
     code = main(
