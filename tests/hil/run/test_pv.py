@@ -101,7 +101,7 @@ def test_of_two_converters_one_is_in_the_shade():
 def test_a_grid_following_law_holds_v_dc_by_its_power():
     run = gfmhil.run("cloud_over_pv", law="grid-following-pv")
     t, v_dc, p = (run.signals[name] for name in ("t", "true_v_dc", "true_p"))
-    assert run.status == "completed" and np.abs(v_dc - 1.0).max() < 0.05
+    assert run.status == "completed" and np.abs(v_dc - 1.0).max() < 0.1
     assert v_dc[t < 0.9] == pytest.approx(1.0, abs=1e-9)
     gives = {0.9: 1.0, 4.0: 0.3 * 1.08 - 0.08}  # I_sc times the light, less the diode's current
     for when, power in gives.items():  # less than 3 per mille of it is the filter's
