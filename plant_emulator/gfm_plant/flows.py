@@ -19,8 +19,8 @@ from gfm_runtime.compiled import compiled, inlined
 @compiled
 def look_at_flows(plant: PlantRecords) -> None:
     """Write what is recorded of the terminals at this tick to ``flow_row``, in the order of
-    `Wiring.recorded`: of each P, Q and its current, real and imaginary part; of a fault the
-    currents of its phases."""
+    `Wiring.recorded`: of each P, Q and its current, real and imaginary part, and the
+    speed of what turns; of a fault the currents of its phases."""
     n, now, tick = plant.net[0], plant.now[0], plant.st[0].tick
     w, unit, source = field(now, "w"), field(now, "unit"), field(now, "flow_i")
     v, held, g = field(now, "flow_v"), field(n, "flow_held"), grid_source(n)
@@ -31,6 +31,7 @@ def look_at_flows(plant: PlantRecords) -> None:
     every_flow(plant, 0, 0)
     node, begin, at = field(n, "flow_node"), field(n, "flow_begin"), field(n, "flow_from")
     by, G, out, j = field(n, "flow_by"), field(n, "flow_G"), field(now, "flow_row"), 0
+    turns, omega = field(n, "flow_turns"), field(now, "flow_omega")
     for k in range(len(node)):
         voltage = v[node[k]]
         i = complex(G[k] * voltage.real, G[k] * voltage.imag)
@@ -41,6 +42,9 @@ def look_at_flows(plant: PlantRecords) -> None:
         power = voltage * i.conjugate()
         out[j], out[j + 1], out[j + 2], out[j + 3] = power.real, power.imag, i.real, i.imag
         j += 4
+        if turns[k] >= 0:
+            out[j] = omega[turns[k]]
+            j += 1
     if n.flow_fault != 0:
         out[j] = out[j + 1] = out[j + 2] = 0.0
         if n.flow_fault > 1 and (now.contact != 0 or now.joint != 0):

@@ -106,6 +106,7 @@ _NET: _Arrays = {
     "flow_from": (int, ("n_flow_sums",)),
     "flow_by": (float, ("n_flow_sums",)),
     "flow_G": (float, ("n_flows",)),
+    "flow_turns": (int, ("n_flows",)),  # the source whose speed is recorded; -1: it has none
     # of a large plant, see `sparse.Sparse`, of each contact its axis alpha and its axis beta: how
     # many states, sums for the voltages, rows of ``extra_at``, sums on the way in, and sums of no
     # more than two, of three and of four entries; and of each node whose voltage is looked at its
@@ -172,6 +173,7 @@ _NOW: _Arrays = {
     # of recorded terminals the voltages of their nodes; the currents of components with such
     "flow_v": (complex, ("n_flow_nodes",)),
     "flow_i": (complex, ("n_flow_sources",)),
+    "flow_omega": (float, ("n_flow_sources",)),  # the speeds of components with such, p.u.
     "flow_row": (float, ("n_flow_columns",)),  # as recorded at the last look
     "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
     "w_before": (complex, ("n_w",)),  # at the last tick

@@ -289,6 +289,7 @@ _FLOWS = {
     "Q": ("Q", "p.u. (S_n)", "reactive power"),
     "i_re": (r"\Re i", "p.u. (S_n/V_n)", "current, real part in the frame that turns at omega_n"),
     "i_im": (r"\Im i", "p.u. (S_n/V_n)", "current, imaginary part in that frame"),
+    "omega": (r"\omega", "p.u. (f_n)", "speed, or frequency of the PLL,"),
     **{
         f"i_{phase}": (f"i_{phase}", "p.u. (sqrt(2/3) S_n/V_n)", f"current of phase {phase}")
         for phase in PHASES

@@ -529,7 +529,8 @@ def panels_of_all(
 
 def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
     """What was recorded of a network's parts, for a page: P, Q and the size of the current of a few
-    parts a panel, at the starts of lines, and the phases of the fault's current."""
+    parts a panel, at the starts of lines, the speed of those that turn, and the phases of the
+    fault's current."""
     columns = next(iter(run.values())).columns
     there = [name for name in run.scenario.flows if name in columns]
     parts = [n.removesuffix(".P") for n in there if n.endswith(".P") and not n.endswith(".end.P")]
@@ -540,6 +541,9 @@ def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
             each.append((title, {part: columns[f"{part}.{what}"] for part in group}))
         currents = {n: Magnitude(columns[f"{n}.i_re"], columns[f"{n}.i_im"]) for n in group}
         each.append(("current |i|", {**currents}))
+        speeds = {n: columns[f"{n}.omega"] for n in group if f"{n}.omega" in there}
+        if speeds:
+            each.append(("speed omega", speeds))
     if f"{FAULT}.i_a" in there:
         phases = {f"i_{phase}": columns[f"{FAULT}.i_{phase}"] for phase in PHASES}
         each.append(("currents of the fault", phases))

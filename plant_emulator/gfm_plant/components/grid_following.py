@@ -114,6 +114,7 @@ def _go_back(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 @compiled
 def _flow(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     field(now, "flow_i")[one.source] = _drawn(one, one.s)
+    field(now, "flow_omega")[one.source] = 1.0 + one.s[X] / n.omega_b
 
 
 class GridFollowing(Drawing):
@@ -135,6 +136,7 @@ class GridFollowing(Drawing):
         ("V", "p.u.", "the voltage that it has measured, to support it"),
     )
     feeds: ClassVar = True
+    turns: ClassVar = True
     lacks: ClassVar = "{} brings a current, so the node needs a bank of network.capacitors"
     record: ClassVar = np.dtype(
         [

@@ -18,6 +18,7 @@ from gfm_plant.components.swing import (
     swing,
     swing_at_rest,
     swing_matrix,
+    tell_speed,
 )
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
@@ -85,6 +86,7 @@ class Rotating(Fed):
     )
     columns: ClassVar = ("true_omega_g",)
     is_voltage: ClassVar = True
+    turns: ClassVar = True
     feeds: ClassVar = True
 
     node: str = Field(min_length=1, description="where it is")
@@ -114,7 +116,7 @@ class Machine(Rotating):
     record: ClassVar = np.dtype([*SPEED, ("E", "f8")], align=True)
     hooks: ClassVar = {
         "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
-        "tick": _tick, **KEPT,
+        "tick": _tick, "flow": tell_speed, **KEPT,
     }  # fmt: skip
 
     E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")

@@ -2,7 +2,7 @@
 the documentation read it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,6 +19,8 @@ Matrix = NDArray[np.float64]
 #: what a run records of a terminal, after its name and a dot: the power by the voltage of its node,
 #: and its current in the common frame; of the fault the currents of its phases
 FLOW, OF_FAULT = ("P", "Q", "i_re", "i_im"), ("i_a", "i_b", "i_c")
+#: after those: the speed of what turns, or the frequency of what follows a voltage
+SPEED_COLUMN = "omega"
 FAULT = "fault"
 
 
@@ -29,11 +31,13 @@ class Terminal:
     name: str  # of the component; ".end" follows at the end of a line
     node: str
     parts: tuple[tuple[str, float], ...] = ()  # elements, and factors of their currents
+    turns: str = ""  # the source of the component whose speed is recorded, if it has one
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Its columns in the recording."""
-        return tuple(f"{self.name}.{what}" for what in (FLOW if self.node else OF_FAULT))
+        each = (*FLOW, *([SPEED_COLUMN] if self.turns else [])) if self.node else OF_FAULT
+        return tuple(f"{self.name}.{what}" for what in each)
 
 
 def converter_terminal(name: str, node: str) -> Terminal:
@@ -112,7 +116,8 @@ class Dynamic(Component):
     record: ClassVar[np.dtype[np.void]]
     #: at_rest, once at the start; keep, at an instant, and go_back to it, as often as it takes;
     #: begin of a piece; drive, where sources add to the forcing of the modes; middle and end of the
-    #: piece; tick, after each tick; flow, where its current is recorded, which goes to ``flow_i``
+    #: piece; tick, after each tick; flow, where it is recorded: a current of its own goes to
+    #: ``flow_i``, a speed to ``flow_omega``
     hooks: ClassVar[Mapping[str, Callable[..., None]]]
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
@@ -145,6 +150,12 @@ class Fed(Dynamic):
     is_voltage: ClassVar[bool]
     #: of its steady state, besides currents and voltages of the circuit
     unknowns: ClassVar[int] = 0
+    #: whether it has a speed, which its hook ``flow`` gives
+    turns: ClassVar[bool] = False
+
+    def terminals(self, name: str) -> Sequence[Terminal]:
+        first, *others = super().terminals(name)
+        return [replace(first, turns=self.sources(name)[0] if self.turns else ""), *others]
 
     @property
     def nodes(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.layout import field
 from gfm_runtime.compiled import compiled
 
 STEP = 0.1  # largest rate times T_s
@@ -76,6 +77,12 @@ def lead(now: Any, one: Any) -> None:
     if one.leads:
         now.omega_g = now.omega_g_to = one.omega
         now.omega_g_slope = one.slope
+
+
+@compiled
+def tell_speed(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Give the speed that a run records."""
+    field(now, "flow_omega")[one.source] = one.omega
 
 
 KEPT = {"keep": _keep, "go_back": _go_back}

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import gfmhil
 from gfm_hil.cli import main
@@ -86,6 +87,24 @@ def test_currents_and_powers_of_every_node_add_up_to_nothing(large, monkeypatch)
             each = [read(run, n) for n in arrives] + [-read(run, n) for n in leaves]
             assert np.abs(sum(each)).max() < 1e-12
             assert max(np.abs(x).max() for x in each) > least
+
+
+def test_a_machine_turns_as_its_power_asks(run):
+    """The swing equation and the governor by SciPy, driven by the recorded power; the energy of the
+    machine's reactance, 1e-4 of its speed, is between that power and the rotor's."""
+    f, one = run.flows, NETWORK["machines"]["sm"]
+    t, P = run["A"].signals["t"], f["sm.P"]
+
+    def slopes(now: float, x: np.ndarray) -> list[float]:
+        omega, turbine = x
+        torque = (turbine - np.interp(now, t, P)) / (2 * one["H"])
+        return [torque, (one["P"] - (omega - 1.0) / 0.05 - turbine) / 0.5]
+
+    omega = solve_ivp(slopes, (0, t[-1]), [1.0, P[0]], t_eval=t, max_step=2e-4).y[0]
+    assert np.ptp(f["sm.omega"]) > 1e-3
+    assert np.abs(f["sm.omega"] - omega).max() < 1e-4
+    assert f["wind.omega"][0] == pytest.approx(1.0, abs=1e-12) and np.ptp(f["wind.omega"]) > 1e-3
+    assert "step.omega" not in f
 
 
 def test_a_branch_loses_what_its_resistance_does(run):
