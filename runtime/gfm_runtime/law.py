@@ -127,8 +127,9 @@ class BuiltLaw:
             )
             with mistakes.noting():
                 if idle:
-                    why = "which gives omega_u and the current itself; a law for it has row 1 only"
-                    raise LawError(", ".join(idle), f"do not act on {self.inner.kind}, {why}")
+                    why = f"no effect in front of the inner stage {self.inner.kind}, which gives"
+                    why += " omega_u and the current itself; a law for it has row 1 only"
+                    raise LawError(", ".join(idle), why)
         for name, value in zip(U_NAMES, self.u_0, strict=True):
             with mistakes.noting():
                 if value not in REF_NAMES if isinstance(value, str) else not math.isfinite(value):

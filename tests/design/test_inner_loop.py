@@ -293,11 +293,13 @@ def test_many_loops_with_stages_are_each_of_them():
         (VirtualStator(power=upto(0.3)), {}, "the power limiter acts: p is 0.5 p.u., not in"),
         (ThresholdImpedance(I_thr=0.3), {}, "the threshold impedance acts"),
         (VirtualStator(m=0.9), {}, "the limit of modulation acts"),
+        (GridFollowing(k_V=2.0, band_V=0.003), {}, "the support of the voltage acts: V is 1.009"),
+        (GridFollowing(V_least=1.2), {}, "V is 1.013 p.u., below V_least = 1.2"),
     ],
 )
 def test_a_limit_that_acts_is_named(stage, references, said):
     with pytest.raises(NoEquilibrium, match=said):
-        loop_of(stage)
+        loop_of(stage, "grid-following" if isinstance(stage, GridFollowing) else "vsg-2")
 
 
 def test_a_continuous_loop_has_no_stage():

@@ -13,6 +13,7 @@ import gfm_plant
 from gfm_design.margins.all_margins import loop_margins
 from gfm_design.model.closed_loop import INPUTS, ClosedLoop
 from gfm_design.model.network import LINES, NetworkLoop
+from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.recording.columns import signals_of
@@ -323,3 +324,19 @@ def test_what_cannot_be():
                    plant={"factors": {"L_g": 100.0}})  # fmt: skip
     with pytest.raises(NoEquilibrium):
         loop(far)
+
+
+def test_an_island_of_converters_that_follow_is_refused():
+    """Also a part of a network behind an open line, beside one that the grid holds."""
+    network = {
+        "grid": "g",
+        "converters": {"A": {"node": "a"}, "B": {"node": "b", "law": "grid-following"}},
+        "lines": {
+            "near": {"start": "g", "end": "a", "L": 0.2, "R": 0.02},
+            "far": {"start": "a", "end": "b", "L": 0.2, "R": 0.02, "closed": False},
+        },
+        "loads": {"house": {"node": "b", "P": 0.3}},
+    }  # fmt: skip
+    content = {"title": "", "duration": 0.1, "law": "vsg-2", "network": network}
+    with pytest.raises(UserError, match=r"B \(grid-following\): nothing forms the voltage of b"):
+        make_benches(check_scenario(content, "test"))

@@ -227,9 +227,9 @@ def test_shipped_stages_load_and_differ():
         ),
         (
             'type = "grid-following"',
-            "law vsg-2: phi_22, phi_34, phi_35: do not act on grid-following, which gives omega_u",
+            "law vsg-2: phi_22, phi_34, phi_35: no effect in front of the inner stage grid",
         ),
-        ('type = "grid-following"\n[power]\nP_max = 1.0\nP_min = 0.0', "power: "),
+        ('type = "grid-following"\n[power]\nP_max = 1.0\nP_min = 0.0', "power: not with grid"),
         ('type = "grid-following"\nf_pll = 0.0', "f_pll: must be > 0, not 0.0"),
         ('type = "cascaded"\npriority = "both"', "priority: .*'circular', 'd', 'q' or 'angle'"),
     ],

@@ -229,6 +229,7 @@ def _states(inner: InnerStage, c: np.void) -> tuple[list[str], list[str]]:
 def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
     """Refuse an operating point at which a limit acts; |i*| is within I_max at any."""
     p, e, most = float(op.y[1]), abs(op.e), inner.m * float(op.y[0])
+    V = abs(complex(op.x[2], op.x[3]))
     why = ""
     if not inner.P_min - _ROUNDING <= p <= inner.P_max + _ROUNDING:
         why = (
@@ -236,8 +237,10 @@ def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
         )
     elif isinstance(inner, ThresholdImpedance) and size > inner.I_thr:
         why = f"the threshold impedance acts: |i| is {size:.4g} p.u., I_thr is {inner.I_thr:g}"
-    elif isinstance(inner, GridFollowing) and abs(1.0 - op.y[4]) >= inner.band_V:
-        why = f"the support of the voltage acts: V is {op.y[4]:.4g} p.u., its dead band ends there"
+    elif isinstance(inner, GridFollowing) and inner.k_V > 0 and abs(1.0 - V) >= inner.band_V:
+        why = f"the support of the voltage acts: V is {V:.4g} p.u., beyond its dead band"
+    elif isinstance(inner, GridFollowing) and inner.V_least >= V:
+        why = f"V is {V:.4g} p.u., below V_least = {inner.V_least:g}"
     elif isinstance(inner, StiffSource) and not inner.rests(e, float(op.y[3])):
         why = f"a limit of E or q acts: E is {e:.4g} p.u., q {op.y[3]:.4g} p.u."
     elif e > most + _ROUNDING:

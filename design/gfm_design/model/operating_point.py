@@ -157,10 +157,28 @@ class _NetworkEquilibrium:
         feeding |= {node for _, one in wiring.fed if one.is_voltage for node in one.nodes}
         groups = wiring.islands()
         self.islands = [g for g in groups if self.fixed not in g and feeding & {*g}]
+        self._check_forming()
         self.island_of = {node: k for k, nodes in enumerate(self.islands) for node in nodes}
         self.alive = {*self.island_of, *(n for g in groups if self.fixed in g for n in g)}
         self.sizes = [side.size for side in self.sides]
         self.sizes += [2 * len(self.free), *(one.unknowns for _, one in wiring.fed)]
+
+    def _check_forming(self) -> None:
+        """Raise NoEquilibrium: in an island all converters follow a voltage that nothing forms."""
+        sources = {node for _, one in self.wiring.fed if one.is_voltage for node in one.nodes}
+        for nodes in self.islands:
+            there = [
+                (unit.name, law.law)
+                for unit, law in zip(self.wiring.units, self.laws, strict=True)
+                if unit.node in nodes
+            ]
+            follow = all(isinstance(law.inner, GridFollowing) for _, law in there)
+            if follow and not sources & {*nodes}:
+                who = ", ".join(f"{name} ({law.name})" for name, law in there)
+                raise NoEquilibrium(
+                    f"{who}: nothing forms the voltage of {', '.join(nodes)}; a law that follows"
+                    " the grid needs the grid, a machine or a grid-forming converter there"
+                )
 
     def _split(self, z: Vector) -> tuple[list[Vector], dict[str, complex], dict[str, float]]:
         """The unknowns of each converter and component, and each node's voltage and speed."""

@@ -90,7 +90,10 @@ def settings(options: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str
 
 def add_inner(command: argparse.ArgumentParser) -> None:
     """The option that gives every law an inner stage."""
-    said = "inner stage: a shipped name (gfmhil laws), a file, or none; by default each law's own"
+    said = (
+        "inner stage: a shipped name (gfmhil laws), a file, or none; by default each law's own,"
+        " which grid-following laws keep in place of a grid-forming one"
+    )
     command.add_argument("--inner", metavar="NAME", help=said)
 
 

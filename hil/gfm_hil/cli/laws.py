@@ -45,7 +45,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--industry",
         action="store_true",
-        help="those of the industry: REGFM_A1, REGFM_B1, grid-following",
+        help="those of the industry: REGFM_A1, REGFM_B1, grid-following, grid-following-pv",
     )
     kinds = command.add_subparsers(metavar="show|import|export")
     show = kinds.add_parser("show", help="one law, with its transfer functions")

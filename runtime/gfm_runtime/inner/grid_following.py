@@ -20,11 +20,11 @@ Source: Yazdani and Iravani, "Voltage-Sourced Converters in Power Systems", chap
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from gfm_runtime.compiled import inlined
 from gfm_runtime.inner.stage import I_D, I_Q, V_DC, InnerStage, limit_current, limited
@@ -39,7 +39,7 @@ class GridFollowing(InnerStage):
     rows: ClassVar = (0,)
 
     type: Literal["grid-following"] = Field("grid-following", description="kind of stage")
-    f_pll: Positive = Field(10.0, description="bandwidth of the PLL, Hz")
+    f_pll: Positive = Field(10.0, description="natural frequency of the PLL, Hz")
     freeze: Literal[False] = Field(False, description="no row of the law acts on the current")
     power: None = Field(
         None, description="none: omega_u, which a power limiter moves, is the PLL's"
@@ -61,6 +61,16 @@ class GridFollowing(InnerStage):
     band_f: NotNegative = Field(0.0, description="dead band of the frequency around 1 p.u.")
     k_dc: NotNegative = Field(0.0, description="power by v_dc, p.u./p.u.")
     k_dci: NotNegative = Field(0.0, description="power by the integral of v_dc, 1/s")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_voltage_to_freeze(cls, content: Any) -> Any:
+        if isinstance(content, dict):
+            if content.get("power") is not None:
+                raise ValueError("power: not with grid-following, whose frequency is the PLL's")
+            if content.get("freeze"):
+                raise ValueError("freeze: not with grid-following, on which no E_u acts")
+        return content
 
     def constants(self, T_s: float, omega_b: float) -> dict[str, float]:
         own = ("R_v", "X_v", "C_f", "V_least", "k_V", "band_V", "k_f", "band_f", "k_dc")

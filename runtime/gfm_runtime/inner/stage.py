@@ -43,7 +43,7 @@ INNER_STATE = (
     ("i_f", 2, "low-pass filtered i"),
     ("x_c", 2, "integral of the current loop"),
     ("x_v", 2, "integral of the voltage loop, or of v_dc, or current of the virtual stator"),
-    ("away", 2, "voltage that a change of law left; decays"),
+    ("away", 2, "voltage, if grid-following current, that a change of law left; decays"),
     ("e", 2, "the bridge's voltage of the last tick"),
     ("pll", 2, "unit phasor that follows v"),
     ("omega_pll", 1, "frequency of the PLL"),
@@ -90,7 +90,8 @@ class InnerStage(TomlTable):
     )
     power: PowerLimiter | None = Field(None, description="power limiter; none if not given")
     f_pll: NotNegative = Field(
-        0.0, description="bandwidth of the PLL that measures omega_g for column 3, Hz; 0: none"
+        0.0,
+        description="natural frequency of the PLL that measures omega_g for column 3, Hz; 0: none",
     )
     I_max: Positive = Field(1.2, description="limit of the current, p.u. of S_n/V_n")
     priority: Literal["circular", "d", "q", "angle"] = Field(
