@@ -81,9 +81,8 @@ def _advance(r: Any, s: Any, half_h: float, array: bool) -> tuple[float, float]:
     i_u, g, v_0 = r.i_u_gain * s.u_now[0], s.chopper, s.x[V_DC]
     i_max, i_min = (s.i_most[0], s.i_most[1]) if s.trip == 0 else (0.0, 0.0)
     steps = r.dc_steps
-    # of the array: what its light gives, and the terms of the current of its diode
-    light, e_0, e_1, e_2, e_3, e_4 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    I_0, per_v_T = 0.0, 0.0
+    # of the array: what its light gives, and its diode, whose current is -d and the terms of j
+    light, I_0, per_v_T, d = 0.0, 0.0, 0.0, 0.0
     if array and s.trip == 0:
         light, I_0, per_v_T = r.I_sc * s.irradiance + r.I_0, r.I_0, 1.0 / r.v_T
     while True:
@@ -109,37 +108,33 @@ def _advance(r: Any, s: Any, half_h: float, array: bool) -> tuple[float, float]:
             per_v = 1.0 / v
             j_0 = t_0 if lag == 0.0 else j
             if array:
-                e_0 = I_0 * math.exp(v * per_v_T)
-                j_0 = light - e_0
+                d = -I_0 * math.exp(v * per_v_T)
+                j_0 = light + d
             c_0 = (d_0 + n * (b + n * a)) * per_v
             v_1, i_1 = H * (j_0 - c_0 - g * v), K * (1.0 - v)
             t_1 = free * i_1 - k_p * v_1
             j_1 = t_1 if lag == 0.0 else lag * (t_0 - j_0)
             if array:
-                e_1 = per_v_T * v_1 * e_0
-                j_1 = -e_1
+                j_1 = per_v_T * v_1 * d
             c_1 = (b + 2 * n * a - v_1 * c_0) * per_v
             v_2, i_2 = _1_2 * H * (j_1 - c_1 - g * v_1), -_1_2 * K * v_1
             t_2 = free * i_2 - k_p * v_2
             j_2 = t_2 if lag == 0.0 else _1_2 * lag * (t_1 - j_1)
             if array:
-                e_2 = _1_2 * per_v_T * (v_1 * e_1 + 2.0 * v_2 * e_0)
-                j_2 = -e_2
+                j_2 = _1_2 * per_v_T * (v_1 * j_1 + 2.0 * v_2 * d)
             c_2 = (a - v_1 * c_1 - v_2 * c_0) * per_v
             v_3, i_3 = _1_3 * H * (j_2 - c_2 - g * v_2), -_1_3 * K * v_2
             t_3 = free * i_3 - k_p * v_3
             j_3 = t_3 if lag == 0.0 else _1_3 * lag * (t_2 - j_2)
             if array:
-                e_3 = _1_3 * per_v_T * (v_1 * e_2 + 2.0 * v_2 * e_1 + 3.0 * v_3 * e_0)
-                j_3 = -e_3
+                j_3 = _1_3 * per_v_T * (v_1 * j_2 + 2.0 * v_2 * j_1 + 3.0 * v_3 * d)
             c_3 = -(v_1 * c_2 + v_2 * c_1 + v_3 * c_0) * per_v
             v_4, i_4 = _1_4 * H * (j_3 - c_3 - g * v_3), -_1_4 * K * v_3
             t_4 = free * i_4 - k_p * v_4
             j_4 = t_4 if lag == 0.0 else _1_4 * lag * (t_3 - j_3)
             if array:
-                e_4 = v_1 * e_3 + 2.0 * v_2 * e_2 + 3.0 * v_3 * e_1 + 4.0 * v_4 * e_0
-                e_4 *= _1_4 * per_v_T
-                j_4 = -e_4
+                j_4 = v_1 * j_3 + 2.0 * v_2 * j_2 + 3.0 * v_3 * j_1 + 4.0 * v_4 * d
+                j_4 *= _1_4 * per_v_T
             c_4 = -(v_1 * c_3 + v_2 * c_2 + v_3 * c_1 + v_4 * c_0) * per_v
             v_5, i_5 = _1_5 * H * (j_4 - c_4 - g * v_4), -_1_5 * K * v_4
             j_5 = _1_5 * lag * (t_4 - j_4)

@@ -27,7 +27,7 @@ from gfm_runtime import LawError, LawSet, build_law, discretise, get_law, law_fi
 from gfm_runtime.assembly import Controller
 from gfm_runtime.inner import (
     Cascaded,
-    GridFollowing,
+    GridFollowingStage,
     InnerStage,
     PowerLimiter,
     ThresholdImpedance,
@@ -51,8 +51,8 @@ STAGES = {
     "voltage loop without integral": Cascaded(k_vi=0.0, k_ci=10.0, f_pll=30.0),
 }
 FOLLOWING = {
-    "grid-following": GridFollowing(k_f=3.0),
-    "grid-following without integral": GridFollowing(k_ci=0.0, k_dc=2.0),
+    "grid-following": GridFollowingStage(k_f=3.0),
+    "grid-following without integral": GridFollowingStage(k_ci=0.0, k_dc=2.0),
 }
 LAWS = ("vsg-2", "dvoc", "vsg-5")
 ARRAY = {"mode": "array", "pv": {"V_oc": 1.25, "I_sc": 0.6, "V_mp": 1.0, "I_mp": 0.55}}
@@ -293,13 +293,17 @@ def test_many_loops_with_stages_are_each_of_them():
         (VirtualStator(power=upto(0.3)), {}, "the power limiter acts: p is 0.5 p.u., not in"),
         (ThresholdImpedance(I_thr=0.3), {}, "the threshold impedance acts"),
         (VirtualStator(m=0.9), {}, "the limit of modulation acts"),
-        (GridFollowing(k_V=2.0, band_V=0.003), {}, "the support of the voltage acts: V is 1.009"),
-        (GridFollowing(V_least=1.2), {}, "V is 1.013 p.u., below V_least = 1.2"),
+        (
+            GridFollowingStage(k_V=2.0, band_V=0.003),
+            {},
+            "the support of the voltage acts: V is 1.009",
+        ),
+        (GridFollowingStage(V_least=1.2), {}, "V is 1.013 p.u., below V_least = 1.2"),
     ],
 )
 def test_a_limit_that_acts_is_named(stage, references, said):
     with pytest.raises(NoEquilibrium, match=said):
-        loop_of(stage, "grid-following" if isinstance(stage, GridFollowing) else "vsg-2")
+        loop_of(stage, "grid-following" if isinstance(stage, GridFollowingStage) else "vsg-2")
 
 
 def test_a_continuous_loop_has_no_stage():

@@ -14,7 +14,7 @@ from gfm_runtime.inner import (
     PRIORITIES,
     STAGES,
     Cascaded,
-    GridFollowing,
+    GridFollowingStage,
     InnerStage,
     PowerLimiter,
     VirtualStator,
@@ -154,7 +154,7 @@ def test_the_pll_finds_the_frequency_that_column_3_is_told():
 
 def following(v: complex, ticks: int, **keys: Any) -> Controller:
     """A grid-following controller after ticks of a voltage v; its frame begins on the real axis."""
-    c, u = started(GridFollowing(**keys), v=abs(v)), np.zeros(NU_INNER)
+    c, u = started(GridFollowingStage(**keys), v=abs(v)), np.zeros(NU_INNER)
     c.states["away"] = 0.0
     for _ in range(ticks):
         y = measured(v=v, i=0.0, i_o=0.0)

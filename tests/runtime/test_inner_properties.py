@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from gfm_runtime import LawSet
 from gfm_runtime.assembly import Controller
-from gfm_runtime.inner import KINDS, PRIORITIES, STAGES, GridFollowing, InnerStage, PowerLimiter
+from gfm_runtime.inner import (
+    KINDS,
+    PRIORITIES,
+    STAGES,
+    GridFollowingStage,
+    InnerStage,
+    PowerLimiter,
+)
 from gfm_runtime.signals import NU_INNER, carried_rows
 from gfm_runtime.states import RUNNING
 
@@ -70,7 +77,7 @@ def stages(kinds: Iterable[str] = tuple(STAGES)) -> st.SearchStrategy[InnerStage
     others = {"f_pll": st.just(20.0), "power": st.none(), "k_V": st.floats(0.0, 5.0)}
 
     def of(one: type[InnerStage]) -> dict[str, st.SearchStrategy[Any]]:
-        mine = numbers | (others if one is GridFollowing else {})
+        mine = numbers | (others if one is GridFollowingStage else {})
         return {key: mine[key] for key in mine if key in one.model_fields}
 
     return st.one_of(st.builds(one, **of(one)) for one in map(STAGES.__getitem__, kinds))

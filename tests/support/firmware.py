@@ -18,7 +18,7 @@ from gfm_runtime.inner import (
     PRIORITIES,
     STAGES,
     DualSequence,
-    GridFollowing,
+    GridFollowingStage,
     PowerLimiter,
     StiffSource,
     settle,
@@ -52,7 +52,7 @@ def _staged() -> dict[str, BuiltLaw]:
     follows = load_law("grid-following").laws[0]
     for kind, one in STAGES.items():
         for k, priority in enumerate(PRIORITIES):
-            if one is GridFollowing:
+            if one is GridFollowingStage:
                 stage = one(
                     priority=priority, angle=-30.0, k_ci=5.0 * (k % 2), f_pll=20.0, k_f=3.0,
                     k_V=2.0 * (k > 1),

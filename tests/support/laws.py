@@ -24,7 +24,7 @@ from gfm_runtime import (
     step,
 )
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
-from gfm_runtime.inner import GridFollowing, InnerStage
+from gfm_runtime.inner import GridFollowingStage, InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES
 
 from .files import text_of
@@ -48,7 +48,7 @@ LAWS = {
 
 def behind(law: str, stage: InnerStage | None) -> BuiltLaw:
     """A law of the catalogue with a stage: the grid-following one where it takes no other."""
-    follows = isinstance(stage, GridFollowing)
+    follows = isinstance(stage, GridFollowingStage)
     return replace(get_law("grid-following" if follows else law), inner=stage)
 
 

@@ -19,7 +19,7 @@ from gfm_plant import NoEquilibrium
 from gfm_runtime.inner import (
     INNER_NUMBERS,
     DualSequence,
-    GridFollowing,
+    GridFollowingStage,
     InnerStage,
     StiffSource,
     ThresholdImpedance,
@@ -130,7 +130,7 @@ def linearise_stage(
     # A quantity is a row over w = (x, u, y, r): its real and imaginary part are those of row @ w.
     n = len(states)
     w = np.eye(n + NU + NY_INNER + NY)
-    omega, E, y, ref = w[n + OMEGA_ROW], w[n + 2], w[n + NU :], w[n + NU + NY_INNER :]
+    omega, E, y = w[n + OMEGA_ROW], w[n + 2], w[n + NU :]
     i, v, i_o = (y[k] + 1j * y[k + 1] for k in (NY, NY + 2, NY + 4))
     x = {name: w[2 * k] + 1j * w[2 * k + 1] for k, name in enumerate(both)}
     seen, after, turns = np.zeros(len(w)), list[NDArray[np.float64]](), omega
@@ -153,23 +153,11 @@ def linearise_stage(
         seen = frequency + c["T_k_pll"] * error
         turned = angle + 2.0 * c["half_turn"] * (seen + c["k_pll"] * error - y[OMEGA_COLUMN])
         after = [turned, seen]
-    if isinstance(inner, GridFollowing):
-        V, ahead = w[n - 3], v_0 / abs(v_0)
+    if isinstance(inner, GridFollowingStage):
         E = then["v_f"] + (c["R_v"] + 1j * c["X_v"]) * i
         omega, turns = seen, seen + c["give_back"] * E.imag / op.u[2]
-        V = V + c["follow_V"] * ((then["v_f"] / ahead).real - V)
-        after = [V, *after]
-        i_0 = inner.reference(i_0, v_0, op.e, omega_0)  # at rest
-        P_of, Q_of = (i_0 / ahead).real, omega_0 * c["C_f"] * abs(v_0) - (i_0 / ahead).imag
-        droops = abs(1.0 - omega_0) >= inner.band_f
-        error = y[0] - ref[0]
-        power = ref[1] - (c["k_f"] * droops) * seen + c["k_dc"] * error
-        if c["T_k_dci"] > 0.0:
-            power, after = power + w[n - 4], [w[n - 4] + c["T_k_dci"] * error, *after]
-        along = (power - P_of * V) / abs(v_0)
-        across = (Q_of * V - ref[3]) / abs(v_0) + c["C_f"] * (omega_0 * V + abs(v_0) * seen)
-        i_ref = ahead * (along + 1j * across) + 1j * i_0 * turned
-        i_0 = complex(op.x[0], op.x[1])
+        i_ref, own = _asked_current(inner, c, op, w, n, then["v_f"], seen, turned)
+        after = [*own, *after]
     elif stator:
         lacks = op.e - v_0 - 1j * omega_0 * c["L_f"] * i_0
         i_ref_0 = i_0 if inner.k_ci > 0.0 else i_0 + lacks / c["k_c"]
@@ -202,6 +190,38 @@ def linearise_stage(
     return LinearStage(*of, states=tuple(states))
 
 
+def _asked_current(
+    inner: GridFollowingStage,
+    c: np.void,
+    op: OperatingPoint,
+    w: Matrix,
+    n: int,
+    v_f: NDArray[np.complex128],
+    omega: Matrix,
+    angle: Matrix,
+) -> tuple[NDArray[np.complex128], list[Matrix]]:
+    """i* of a grid-following stage, and the next of its own states, which end n - 2 states.
+
+    Args:
+        w, n: rows and number of states, as in ``linearise_stage``.
+        v_f, omega, angle: the filtered voltage, and the frequency and angle of the PLL, after the
+            tick.
+    """
+    v_0, omega_0 = complex(op.x[2], op.x[3]), float(op.u[1])
+    size, ahead = abs(v_0), v_0 / abs(v_0)
+    y, ref = w[n + NU :], w[n + NU + NY_INNER :]
+    i_0 = inner.reference(complex(op.x[0], op.x[1]), v_0, op.e, omega_0)
+    P_of, Q_of = (i_0 / ahead).real, omega_0 * c["C_f"] * size - (i_0 / ahead).imag
+    V = w[n - 3] + c["follow_V"] * ((v_f / ahead).real - w[n - 3])
+    droops, error, then = abs(1.0 - omega_0) >= inner.band_f, y[0] - ref[0], [V]
+    power = ref[1] - (c["k_f"] * droops) * omega + c["k_dc"] * error
+    if c["T_k_dci"] > 0.0:
+        power, then = power + w[n - 4], [w[n - 4] + c["T_k_dci"] * error, V]
+    along = (power - P_of * V) / size
+    across = (Q_of * V - ref[3]) / size + c["C_f"] * (omega_0 * V + size * omega)
+    return ahead * (along + 1j * across) + 1j * i_0 * angle, then
+
+
 def _without_states() -> LinearStage:
     """A stage whose bridge produces E_u itself."""
     none, D_u = np.zeros((0, 0)), np.eye(NU_INNER, NU)
@@ -214,7 +234,7 @@ def _without_states() -> LinearStage:
 def _states(inner: InnerStage, c: np.void) -> tuple[list[str], list[str]]:
     """The states that have both axes, by their symbols; and all states, one axis each, in words."""
     stator = isinstance(inner, VirtualStator)
-    follows = isinstance(inner, GridFollowing)
+    follows = isinstance(inner, GridFollowingStage)
     acts = {"v_f": True, "i*": stator, "x_v": not stator and c["T_k_vi"] > 0.0}
     acts["x_c"] = c["T_k_ci"] > 0.0
     acts |= dict.fromkeys(("i_p", "i_n", "E_p", "E_n"), isinstance(inner, DualSequence))
@@ -237,9 +257,9 @@ def _check_limits(inner: InnerStage, op: OperatingPoint, size: float) -> None:
         )
     elif isinstance(inner, ThresholdImpedance) and size > inner.I_thr:
         why = f"the threshold impedance acts: |i| is {size:.4g} p.u., I_thr is {inner.I_thr:g}"
-    elif isinstance(inner, GridFollowing) and inner.k_V > 0 and abs(1.0 - V) >= inner.band_V:
+    elif isinstance(inner, GridFollowingStage) and inner.k_V > 0 and abs(1.0 - V) >= inner.band_V:
         why = f"the support of the voltage acts: V is {V:.4g} p.u., beyond its dead band"
-    elif isinstance(inner, GridFollowing) and inner.V_least >= V:
+    elif isinstance(inner, GridFollowingStage) and inner.V_least >= V:
         why = f"V is {V:.4g} p.u., below V_least = {inner.V_least:g}"
     elif isinstance(inner, StiffSource) and not inner.rests(e, float(op.y[3])):
         why = f"a limit of E or q acts: E is {e:.4g} p.u., q {op.y[3]:.4g} p.u."

@@ -29,7 +29,7 @@ from gfm_plant.records import ACROSS, BEHIND, Record
 from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
-from gfm_runtime.inner import GridFollowing
+from gfm_runtime.inner import GridFollowingStage
 from gfm_runtime.tustin import DiscreteLaw
 
 Vector = NDArray[np.float64]
@@ -172,7 +172,7 @@ class _NetworkEquilibrium:
                 for unit, law in zip(self.wiring.units, self.laws, strict=True)
                 if unit.node in nodes
             ]
-            follow = all(isinstance(law.inner, GridFollowing) for _, law in there)
+            follow = all(isinstance(law.inner, GridFollowingStage) for _, law in there)
             if follow and not sources & {*nodes}:
                 who = ", ".join(f"{name} ({law.name})" for name, law in there)
                 raise NoEquilibrium(
@@ -360,7 +360,7 @@ class _ConverterEquilibrium:
     def __init__(self, par: Record, law: DiscreteLaw, ref: Vector, drop: Drop = no_drop) -> None:
         self.par, self.law, self.ref, self.drop = par, law, ref, drop
         self.controlled = par[0]["i_u_gain"] != 0.0
-        if isinstance(inner := law.law.inner, GridFollowing) and inner.k_dci > 0.0:
+        if isinstance(inner := law.law.inner, GridFollowingStage) and inner.k_dci > 0.0:
             held = 0 in law.rows if self.controlled else par[0]["array"] != ACROSS
             if held:
                 raise NoEquilibrium(
@@ -409,7 +409,7 @@ class _ConverterEquilibrium:
             dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
         ac = dx[self._steady]
         e = self._command(x, u)
-        if isinstance(inner := law.law.inner, GridFollowing):
+        if isinstance(inner := law.law.inner, GridFollowingStage):
             i, v = complex(x[0], x[1]), complex(x[2], x[3])
             lack = inner.wanted(ref, y[0], abs(v), omega_g)
             lack -= inner.reference(i, v, e, omega_g) * abs(v) / v

@@ -23,7 +23,7 @@ from pydantic import Field
 
 from gfm_plant.circuit import Branch
 from gfm_plant.components.part import Fed, LinearPart, Matrix, emf
-from gfm_plant.components.swing import STEP, tell_speed
+from gfm_plant.components.swing import STEP, record_speed
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import drive, state
@@ -121,7 +121,7 @@ class InductionMotor(Fed):
     )  # fmt: skip
     hooks: ClassVar = {
         "at_rest": _look_ahead, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
-        "tick": _tick, "flow": tell_speed, "keep": _keep, "go_back": _go_back,
+        "tick": _tick, "flow": record_speed, "keep": _keep, "go_back": _go_back,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is")

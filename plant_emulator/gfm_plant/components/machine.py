@@ -14,11 +14,11 @@ from gfm_plant.components.swing import (
     SWING,
     lead,
     pack_swing,
+    record_speed,
     slopes,
     swing,
     swing_at_rest,
     swing_matrix,
-    tell_speed,
 )
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
@@ -116,7 +116,7 @@ class Machine(Rotating):
     record: ClassVar = np.dtype([*SPEED, ("E", "f8")], align=True)
     hooks: ClassVar = {
         "at_rest": _at_rest, "begin": _bound, "drive": _drive, "middle": _middle, "end": _bound,
-        "tick": _tick, "flow": tell_speed, **KEPT,
+        "tick": _tick, "flow": record_speed, **KEPT,
     }  # fmt: skip
 
     E: Positive = Field(1.05, description="voltage behind the reactance, p.u.")

@@ -80,7 +80,7 @@ def lead(now: Any, one: Any) -> None:
 
 
 @compiled
-def tell_speed(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+def record_speed(n: Any, now: Any, one: Any, c: int, part: int) -> None:
     """Give the speed that a run records."""
     field(now, "flow_omega")[one.source] = one.omega
 

@@ -53,11 +53,11 @@ from gfm_plant.components.swing import (
     KEPT,
     lead,
     pack_swing,
+    record_speed,
     slopes,
     swing,
     swing_at_rest,
     swing_matrix,
-    tell_speed,
 )
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
@@ -234,7 +234,7 @@ class SynchronousMachine(Rotating):
     )  # fmt: skip
     hooks: ClassVar = {
         "at_rest": _at_rest, "begin": _begin, "drive": _drive, "middle": _middle, "end": _end,
-        "tick": _tick, "flow": tell_speed, **KEPT,
+        "tick": _tick, "flow": record_speed, **KEPT,
     }  # fmt: skip
 
     V: Positive = Field(1.0, description="voltage of its node at the start, p.u.")

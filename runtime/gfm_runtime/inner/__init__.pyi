@@ -1,5 +1,5 @@
 from .dual_sequence import DualSequence
-from .grid_following import GridFollowing
+from .grid_following import GridFollowingStage
 from .kinds import (
     INNER_CONSTANTS,
     INNER_NUMBERS,
@@ -42,7 +42,7 @@ __all__ = [
     "STIFF",
     "Cascaded",
     "DualSequence",
-    "GridFollowing",
+    "GridFollowingStage",
     "Inner",
     "InnerStage",
     "PowerLimiter",

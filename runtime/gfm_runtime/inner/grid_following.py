@@ -33,7 +33,7 @@ from gfm_runtime.toml_file import NotNegative, Positive
 _RETURN = 10.0  # 1/s, of the converter's frame to the angle of E
 
 
-class GridFollowing(InnerStage):
+class GridFollowingStage(InnerStage):
     """A current by set-points of P and Q in the frame of a PLL, a limit, and a current loop."""
 
     rows: ClassVar = (0,)

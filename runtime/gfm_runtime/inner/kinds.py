@@ -17,7 +17,7 @@ from pydantic import Field
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.inner.dual_sequence import DualSequence, dual_sequence
 from gfm_runtime.inner.grid_following import (
-    GridFollowing,
+    GridFollowingStage,
     grid_following,
     settle_following,
     turn_frame,
@@ -54,7 +54,7 @@ from gfm_runtime.inner.voltage_loop import (
 from gfm_runtime.signals import NU
 
 Inner = Annotated[
-    VirtualStator | Cascaded | ThresholdImpedance | DualSequence | StiffSource | GridFollowing,
+    VirtualStator | Cascaded | ThresholdImpedance | DualSequence | StiffSource | GridFollowingStage,
     Field(discriminator="type"),
 ]
 
