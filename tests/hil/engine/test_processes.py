@@ -222,13 +222,22 @@ def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, 
     assert roles_of(folder) == {}
 
 
-def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(start, tmp_path):
-    """The plant stands still before its handshake, as one does that has to compile."""
+STANDS_STILL = """\
+import os, signal, sys
+if "plant" in sys.orig_argv:
+    os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(
+    start, tmp_path, monkeypatch
+):
+    """The plant stands still before its first import, as one does that has to compile."""
+    (tmp_path / "sitecustomize.py").write_text(STANDS_STILL, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     scenario = write(tmp_path, **LONG, link={"start_timeout_s": 1.0})
     folder = tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
-    wait_for(lambda: "plant" in roles_of(folder), process)
-    os.kill(roles_of(folder)["plant"], signal.SIGSTOP)
     code, out, _ = end(process)
     found = json.loads(out)
     assert (code, found["status"]) == (3, "safe")
