@@ -351,6 +351,18 @@ def _first_voltages(wiring: Wiring, refs: Sequence[Vector]) -> dict[str, float]:
     return found
 
 
+def check_dc_side(par: Record, law: DiscreteLaw) -> None:
+    """Raise NoEquilibrium: a law's stage integrates v_dc beside a DC source that holds it too."""
+    inner, r = law.law.inner, par[0]
+    if isinstance(inner, GridFollowingStage) and inner.k_dci > 0.0:
+        held = 0 in law.rows if r["i_u_gain"] != 0.0 else r["array"] != ACROSS
+        if held:
+            raise NoEquilibrium(
+                f"{law.law.name}: inner.k_dci = {inner.k_dci:g}: the DC source holds v_dc too;"
+                ' it is for one that does not, as plant.dc_source.mode = "array"'
+            )
+
+
 class _ConverterEquilibrium:
     """One converter under its law: unknowns, what must vanish, and what is found.
 
@@ -360,13 +372,7 @@ class _ConverterEquilibrium:
     def __init__(self, par: Record, law: DiscreteLaw, ref: Vector, drop: Drop = no_drop) -> None:
         self.par, self.law, self.ref, self.drop = par, law, ref, drop
         self.controlled = par[0]["i_u_gain"] != 0.0
-        if isinstance(inner := law.law.inner, GridFollowingStage) and inner.k_dci > 0.0:
-            held = 0 in law.rows if self.controlled else par[0]["array"] != ACROSS
-            if held:
-                raise NoEquilibrium(
-                    f"{law.law.name}: inner.k_dci = {inner.k_dci:g}: the DC source holds v_dc too;"
-                    ' it is for one that does not, as plant.dc_source.mode = "array"'
-                )
+        check_dc_side(par, law)
         # row 1's states are left out of a plant whose DC source ignores it
         self.kept = np.array(
             [i for i, row in enumerate(law.rows) if self.controlled or row != 0], dtype=int

@@ -12,7 +12,12 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.operating_point import OperatingPoint, operating_point, operating_points
+from gfm_design.model.operating_point import (
+    OperatingPoint,
+    check_dc_side,
+    operating_point,
+    operating_points,
+)
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.replay import Trace, no_trace, trace_of
@@ -157,6 +162,9 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
             rests = list[tuple[NDArray[np.float64], float]]()
         else:
             starts, rests = operating_points(plant, laws, refs)
+        for k, bench in enumerate(benches):
+            for law in bench.controller.discrete:  # to which an event may change
+                check_dc_side(plant.par[k : k + 1], law)
         x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
         plant.start(x, u, rests)
     except NoEquilibrium as problem:

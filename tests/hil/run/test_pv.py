@@ -108,6 +108,9 @@ def test_a_grid_following_law_holds_v_dc_by_its_power():
         assert p[t < when][-1] == pytest.approx(power, rel=3e-3)
     with pytest.raises(UserError, match=r"k_dci = 20: the DC source holds v_dc too"):
         gfmhil.run("pref_step", law="grid-following-pv")
+    event = {"t": 0.5, "type": "law", "law": "grid-following-pv"}
+    with pytest.raises(UserError, match=r"k_dci = 20: the DC source holds v_dc too"):
+        gfmhil.run("pref_step", events=[event])
 
 
 @pytest.mark.processes
