@@ -182,10 +182,8 @@ def linearise_stage(
     rows = [part for name in both for part in (then[name].real, then[name].imag)]
     out = np.array([w[n], turns, e.real, e.imag])
     split = [n, n + NU, n + NU + NY_INNER]
-    A, B_u, B_y, B_r = np.split(np.array([*rows, *after]), split, axis=1)
-    C, D_u, D_y, D_r = np.split(out, split, axis=1)
-    C_pll, _, D_pll, _ = np.split(seen[None, :], split, axis=1)
-    assert C.shape == (NU_INNER, n)
+    each = (np.split(m, split, axis=1) for m in (np.array([*rows, *after]), out, seen[None, :]))
+    (A, B_u, B_y, B_r), (C, D_u, D_y, D_r), (C_pll, _, D_pll, _) = each
     of = A, B_u, B_y, B_r, C, D_u, D_y, D_r, C_pll, D_pll
     return LinearStage(*of, states=tuple(states))
 
