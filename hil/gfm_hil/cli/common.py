@@ -30,6 +30,7 @@ from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
 from gfm_hil.scenario import Scenario, load_scenario
 from gfm_hil.studies.workers import Watch
+from gfm_runtime import law_file
 
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run
@@ -214,7 +215,7 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
         **more,
     }
     changed, names = settings(options)
-    return load_scenario(
+    scenario = load_scenario(
         options.scenario,
         {
             **OPTIONS,
@@ -225,6 +226,12 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
         converter=options.converter if gets else None,
         **own | changed,
     )
+    if options.inner is not None:
+        kept = [law for law in scenario.laws() if (f := law_file(law)).behind(options.inner) is f]
+        if kept:
+            why = f"{', '.join(kept)} needs its own stage, and keeps it"
+            print(f"gfmhil: --inner {options.inner}: {why}", file=sys.stderr)
+    return scenario
 
 
 def new_folder(out: str | None, stem: str) -> Path:

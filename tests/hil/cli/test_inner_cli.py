@@ -153,3 +153,11 @@ def test_a_current_loop_too_fast_for_T_s_is_told_with_the_range_of_k_c(tmp_path,
     run = ["run", str(scenario), "--quiet", "--no-figures", "--out", str(tmp_path / "run")]
     assert main(run) == 3
     assert "needs k_c below 0.0554 p.u. (it is 0.15)" in capsys.readouterr().out
+
+
+def test_a_grid_following_law_says_that_it_keeps_its_stage(tmp_path, capsys):
+    options = ["--link", "inproc", "--no-figures", "--quiet", "--out", str(tmp_path / "run")]
+    code = main(["run", "pref_step", "--law", "grid-following", "--inner", "none", *options])
+    assert code == 0
+    said = "gfmhil: --inner none: grid-following needs its own stage, and keeps it\n"
+    assert said in capsys.readouterr().err
