@@ -249,10 +249,11 @@ class LawFile(TomlTable):
         Raises LawError: no such stage, or a mistake in its file."""
         if inner is None:
             return self
-        stage, own = named_inner(inner), self.inner
-        needs = InnerStage.rows if stage is None else stage.rows
-        kept = own is not None and own.rows != InnerStage.rows == needs
-        return self if kept else self.model_copy(update={"inner": stage})
+        stage, own, every = named_inner(inner), self.inner, InnerStage.rows
+        needs = every if stage is None else stage.rows
+        if own is not None and own.rows != every and needs == every:
+            return self
+        return self.model_copy(update={"inner": stage})
 
     model_config = ConfigDict(json_schema_extra=_base_or_whole)
 

@@ -161,6 +161,9 @@ class _NetworkEquilibrium:
         self.island_of = {node: k for k, nodes in enumerate(self.islands) for node in nodes}
         self.alive = {*self.island_of, *(n for g in groups if self.fixed in g for n in g)}
         self.sizes = [side.size for side in self.sides]
+        acting = [c for name, c in wiring.fed if c.is_voltage or name not in wiring.opened]
+        #: how many rows are before those of the nodes
+        self.wanted = sum(self.sizes) + sum(one.unknowns for one in acting)
         self.sizes += [2 * len(self.free), *(one.unknowns for _, one in wiring.fed)]
 
     def _check_forming(self) -> None:
@@ -242,10 +245,10 @@ class _NetworkEquilibrium:
         ]
         starts = np.cumsum([0, *lengths])
         blocks = [{*range(a, b)} for a, b in pairwise(starts)]
-        at = {node: {k, k + 1} for node, k in self._places(int(starts[-1])).items()}
+        at = {node: {k, k + 1} for node, k in self._places(self.wanted).items()}
         reached = {node: set(rows) for node, rows in at.items()}  # by the voltage of each node
         for k, nodes in enumerate(self.islands):
-            reached[nodes[0]].add(int(starts[-1]) + 2 * len(self.free) + k)
+            reached[nodes[0]].add(self.wanted + 2 * len(self.free) + k)
         own = [set(block) for block in blocks[: len(wiring.units)]]
         terminals = {unit.terminal: k for k, unit in enumerate(wiring.units)}
         for k, unit in enumerate(wiring.units):
@@ -270,7 +273,7 @@ class _NetworkEquilibrium:
         reach += [(reached[node], beyond[node]) for node in self.free for _ in range(2)]
         for k, (_, component) in enumerate(wiring.fed):
             reach += [(mine[k], mine[k])] * component.unknowns
-        everything = {*range(int(starts[-1]) + 2 * len(self.free) + len(self.islands))}
+        everything = {*range(self.wanted + 2 * len(self.free) + len(self.islands))}
         return reach + [(everything, everything)] * len(self.islands)
 
     def _places(self, first: int) -> dict[str, int]:
@@ -281,10 +284,7 @@ class _NetworkEquilibrium:
         """The slopes that are known: by row and unknown, those of the current that meets at a node
         by the voltage of another one, and by the current and the angle of a converter."""
         wiring, (own, _, speeds) = self.wiring, self._split(z)
-        rows = self._places(
-            sum(side.size for side in self.sides)
-            + sum(c.unknowns for name, c in wiring.fed if c.is_voltage or name not in wiring.opened)
-        )
+        rows = self._places(self.wanted)
         unknowns, first = self._places(sum(side.size for side in self.sides)), 0
         for side, unit, mine in zip(self.sides, wiring.units, own, strict=False):
             if (row := rows.get(unit.node)) is not None:

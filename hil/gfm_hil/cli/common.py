@@ -227,10 +227,12 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
         **own | changed,
     )
     if options.inner is not None:
-        kept = [law for law in scenario.laws() if (f := law_file(law)).behind(options.inner) is f]
-        if kept:
-            why = f"{', '.join(kept)} needs its own stage, and keeps it"
-            print(f"gfmhil: --inner {options.inner}: {why}", file=sys.stderr)
+        members = [*scenario.each.values()] or [scenario]
+        laws = dict.fromkeys(law for one in members for law in one.laws())
+        for law in laws:
+            if (file := law_file(law)).behind(options.inner) is file:
+                why = f"{law} needs its own stage, and keeps it"
+                print(f"gfmhil: --inner {options.inner}: {why}", file=sys.stderr)
     return scenario
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from gfm_runtime.compiled import inlined
-from gfm_runtime.inner.stage import I_D, I_Q, V_DC, InnerStage, limit_current, limited
+from gfm_runtime.inner.stage import I_D, I_Q, V_DC, InnerStage, keep_q, limit_current, limited
 from gfm_runtime.toml_file import NotNegative, Positive
 
 _RETURN = 10.0  # 1/s, of the converter's frame to the angle of E
@@ -127,9 +127,7 @@ def limit_reactive_first(law, state):
     most = law.I_max * law.I_max
     state.limited = d * d + q * q > most
     if state.limited != 0:
-        q = limited(q, -law.I_max, law.I_max)
-        rest = math.sqrt(most - q * q)
-        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
+        keep_q(law, state, most)
 
 
 @inlined

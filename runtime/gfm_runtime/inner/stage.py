@@ -259,6 +259,14 @@ def limit_power(law, state, p):
 
 
 @inlined
+def keep_q(law, state, most):
+    """i* cut to I_max, whose square is ``most``, with what i_q* leaves for i_d*."""
+    q = limited(state.i_ref[1], -law.I_max, law.I_max)
+    rest = math.sqrt(most - q * q)
+    state.i_ref[0], state.i_ref[1] = limited(state.i_ref[0], -rest, rest), q
+
+
+@inlined
 def limit_current(law, state):
     """i* cut to I_max, and whether that was needed."""
     d, q = state.i_ref[0], state.i_ref[1]
@@ -274,9 +282,7 @@ def limit_current(law, state):
         rest = math.sqrt(most - d * d)
         state.i_ref[0], state.i_ref[1] = d, limited(q, -rest, rest)
     elif law.priority == _Q:
-        q = limited(q, -law.I_max, law.I_max)
-        rest = math.sqrt(most - q * q)
-        state.i_ref[0], state.i_ref[1] = limited(d, -rest, rest), q
+        keep_q(law, state, most)
     else:
         scale = law.I_max / math.sqrt(size)
         state.i_ref[0], state.i_ref[1] = d * scale, q * scale

@@ -155,9 +155,26 @@ def test_a_current_loop_too_fast_for_T_s_is_told_with_the_range_of_k_c(tmp_path,
     assert "needs k_c below 0.0554 p.u. (it is 0.15)" in capsys.readouterr().out
 
 
-def test_a_grid_following_law_says_that_it_keeps_its_stage(tmp_path, capsys):
+NETWORK = """\
+title = "one follows"
+duration = 0.01
+link = { type = "inproc" }
+[network]
+grid = "g"
+lines.feeder = { start = "g", end = "bus", L = 0.2, R = 0.02 }
+converters.A = { node = "bus", law = "vsg-2" }
+converters.B = { node = "bus", law = "grid-following" }
+"""
+
+
+@pytest.mark.parametrize("network", [False, pytest.param(True, marks=pytest.mark.full)])
+def test_a_grid_following_law_says_that_it_keeps_its_stage(network, tmp_path, capsys):
+    given = (
+        [file(tmp_path, NETWORK, "net.toml")]
+        if network
+        else ["pref_step", "--law", "grid-following"]
+    )
     options = ["--link", "inproc", "--no-figures", "--quiet", "--out", str(tmp_path / "run")]
-    code = main(["run", "pref_step", "--law", "grid-following", "--inner", "none", *options])
-    assert code == 0
+    assert main(["run", *given, "--inner", "none", *options]) == 0
     said = "gfmhil: --inner none: grid-following needs its own stage, and keeps it\n"
-    assert said in capsys.readouterr().err
+    assert capsys.readouterr().err.count(said) == 1
