@@ -18,7 +18,7 @@ import zmq
 NAME = "droop in Python"
 GREETING = b"GFMHIL "
 HEADER = "<HBBBBHIQ"  # magic, table version, data id, state, reason, spare, sequence, tick
-MAGIC, VERSION, Y_ID, U_ID = 0x4647, 3, 1, 2
+MAGIC, VERSION, Y_ID, U_ID = 0x4647, 4, 1, 2
 RUNNING, SAFE, STOPPED = 2, 3, 4
 
 D_p, k_34, T = 0.01, 0.005, 0.02  # p.u., p.u., s

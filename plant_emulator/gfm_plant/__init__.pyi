@@ -1,6 +1,7 @@
 from .bases import Bases
 from .build import make_network, make_plant
 from .components import NetworkParts
+from .components.plant_controller import begin_set_points, set_plant_reference
 from .emulator import (
     plant_advance,
     plant_command,
@@ -34,7 +35,7 @@ from .parameters import ConverterParameters, load_converter
 from .protection import trip_reason, wait_reason
 from .pv_array import set_irradiance
 from .records import PlantRecords
-from .sensors import plant_sample
+from .sensors import plant_sample, plant_set_points
 from .steady_state import NoEquilibrium, plant_equilibrium
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "Plant",
     "PlantRecords",
     "SynchroCheckResult",
+    "begin_set_points",
     "breaker",
     "check_synchronism",
     "clear_fault",
@@ -74,9 +76,11 @@ __all__ = [
     "plant_is_delayed",
     "plant_options",
     "plant_sample",
+    "plant_set_points",
     "plant_step",
     "plant_truth",
     "set_irradiance",
+    "set_plant_reference",
     "start_again",
     "take_out",
     "trip_reason",

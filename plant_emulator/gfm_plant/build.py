@@ -14,6 +14,7 @@ from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
 from gfm_plant.components.line import Line
 from gfm_plant.components.part import Component, Dynamic, Fed, Terminal
+from gfm_plant.components.plant_controller import PlantController
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.swing import pack_swing
 from gfm_plant.layout import Record, make_net_and_now
@@ -160,6 +161,7 @@ def _make(
         grid_node,
         opened=opened,
         recorded=recorded,
+        supervisors=tuple((name, x) for _, name, x in each if isinstance(x, PlantController)),
     )
     _check_paths(wiring)
     dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
@@ -278,6 +280,7 @@ def _network(
             sum(len(one.columns) for one in wiring.recorded),
         ),
         len(par) + 1 if port else 0,
+        bool(wiring.supervisors),
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)
@@ -287,7 +290,7 @@ def _network(
     for kind in DYNAMIC:
         those = [item for item in dynamic if isinstance(item[2], kind)]
         parts.append(records := np.zeros(len(those), kind.record))
-        for record, (table, name, one) in zip(records, those, strict=True):
+        for k, (record, (table, name, one)) in enumerate(zip(records, those, strict=True)):
             where = f"{table}.{name}" if name else table
             if isinstance(one, FiniteGrid):
                 X = 1 / sum(1 / (unit.L_f + unit.L_g) for unit in wiring.units)
@@ -298,6 +301,8 @@ def _network(
                 record["lag"] = len(par) + lags.index(name)
             if isinstance(one, Fed):
                 record["source"] = places[one.sources(name)[0]]
+            elif isinstance(one, PlantController):
+                one.place(name, record, k + 1, wiring, net["supervisor"][0])
     net["n_dynamic"] = len(dynamic)
     return Network(par, st, net, now, tuple(parts), wiring)
 

@@ -32,6 +32,7 @@ def look_at_flows(plant: PlantRecords) -> None:
     node, begin, at = field(n, "flow_node"), field(n, "flow_begin"), field(n, "flow_from")
     by, G, out, j = field(n, "flow_by"), field(n, "flow_G"), field(now, "flow_row"), 0
     turns, omega = field(n, "flow_turns"), field(now, "flow_omega")
+    more = field(n, "flow_more")
     for k in range(len(node)):
         voltage = v[node[k]]
         i = complex(G[k] * voltage.real, G[k] * voltage.imag)
@@ -45,6 +46,7 @@ def look_at_flows(plant: PlantRecords) -> None:
         if turns[k] >= 0:
             out[j] = omega[turns[k]]
             j += 1
+        j += more[k]
     if n.flow_fault != 0:
         out[j] = out[j + 1] = out[j + 2] = 0.0
         if n.flow_fault > 1 and (now.contact != 0 or now.joint != 0):

@@ -442,6 +442,7 @@ def _pack_flows(net: Any, wiring: Wiring) -> None:
         )
         net["flow_node"][k], net["flow_begin"][k] = nodes.index(one.node), count
         net["flow_turns"][k] = sources[one.turns] if one.turns else -1
+        net["flow_more"][k] = len(one.more)
         net["flow_G"][k] = sum(by * through.get(name, 0.0) for name, by in parts)
         for name, by in parts:
             if name == wiring.split != one.name:  # its end

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_plant.layout import field
 from gfm_plant.model import V_DC, terminal
 from gfm_plant.noise import gaussians
 from gfm_plant.phases import read_phases
@@ -12,7 +13,17 @@ from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecords
 from gfm_runtime.by_address import call_at
 from gfm_runtime.compiled import compiled, inlined
-from gfm_runtime.signals import NY, NY_INNER
+from gfm_runtime.signals import N_SET, NY, NY_INNER
+
+
+@inlined
+def plant_set_points(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
+    """Write the set-points of converter k's plant controller to the end of y, if the network has
+    one: (P_set, Q_set, V_set), p.u. of the converter, NaN where it sends none."""
+    if plant.net[0].n_followers > 0:
+        points = field(plant.now[0], "set_points")
+        for j in range(N_SET):
+            y[len(y) - N_SET + j] = points[k, j]
 
 
 @inlined

@@ -33,6 +33,7 @@ from gfm_plant.circuit import (
     without_ends,
 )
 from gfm_plant.components.part import Fed, Terminal, emf
+from gfm_plant.components.plant_controller import PlantController
 from gfm_plant.contacts import zero_circuit
 from gfm_plant.names import FAULTED_PHASES
 
@@ -224,6 +225,7 @@ class Wiring:
     check: Check | None = None  # the synchro-check that waits to close a breaker, or None
     recorded: tuple[Terminal, ...] = ()  # where the run records currents and powers
     led: bool = False  # whether another part of the plant sets the frequency, see `parted`
+    supervisors: tuple[tuple[str, PlantController], ...] = ()  # plant controllers by their names
 
     @cached_property
     def order(self) -> tuple[str, ...]:

@@ -11,7 +11,9 @@ within a group is the order of the vectors everywhere:
   commands besides, at the end of y and u; E_u is then the d component of the bridge's voltage,
 * ``adc`` and ``compare``: what the pins of a processor see besides, at the end of y and u of a run
   whose laws measure and modulate themselves (``gfm_runtime.counts``). Such a law computes its own
-  y from the counts; what y has before them is for the recording alone.
+  y from the counts; what y has before them is for the recording alone,
+* ``set``: the set-points of a plant controller, at the end of y in a network that has one. A
+  controller takes those that are numbers as references from this tick on.
 
 Add signals at the end of a group only; anything else is a new ``TABLE_VERSION``, which both
 sides of a link compare before they start.
@@ -22,9 +24,9 @@ import math
 from dataclasses import astuple, dataclass, replace
 from typing import Literal, get_args
 
-TABLE_VERSION = 3
+TABLE_VERSION = 4
 
-Group = Literal["y", "u", "y_inner", "u_inner", "adc", "compare", "ref", "d"]
+Group = Literal["y", "u", "y_inner", "u_inner", "adc", "compare", "ref", "d", "set"]
 Vector = Literal["y", "u"]
 Channel = Literal["v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"]
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -97,6 +99,9 @@ SIGNALS: tuple[Signal, ...] = (
                f"compare value of leg {leg}: how long it is above, of half a carrier")
         for leg in "abc"
     ),
+    Signal("set", "P_set", "P_{set}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.5, "set-point of P_ref"),
+    Signal("set", "Q_set", "Q_{set}", "p.u.", "S_n", 2e-4, -2.0, 2.0, 0.0, "set-point of Q_ref"),
+    Signal("set", "V_set", "V_{set}", "p.u.", "V_n", 1e-4, 0.0, 1.5, 1.0, "set-point of V_ref"),
 )  # fmt: skip
 
 SPACE_VECTOR = 1 / math.sqrt(2)
@@ -110,9 +115,13 @@ NY_INNER, NU_INNER = 11, 4  # of a run with an inner stage
 Y_V_DC, Y_P, Y_OMEGA, Y_Q, Y_V, Y_I_D, Y_I_Q, Y_V_D, Y_V_Q, Y_I_OD, Y_I_OQ = range(NY_INNER)
 N_ADC, N_LEGS = len(CHANNELS), 3
 NY_COUNTS, NU_COUNTS = NY_INNER + N_ADC, NU_INNER + N_LEGS  # of one that measures and modulates
+N_SET = 3  # set-points of a plant controller
+NY_MOST = NY_COUNTS + N_SET
 
 #: what a run exchanges beside y and u of Phi: nothing, the signals of an inner stage, and counts
 PLAIN, INNER, COUNTS = range(3)
+#: what a frame has besides, as a sum with these: set-points at the end of y
+SET_POINTS = 4
 
 
 def group(name: Group) -> tuple[Signal, ...]:
@@ -130,9 +139,11 @@ Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), nam
 
 def carried_rows(vector: Vector, inner: int) -> tuple[Signal, ...]:
     """What a run exchanges: y or u, and after them the signals of an inner stage and counts;
-    ``inner``: ``PLAIN``, ``INNER`` or ``COUNTS``."""
+    ``inner``: ``PLAIN``, ``INNER`` or ``COUNTS``, of y with ``SET_POINTS`` if those follow."""
     more: tuple[Group, Group] = ("y_inner", "adc") if vector == "y" else ("u_inner", "compare")
-    return group(vector) + tuple(row for name in more[:inner] for row in group(name))
+    last: tuple[Group, ...] = ("set",) if vector == "y" and inner & SET_POINTS else ()
+    names = (*more[: inner & ~SET_POINTS], *last)
+    return group(vector) + tuple(row for name in names for row in group(name))
 
 
 def carried(vector: Vector, inner: int) -> tuple[str, ...]:

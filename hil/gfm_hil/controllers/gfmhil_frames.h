@@ -17,14 +17,15 @@
 #error "frames are little-endian"
 #endif
 
-/* Values of a frame; a run with an inner stage has 11 and 4. */
+/* Values of a frame; a run with an inner stage has 11 and 4. In a network with a plant controller y is
+   3 longer: set-points of P_ref, Q_ref and V_ref, each NaN where none is sent. */
 #ifndef GFMHIL_NY
 #define GFMHIL_NY 5 /* v_dc, p, omega_u, q, V */
 #define GFMHIL_NU 3 /* i_u, omega_u, E_u */
 #endif
 
-enum { GFMHIL_MAGIC = 0x4647, GFMHIL_TABLE_VERSION = 3, GFMHIL_Y_ID = 1, GFMHIL_U_ID = 2 };
-#define GFMHIL_TABLE "\"c061c2eb\"" /* hash of the signal table, as a greeting has it */
+enum { GFMHIL_MAGIC = 0x4647, GFMHIL_TABLE_VERSION = 4, GFMHIL_Y_ID = 1, GFMHIL_U_ID = 2 };
+#define GFMHIL_TABLE "\"96954d46\"" /* hash of the signal table, as a greeting has it */
 enum { GFMHIL_INIT, GFMHIL_READY, GFMHIL_RUNNING, GFMHIL_SAFE, GFMHIL_STOPPED }; /* state */
 enum { GFMHIL_OK, GFMHIL_BAD_Y, GFMHIL_BAD_U, GFMHIL_STALE, GFMHIL_LOST_PEER, GFMHIL_PLANT_TRIP,
        GFMHIL_OPERATOR, GFMHIL_BAD_SENSOR }; /* reason */

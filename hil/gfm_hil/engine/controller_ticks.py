@@ -16,7 +16,7 @@ from gfm_hil.links.frame import judge, pack, pack_again, skip, unpack
 from gfm_hil.realtime.clock import AHEAD_NS, now_ns, sleep_until, spin_or_yield, yield_processor
 from gfm_hil.recording.recorder import record_controller
 from gfm_runtime.compiled import compiled, inlined
-from gfm_runtime.controller import missed
+from gfm_runtime.controller import missed, take_set_points
 from gfm_runtime.states import SAFE, STOPPED
 
 _Y_ID = 1
@@ -47,6 +47,7 @@ def controller_ticks(end, records, controller, event):
             return why
         changes = ctl[0].changes
         if not stands_still(records.plan, r.tick):
+            take_set_points(ctl[0], records.y_sent, len(y))
             answer(ctl, laws, states, est, y, u, plant_tripped(end, r))
         why = reply(end, records, r, controller, event, changes)
         if why != ReturnReason.GO_ON:
@@ -94,7 +95,7 @@ def plant_tripped(end, r):
 @inlined
 def _between(end, records, r):
     """Take the y received once its tick is there; note the times of a tick before it."""
-    y, times = records.y, records.times
+    y, times = records.y_sent, records.times
     got, _ = end.into
     if r.tick == r.received and r.left == 0:
         for j in range(len(y)):
@@ -140,7 +141,7 @@ def _next_frame(end, records, r, ctl, sent):
     The time since the last answer was ``sent`` (0: there was none), which the link's own thread
     took, is a gap between two looks at the clock like any other.
     """
-    flags, y, times = records.flags, records.y, records.times
+    flags, y, times = records.flags, records.y_sent, records.times
     got, got_bytes = end.into
     reader = end.reader
     judge(reader, False, ctl[0].state == SAFE)

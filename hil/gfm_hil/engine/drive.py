@@ -71,7 +71,7 @@ class _End:
         scenario, port = bench.scenario, link.port
         plant = role == "plant"
         self.bench, self.link = bench, link
-        self.writer = FrameWriter("y" if plant else "u", bench.inner)
+        self.writer = FrameWriter("y" if plant else "u", scenario.exchanged)
         hold = int(bench.controller.ctl["hold"][0])  # of the watchdog, for both sides
         every = getattr(link, "every", 1)
         self.reader = limited_reader(role, scenario, hold, every)
@@ -89,6 +89,7 @@ class _End:
             self.loop,
             flags,
             bench.y,
+            bench.y_sent,
             bench.u,
             part.signals,
             part.times,
@@ -167,7 +168,7 @@ def drive_plant(shares: Sequence[Share], t0_ns: int, flags: NDArray[np.int64]) -
         state = SAFE if status == "tripped" and not survives_trip else STOPPED
         early = status != "completed" and end.tick < ticks
         if not end.loop["lost"][0]:
-            end.send_last_frames(state, int(early), end.bench.y)
+            end.send_last_frames(state, int(early), end.bench.y_sent)
     return [end.reader for end in ends]
 
 

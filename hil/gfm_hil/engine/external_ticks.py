@@ -33,6 +33,7 @@ from gfm_runtime.controller import (
     measured,
     move_references,
     next_law,
+    take_set_points,
 )
 from gfm_runtime.inner_tick import sense
 from gfm_runtime.signals import NY, NY_INNER
@@ -177,6 +178,7 @@ def receive_tick(end, records, controller, event, has_laws):
         return why, REFUSED, -1
     before = ctl[0].state
     follow_plant(ctl, plant_tripped(end, records.loop[0]))
+    take_set_points(ctl[0], records.y_sent, len(records.y))
     if ctl[0].state != RUNNING or not _takes(ctl[0], records.y, controller, has_laws):
         return why, REFUSED, -1
     changed = next_law(ctl[0], controller.est[0], ctl[0].y) if has_laws else -1

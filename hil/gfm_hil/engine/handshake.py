@@ -328,7 +328,7 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
     """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
         return limited_reader("controller", scenario).unpack(
-            message, np.empty(len(carried("y", scenario.signal_set)))
+            message, np.empty(len(carried("y", scenario.exchanged)))
         )
     except FrameError:
         return None

@@ -22,9 +22,11 @@ from gfm_hil.recording.columns import signals_of
 from gfm_hil.recording.parts import MemoryPart, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
+from gfm_plant.layout import field
 from gfm_plant.synchro_check import WATCHING
 from gfm_runtime.assembly import Controller
 from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.controller import take_set_points
 from gfm_runtime.states import READY
 
 CHUNK = 10_000  # ticks of all converters between two looks at the stop flag and the progress bar
@@ -144,6 +146,8 @@ def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, ke
             trips += tripped
             mine, estimate = ctl[i : i + 1], est[i : i + 1]
             if not stands_still(plan, k):
+                if plant.net[0].n_followers > 0:
+                    take_set_points(ctl[i], field(plant.now[0], "set_points")[i], 0)
                 answer(mine, laws[stack.row[i]], states[i], estimate, y[i], u[i], tripped != 0)
             other = row_at(places.controller[i], widths[1], k - first)
             record_controller(other, mine, states[i], estimate)

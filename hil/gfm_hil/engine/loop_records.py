@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gfm_hil.core.roles import Role
 from gfm_hil.links.frame import LAST_TIMES, LONGEST_JUMP, FrameReader
 from gfm_hil.scenario import Scenario
-from gfm_runtime.signals import NU_COUNTS, NY_COUNTS
+from gfm_runtime.signals import NU_COUNTS, NY_MOST
 from gfm_runtime.states import RUNNING, STOPPED
 
 
@@ -97,8 +97,10 @@ class Records(NamedTuple):
     loop: NDArray[Any]  # one element of ``loop_dtype``
     flags: NDArray[np.int64]  # shape (FLAGS,), int64, written by other threads
     # y, u: measurements (5,) and inputs (3,) of the current tick, (11,) and (4,) with an inner
-    # stage, (21,) and (7,) with counts; p.u. and counts
+    # stage, (21,) and (7,) with counts; p.u. and counts. y_sent: the memory of y, and after it the
+    # set-points of a plant controller, if there is one
     y: NDArray[np.float64]
+    y_sent: NDArray[np.float64]
     u: NDArray[np.float64]
     # rows, times, progress: of the recording's part
     rows: NDArray[np.float64]
@@ -136,7 +138,7 @@ def make_loop(scenario: Scenario, tick: int, t0_ns: int, hold: int, every: int =
     loop["realtime"], loop["tick"], loop["t0"] = scenario.mode == "realtime", tick, t0_ns
     loop["clock_every"] = 1 if scenario.mode == "realtime" else _CLOCK_EVERY
     loop["survives_trip"], loop["others"] = scenario.survives_trips, scenario.network is not None
-    loop["every"], loop["at_once"] = every, NY_COUNTS if every == 1 else 0
+    loop["every"], loop["at_once"] = every, NY_MOST if every == 1 else 0
     loop["received"], loop["ahead"], loop["acting"] = tick, -1, -1
     loop["seen"], loop["unseen"] = RUNNING, -1
     loop["hold"], loop["extrapolate"] = hold, scenario.late_policy.extrapolate
@@ -175,4 +177,4 @@ def limited_reader(role: Role, scenario: Scenario, hold: int = 0, every: int = 1
         limits["behind"] = hold + (2 * every - 1 if every > 1 else 0)
     if scenario.survives_trips:
         limits["leaving"] = STOPPED
-    return FrameReader("u" if plant else "y", scenario.signal_set, **limits)
+    return FrameReader("u" if plant else "y", scenario.exchanged, **limits)

@@ -25,7 +25,7 @@ from gfm_hil.realtime.clock import (
 )
 from gfm_hil.recording.columns import kept_of
 from gfm_hil.recording.recorder import record_command
-from gfm_plant import plant_flows, plant_is_delayed, plant_step
+from gfm_plant import plant_flows, plant_is_delayed, plant_set_points, plant_step
 from gfm_plant.names import CONTROLLER, GONE, LEFT
 from gfm_plant.names import SILENT as NOT_HEARD
 from gfm_plant.protection import trip
@@ -114,6 +114,7 @@ def _ask(side, plant, i, k, due):
     if r.realtime:
         times[k, 0], times[k, 1] = due, now_ns()
     r.tripped = sample(plant, i, records.y, records.rows[k])
+    plant_set_points(plant, i, records.y_sent)
     if records.flows.shape[1] > 0:
         plant_flows(plant, records.flows[k])
     if r.lost != 0:
@@ -124,7 +125,7 @@ def _ask(side, plant, i, k, due):
     if r.realtime:
         times[k, _MEASURED] = now_ns()
     if r.every == 1 or k % r.every == 0:
-        pack(sequence, frame, message, k, state, reason, records.y)
+        pack(sequence, frame, message, k, state, reason, records.y_sent)
         end.send(end.handle, message)
     else:
         skip(sequence)

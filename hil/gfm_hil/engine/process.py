@@ -269,7 +269,7 @@ def _meet(
 def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) every function that Python calls for a side; those that only
     these call become part of them."""
-    inner = benches[0].inner
+    inner = benches[0].scenario.exchanged
     for group in DATA_IDS:
         values = np.zeros(len(carried(group, inner)))
         FrameReader(group, inner).unpack(FrameWriter(group, inner).pack(0, 0, 0, values), values)

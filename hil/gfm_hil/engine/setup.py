@@ -25,16 +25,25 @@ from gfm_hil.engine.snapshot import start_from
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.gains import gains_of
-from gfm_plant import BATTERY, CONNECTION, Network, NoEquilibrium, start_again, take_out
+from gfm_plant import (
+    BATTERY,
+    CONNECTION,
+    Network,
+    NoEquilibrium,
+    begin_set_points,
+    start_again,
+    take_out,
+)
 from gfm_plant.model import DELTA
 from gfm_plant.names import MAY_START
 from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, Vector, carried
+from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, Vector, carried, names
 from gfm_runtime.states import READY, SAFE, STATES
 
+_SET = [REF_NAMES.index(name.replace("set", "ref")) for name in names("set")]
 ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
 
 
@@ -47,8 +56,10 @@ class Bench:
     place: int  # the converter's index in it
     controller: Controller  # the controller, its first law at rest and RUNNING
     start: OperatingPoint
-    # measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.
+    # measurements of the current tick, shape (5,), or (11,) with an inner stage, p.u.; and the same
+    # memory with the set-points of a plant controller after them, if there is one
     y: NDArray[np.float64]
+    y_sent: NDArray[np.float64]
     # inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     u: NDArray[np.float64]
     # what computes u in place of the law; None for the law
@@ -167,6 +178,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
                 check_dc_side(plant.par[k : k + 1], law)
         x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
         plant.start(x, u, rests)
+        begin_set_points(plant, np.stack(refs)[:, _SET])
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None
@@ -217,9 +229,10 @@ def unstarted_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
     for k, one in enumerate([*scenario.each.values()] or [scenario]):
         controller = _controller(one, plant, real)
         inner = controller.inner = scenario.signal_set
-        y, u = (np.zeros(len(carried(group, inner))) for group in vectors)
+        y, u = (np.zeros(len(carried(group, scenario.exchanged))) for group in vectors)
+        own = y[: len(carried("y", inner))]
         flows = scenario.flows if k == 0 else ()
-        benches.append(Bench(one, plant, k, controller, nowhere, y, u, flows=flows))
+        benches.append(Bench(one, plant, k, controller, nowhere, own, y, u, flows=flows))
     return benches
 
 

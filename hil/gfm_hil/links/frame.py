@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.crc import crc32
 from gfm_hil.realtime.atomics import load32, store32
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import NU_COUNTS, NY_COUNTS, TABLE_VERSION, Vector, carried
+from gfm_runtime.signals import NU_COUNTS, NY_MOST, TABLE_VERSION, Vector, carried
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 MAGIC = 0x4647  # "GF"
@@ -76,7 +76,7 @@ def wire_dtype(count: int) -> np.dtype:
 
 #: a frame's memory as compiled functions see it: with room for the longest vector, so that they are
 #: compiled once for frames of all lengths
-_LONGEST = max(NY_COUNTS, NU_COUNTS)
+_LONGEST = max(NY_MOST, NU_COUNTS)
 record_dtype = np.dtype([*_HEADER, ("values", "<f8", (_LONGEST,)), ("room", "<u4")])
 
 

@@ -290,6 +290,10 @@ _FLOWS = {
     "i_re": (r"\Re i", "p.u. (S_n/V_n)", "current, real part in the frame that turns at omega_n"),
     "i_im": (r"\Im i", "p.u. (S_n/V_n)", "current, imaginary part in that frame"),
     "omega": (r"\omega", "p.u. (f_n)", "speed, or frequency of the PLL,"),
+    "V": ("V", "p.u. (V_n)", "voltage"),
+    "P_set": ("P_{set}", "p.u. (S of the plant)", "set-point of the power"),
+    "Q_set": ("Q_{set}", "p.u. (S of the plant)", "set-point of the reactive power"),
+    "V_set": ("V_{set}", "p.u. (V_n)", "set-point of the voltage"),
     **{
         f"i_{phase}": (f"i_{phase}", "p.u. (sqrt(2/3) S_n/V_n)", f"current of phase {phase}")
         for phase in PHASES

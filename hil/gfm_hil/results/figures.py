@@ -529,8 +529,8 @@ def panels_of_all(
 
 def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
     """What was recorded of a network's parts, for a page: P, Q and the size of the current of a few
-    parts a panel, at the starts of lines, the speed of those that turn, and the phases of the
-    fault's current."""
+    parts a panel, at the starts of lines, the speed of those that turn, what plant controllers send
+    and the voltage that they see, and the phases of the fault's current."""
     columns = next(iter(run.values())).columns
     there = [name for name in run.scenario.flows if name in columns]
     parts = [n.removesuffix(".P") for n in there if n.endswith(".P") and not n.endswith(".end.P")]
@@ -544,6 +544,10 @@ def panels_of_network(run: NetworkRun) -> Iterator[Panel]:
         speeds = {n: columns[f"{n}.omega"] for n in group if f"{n}.omega" in there}
         if speeds:
             each.append(("speed omega", speeds))
+    sent = [n for n in there if n.endswith("_set")]
+    for name in dict.fromkeys(n.rpartition(".")[0] for n in sent):  # of plant controllers
+        of = [n for n in (*sent, f"{name}.V") if n.startswith(f"{name}.")]
+        each.append((f"set-points of {name}", {n.rpartition(".")[2]: columns[n] for n in of}))
     if f"{FAULT}.i_a" in there:
         phases = {f"i_{phase}": columns[f"{FAULT}.i_{phase}"] for phase in PHASES}
         each.append(("currents of the fault", phases))

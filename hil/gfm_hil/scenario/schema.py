@@ -24,12 +24,12 @@ from gfm_runtime.counts import named_counts
 from gfm_runtime.errors import meant
 from gfm_runtime.inner_file import named_inner
 from gfm_runtime.regular import read_regular
-from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, table_hash
+from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, SET_POINTS, table_hash
 
 #: default of ``link.peer_timeout_s`` by mode: real time cannot wait; in lockstep simulated time
 #: stands still, and a busy machine may delay a side by seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
-_WITH_COUNTS = ("shm", "zmq")  # links
+_WITH_COUNTS = ("shm", "zmq")  # links, with set-points too
 _MOST_FLOWS = 3500  # columns of a network, in a file of signals
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
@@ -398,6 +398,12 @@ class Scenario(StrictSchema):
         return INNER if any(stage is not None for stage in inner) else PLAIN
 
     @property
+    def exchanged(self) -> int:
+        """The signals of frames, ``signal_set`` and with a plant controller ``SET_POINTS``."""
+        sent = self.network is not None and bool(self.network.plant_controllers)
+        return self.signal_set + SET_POINTS * sent
+
+    @property
     def optional_signals(self) -> tuple[str, ...]:
         """The signals that options of a plant add to the recording, power and voltage at the
         connection point behind a transformer, and the charge of a battery."""
@@ -439,6 +445,8 @@ class Scenario(StrictSchema):
                 f"cores = {self.cores}: with link.type = {INPROC!r} only; over links each loop has"
                 " a processor of its own"
             )
+        if self.cores is not None and self.exchanged & SET_POINTS:
+            problems.append(f"cores = {self.cores}: cannot go with network.plant_controllers")
         if kinds == {INPROC} and self.mode == "realtime":
             problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")
         places = [link.endpoint for link in own.values() if link.endpoint is not None]
@@ -454,11 +462,15 @@ class Scenario(StrictSchema):
             options = kind.options.model_validate(link.options)
             where = f"network.converters.{name}.link" if name else "link"
             try:
-                if self.signal_set == COUNTS and link.type not in _WITH_COUNTS:
+                if self.exchanged >= COUNTS and link.type not in _WITH_COUNTS:
+                    what = (
+                        "counts, which laws with [measure] and [modulate] exchange"
+                        if self.signal_set == COUNTS
+                        else "set-points, which network.plant_controllers send"
+                    )
                     problems.append(
-                        f"{where}.type = {link.type!r}: carries no counts, which laws with"
-                        f" [measure] and [modulate] exchange; use {', '.join(_WITH_COUNTS)} or"
-                        f" {INPROC}"
+                        f"{where}.type = {link.type!r}: carries no {what}; use"
+                        f" {', '.join(_WITH_COUNTS)} or {INPROC}"
                     )
                     continue
                 kind.check(options.of_run(self.signal_set), self.T_s)

@@ -18,6 +18,7 @@ from gfm_plant.components.line import Line
 from gfm_plant.components.load import Load
 from gfm_plant.components.machine import Machine
 from gfm_plant.components.part import FAULT, Component, Dynamic, Fed, Terminal, converter_terminal
+from gfm_plant.components.plant_controller import PlantController
 from gfm_plant.components.saturation import Saturation
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
@@ -48,6 +49,7 @@ class NetworkParts(Options):
     machines: dict[str, Machine] = Field({}, description="by name")
     synchronous_machines: dict[str, SynchronousMachine] = Field({}, description="by name")
     induction_motors: dict[str, InductionMotor] = Field({}, description="by name")
+    plant_controllers: dict[str, PlantController] = Field({}, description="by name")
 
     def components(self) -> Iterator[tuple[str, str, Component]]:
         """Table, name and options of each, in the order of the fields above."""
@@ -56,16 +58,24 @@ class NetworkParts(Options):
                 yield table, name, one
 
     def recorded(self, converters: Mapping[str, str]) -> tuple[Terminal, ...]:
-        """What ``record`` names, in the order of the network.
+        """What ``record`` names, in the order of the network, and where its plant controllers
+        measure.
 
         Args:
             converters: their nodes by their names.
 
         Raises:
-            ValueError: a name is unknown, or of something without a current of its own.
+            ValueError: a name is unknown, or of something without a current of its own; a plant
+                controller has no place to measure.
         """
         each = {("converters", n): [converter_terminal(n, at)] for n, at in converters.items()}
         each |= {(table, n): [*one.terminals(n)] for table, n, one in self.components()}
+        ends = {n: terminals for (_, n), terminals in each.items() if len(terminals) == 2}
+        measured = {
+            ("plant_controllers", n): [one.measures(n, ends)]
+            for n, one in self.plant_controllers.items()
+        }
+        each |= measured
         if self.grid is not None:
             each["grid", "grid"] = [Terminal("grid", self.grid)]
         each[FAULT, FAULT] = [Terminal(FAULT, "")]
@@ -77,7 +87,10 @@ class NetworkParts(Options):
         return tuple(
             terminal
             for (table, name), terminals in each.items()
-            if "all" in asked or name in asked or (table in asked and table not in names)
+            if "all" in asked
+            or name in asked
+            or (table in asked and table not in names)
+            or (table, name) in measured
             for terminal in terminals
         )
 
@@ -90,10 +103,12 @@ COMPONENTS: dict[str, type[Component]] = {
 """The components by their tables."""
 
 _FED = [kind for kind in COMPONENTS.values() if issubclass(kind, Fed)]
+_OTHERS = [x for x in COMPONENTS.values() if issubclass(x, Dynamic) and not issubclass(x, Fed)]
 DYNAMIC: tuple[type[Dynamic], ...] = (
-    FiniteGrid, *sorted(_FED, key=lambda kind: not kind.is_voltage)
+    FiniteGrid, *sorted(_FED, key=lambda kind: not kind.is_voltage), *_OTHERS
 )  # fmt: skip
-"""The components with records, in the order of these: voltages before currents."""
+"""The components with records, in the order of these: voltages before currents, then what has no
+source."""
 
 
 def _every(hook: str) -> Any:

@@ -32,12 +32,13 @@ class Terminal:
     node: str
     parts: tuple[tuple[str, float], ...] = ()  # elements, and factors of their currents
     turns: str = ""  # the source of the component whose speed is recorded, if it has one
+    more: tuple[str, ...] = ()  # columns after these that the component writes itself
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Its columns in the recording."""
         each = (*FLOW, *([SPEED_COLUMN] if self.turns else [])) if self.node else OF_FAULT
-        return tuple(f"{self.name}.{what}" for what in each)
+        return tuple(f"{self.name}.{what}" for what in (*each, *self.more))
 
 
 def converter_terminal(name: str, node: str) -> Terminal:

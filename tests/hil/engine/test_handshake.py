@@ -88,7 +88,7 @@ def test_a_misfit_is_refused_on_both_roles_and_named(other, name, make, endpoint
 @pytest.mark.parametrize(
     ("what", "name"),
     [
-        ("TABLE_VERSION", "version of the signal table (1, ours is 3)"),
+        ("TABLE_VERSION", "version of the signal table (1, ours is 4)"),
         ("table_hash", "signal table"),
     ],
 )

@@ -21,6 +21,7 @@ from gfm_hil.scenario.events.irradiance import Irradiance
 from gfm_hil.scenario.events.law import LawChange
 from gfm_hil.scenario.events.note import Note
 from gfm_hil.scenario.events.phase_jump import PhaseJump
+from gfm_hil.scenario.events.plant_reference import PlantReference
 from gfm_hil.scenario.events.reference import Reference
 from gfm_hil.scenario.events.reset import Reset
 
@@ -28,7 +29,7 @@ from gfm_hil.scenario.events.reset import Reset
 _KINDS: tuple[type[Event], ...] = (
     Reference, LawChange, GainChange, Reset, GridFrequency, GridVoltage, GridProfile, PhaseJump,
     GridImpedance, GridLoad, GridUnbalance, Fault, FaultClear, GridBreaker, LineBreaker,
-    Irradiance, Note,
+    Irradiance, PlantReference, Note,
 )  # fmt: skip
 EVENTS = {get_args(kind.model_fields["type"].annotation)[0]: kind for kind in _KINDS}
 """The kinds of events by what ``type`` says in a scenario."""

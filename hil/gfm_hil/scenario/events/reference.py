@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
 from gfm_hil.scenario.events.base import WHOSE, ControllerEvent, EventTarget
 from gfm_runtime.signals import SIGNALS
+
+if TYPE_CHECKING:
+    from gfm_hil.scenario.schema import Scenario
 
 _REFERENCE = {s.name: s for s in SIGNALS if s.group == "ref"}
 
@@ -51,6 +54,22 @@ class Reference(ControllerEvent):
 
     def label(self) -> str:
         return ", ".join(f"{name} = {value:g}" for name, value in self.values().items())
+
+    def misfits(self, scenario: Scenario) -> list[str]:
+        if scenario.network is None:
+            return []
+        ours = [self.converter] if self.converter else scenario.converters
+        return [
+            f"{key}: network.plant_controllers.{name} commands it; use the event plant-reference"
+            for name, one in scenario.network.plant_controllers.items()
+            for key in one.sent()
+            if key in self.values() and {*ours} & {*(one.converters or ours)}
+        ]
+
+    def check_now(self, target: EventTarget) -> None:
+        super().check_now(target)
+        if found := self.misfits(target.scenario):
+            raise ValueError(found[0])
 
     def carry_out(self, target: EventTarget) -> None:
         for name, value in self.values().items():
