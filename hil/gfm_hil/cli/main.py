@@ -81,6 +81,12 @@ class _Parser(argparse.ArgumentParser):
             options.parsed_by = self
         return options, unknown
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        if file is sys.stdout and file is not None:  # argparse hides that a disk is full
+            file.write(message)
+        else:
+            super()._print_message(message, file)
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message} ({self.prog} --help)\n")
 
@@ -159,18 +165,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _refuse(OSError(errno.EINVAL, why, text))
     with garbage_kept():  # a command's modules make a million objects, which stay
         top = parser(given[0] if given else None)
-    if not given:
-        top.print_help()
-        return 0
-    if not given[0].startswith("-") and given[0] not in COMMANDS:
+    if given and not given[0].startswith("-") and given[0] not in COMMANDS:
         from gfm_hil.core.errors import UserError
         from gfm_runtime.errors import allowed
 
         return _refuse(UserError(f"{given[0]}: no command; {allowed(given[0], COMMANDS)}"))
-    options, unknown = top.parse_known_args(given)
-    if unknown:
-        return _refuse(_unknown(options.parsed_by, unknown))
     try:
+        if not given:
+            top.print_help()
+            return 0
+        options, unknown = top.parse_known_args(given)
+        if unknown:
+            return _refuse(_unknown(options.parsed_by, unknown))
         return int(options.call(options))
     except KeyboardInterrupt as stop:
         if stop.args:  # what is left, and how to complete it

@@ -379,7 +379,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("arguments", [["laws", "--json"], ["scenarios"]])
+@pytest.mark.parametrize("arguments", [["laws"], ["--version"], ["--help"], ["run", "--help"]])
 def test_a_disk_that_is_full_is_told_in_one_line(arguments, refused, monkeypatch):
     """Where each line is written at once, and where the program's end writes all."""
     full = Path("/dev/full")
