@@ -13,7 +13,7 @@ from gfm_hil.api.runs import load_run
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.scenario import check_scenario, load_scenario
-from gfm_hil.scenario.events.grid_profile import GridProfile
+from gfm_hil.scenario.events.grid_profile import GridProfile, read_profile
 
 TEXT = """# a fall of the frequency and of the voltage
 t, f_hz, V_g
@@ -52,6 +52,13 @@ def test_the_grid_follows_the_lines_at_every_tick(course):
     assert run.signals["V_g"] == pytest.approx(V, abs=1e-12)
     (event,) = run.summary["events"]
     assert event["label"] == "grid profile course"
+
+
+def test_a_file_is_taken_apart_once_until_it_changes(course):
+    first = read_profile(str(course), 50.0)
+    assert read_profile(str(course), 50.0) is first
+    course.write_text(TEXT.replace("49.9", "49.8"), encoding="utf-8")
+    assert read_profile(str(course), 50.0).omega_g[1] == 49.8 / 50
 
 
 @pytest.mark.processes

@@ -12,6 +12,7 @@ import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import PurePath
 from typing import Any, Literal, NamedTuple
@@ -22,7 +23,7 @@ import gfm_plant
 from gfm_hil.core.errors import UserError
 from gfm_hil.scenario.events.base import EventTarget, GridEvent, nominal_hz
 from gfm_runtime.errors import printable
-from gfm_runtime.regular import open_regular
+from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import SIGNALS
 
 _COLUMNS = ("t", "f_hz", "omega_g", "V_g", "degrees")
@@ -127,27 +128,32 @@ def read_profile(file: str, f_n: float | None) -> Profile:
         file: path.
         f_n: nominal frequency, Hz; None leaves f_hz aside.
     """
-    t, columns = [], dict[str, list[float]]()
     try:
-        with io.TextIOWrapper(open_regular(file, LARGEST_FILE), "utf-8", newline="") as text:
-            for number, cells in _lines(text, file):
-                if not columns:
-                    columns = {name: [] for name in _head([c.strip() for c in cells], file)}
-                    continue
-                if len(cells) != len(columns):
-                    raise UserError(f"{file}, line {number}: has {len(cells)} fields, but the first"
-                                    f" line has {len(columns)}")  # fmt: skip
-                for (name, values), cell in zip(columns.items(), cells, strict=True):
-                    values.append(_value(name, cell, f_n, f"{file}, line {number}"))
-                t = columns["t"]
-                if len(t) > 1 and not t[-1] > t[-2]:
-                    raise UserError(f"{file}, line {number}: t = {t[-1]:g}: must be larger than in"
-                                    f" the line before, {t[-2]:g}")  # fmt: skip
+        return _profile(read_regular(file, LARGEST_FILE), file, f_n)
     except (OSError, ValueError) as problem:  # a name with a zero byte, bytes that are no text
         reason = getattr(problem, "strerror", None) or str(problem)
         raise UserError(printable(f"{file}: {reason}")) from None
     except csv.Error as problem:
         raise UserError(printable(f"{file}: {problem}")) from None
+
+
+@lru_cache(maxsize=4)  # each run of a study asks for it several times
+def _profile(content: bytes, file: str, f_n: float | None) -> Profile:
+    """The course in a file's content; arguments and UserError as of ``read_profile``."""
+    t, columns = [], dict[str, list[float]]()
+    for number, cells in _lines(io.StringIO(content.decode(), newline=""), file):
+        if not columns:
+            columns = {name: [] for name in _head([c.strip() for c in cells], file)}
+            continue
+        if len(cells) != len(columns):
+            raise UserError(f"{file}, line {number}: has {len(cells)} fields, but the first"
+                            f" line has {len(columns)}")  # fmt: skip
+        for (name, values), cell in zip(columns.items(), cells, strict=True):
+            values.append(_value(name, cell, f_n, f"{file}, line {number}"))
+        t = columns["t"]
+        if len(t) > 1 and not t[-1] > t[-2]:
+            raise UserError(f"{file}, line {number}: t = {t[-1]:g}: must be larger than in"
+                            f" the line before, {t[-2]:g}")  # fmt: skip
     if not t:
         raise UserError(f"{file}: has no line with numbers; it needs one with t and values")
     omega_g = columns.get("omega_g")
