@@ -25,6 +25,7 @@
 
 enum { NY = GFMHIL_NY, NU = GFMHIL_NU };
 enum { GREETING_WAIT_MS = 60000, LOCKSTEP_WAIT_MS = 20000, REALTIME_WAIT_MS = 1000 };
+enum { LOOK_MS = 100 }; /* a signal may come just before a wait, which it then does not interrupt */
 enum { PRIORITY = 50, ANSWER_EVERY_MS = 100, LAST_TIMES = 3 };
 
 #define NAME "droop in C" /* what the plant's report calls this controller */
@@ -139,11 +140,11 @@ static int run(link_t *link, char **steps, int count, bool realtime) {
     } message;
 
     while (!stopping) {
-        const size_t size = link_receive(link, &message, wait_ms);
+        const size_t size = link_receive(link, &message, LOOK_MS);
         const int64_t now = now_ms();
         if (size == 0) {
             if (now - heard < wait_ms)
-                continue; /* a signal */
+                continue;
             fprintf(stderr, "the plant is gone\n");
             return leave(&loop, GFMHIL_SAFE, GFMHIL_LOST_PEER, 1);
         }
