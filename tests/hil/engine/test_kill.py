@@ -72,14 +72,14 @@ def test_kill_9_of_either_role_at_random_ticks(start, tmp_path):
         with contextlib.suppress(KeyError, OSError):  # a run may end by itself at any moment
             outside = places(folder)
             os.kill(roles_of(folder)[victim], signal.SIGKILL)
-        code, out, _ = end(process)
+        code, out, err = end(process)
         found = json.loads(out)
         if sum(e["event"] == "end" for e in log_of(folder)) == 2:
             continue  # a stall of the machine ended the run before we did
         done += 1
         assert len(outside) == (2 if mode == "realtime" else 1)
         assert (code, found["status"]) == (3, "safe")
-        assert found["reason"] == f"the {victim} was ended by SIGKILL"
+        assert found["reason"] == f"the {victim} was ended by SIGKILL" and found["reason"] in err
         took = watchdog_s(folder, victim)
         assert took < PEER_TIMEOUT_S + GENEROUS_S
         recorded = signals(folder)
@@ -87,6 +87,7 @@ def test_kill_9_of_either_role_at_random_ticks(start, tmp_path):
         assert n == found["ticks"] >= ticks
         for name in ("true_p", "y_p", "u_omega_u"):
             assert np.isfinite(recorded[name]).all()
+        assert np.isfinite(recorded["ref_P_ref"]).any()  # the controller's own
         if victim == "controller" and mode == "realtime":
             with np.load(folder / "timing.npz") as file:
                 late = file["plant_received"] < 0
@@ -127,8 +128,7 @@ def test_without_a_survivor_the_next_run_clears_up(start, tmp_path):
     assert np.isfinite(np.load(folder / "parts" / "plant_signals.npy")[:300]).all()
 
 
-@pytest.mark.parametrize("link", ["shm", "zmq"])
-@pytest.mark.parametrize("victim", ROLES)
+@pytest.mark.parametrize(("link", "victim"), [("shm", "controller"), ("zmq", "plant")])
 def test_a_role_that_hangs_makes_the_other_safe_and_ends_when_it_goes_on(
     victim, link, start, tmp_path
 ):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.core.stopping import Interrupt
@@ -31,6 +32,7 @@ from ...support.processes import (
 
 pytestmark = pytest.mark.processes
 
+TOGETHER = ("--link", "inproc", "--no-figures", "--quiet", "--out")
 LONG = {"title": "long", "duration": 20.0}  # far more than any test waits for
 
 
@@ -80,15 +82,13 @@ def test_two_processes_in_lockstep_are_bit_for_bit_one(start, tmp_path):
     assert json.loads(out) == summary(tmp_path / "apart")
     assert json.loads(out)["link"] == "zmq"
     assert json.loads(out)["e2e"] == {"controller": "valid", "plant": "valid"}
-    code, out, _ = end(start("run", scenario, "--link", "inproc", "--out", "together", "--json",
-                             "--no-figures"))  # fmt: skip
-    assert (code, json.loads(out)["link"]) == (0, "inproc")
+    assert main(["run", scenario, *TOGETHER, str(tmp_path / "together")]) == 0
     assert_same(tmp_path / "apart", tmp_path / "together")
     left = {path.name for path in (tmp_path / "apart").iterdir()}
     assert left == {"scenario.toml", "signals.npz", "timing.npz", "events.jsonl", "summary.json"}
 
 
-def test_both_roles_started_by_hand_over_tcp(start, tmp_path):
+def test_both_roles_started_by_hand_over_tcp(start, tmp_path, monkeypatch, capsys, refused):
     scenario = write(
         tmp_path,
         law="vsg-2",
@@ -109,21 +109,22 @@ def test_both_roles_started_by_hand_over_tcp(start, tmp_path):
     plant, controller = signals(tmp_path / "plant"), signals(tmp_path / "controller")
     assert "true_p" in plant and "true_p" not in controller
     assert controller["ref_P_ref"][-1] == 0.6
-    end(start("run", scenario, "--link", "inproc", "--out", "together", "--no-figures"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", scenario, *TOGETHER, "together"]) == 0
     together = signals(tmp_path / "together")
     for name in plant.keys() - {"laws"}:
         assert plant[name].tobytes() == together[name].tobytes(), name
 
-    code, out, _ = end(start("merge", "controller", "plant", "-o", "merged"))
-    assert code == 0 and "p final" in out
+    assert main(["merge", "controller", "plant", "-o", "merged"]) == 0
+    assert "p final" in capsys.readouterr().out
     assert_same(tmp_path / "merged", tmp_path / "together")
     assert summary(tmp_path / "merged")["events"] == summary(tmp_path / "together")["events"]
     assert (tmp_path / "merged" / "report.html").stat().st_size > 10_000
-    code, _, err = end(start("merge", "plant", "merged"))
-    assert code == 2 and "merged: holds the recording of controller and plant" in err
+    assert "merged: holds the recording of controller and plant" in refused(
+        "merge", "plant", "merged"
+    )
     (tmp_path / "plant" / "summary.json").write_text(json.dumps(found | {"run": "another"}))
-    code, _, err = end(start("merge", "plant", "controller"))
-    assert code == 2 and "are not of the same run: run = 'another', " in err
+    assert "are not of the same run: run = 'another', " in refused("merge", "plant", "controller")
 
 
 def test_a_recording_beyond_the_memory_of_the_machine_is_refused(tmp_path, monkeypatch):
@@ -189,37 +190,17 @@ def test_ctrl_c_ends_both_and_keeps_the_data(begun):
     assert not (folder / "parts").exists()
 
 
-@pytest.mark.parametrize("role", ROLES)
-def test_in_lockstep_a_role_may_stand_still_for_seconds(role, begun):
+def test_in_lockstep_either_role_may_stand_still_for_seconds(begun):
     """As on a busy machine."""
-    process, folder = begun(duration=3.0)
-    stopped = roles_of(folder)[role]
-    os.kill(stopped, signal.SIGSTOP)
-    time.sleep(2.0)
-    os.kill(stopped, signal.SIGCONT)
+    process, folder = begun(duration=3.0, link={"type": "shm"})
+    for stopped in roles_of(folder).values():
+        os.kill(stopped, signal.SIGSTOP)
+        time.sleep(2.0)
+        os.kill(stopped, signal.SIGCONT)
     code, out, _ = end(process)
     found = json.loads(out)
     assert (code, found["status"], found["ticks"]) == (0, "completed", 30_000)
-    assert found["wall_s"] > 2.0
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_a_role_that_is_killed_is_reported_and_what_both_recorded_is_kept(role, begun):
-    process, folder = begun()
-    os.kill(roles_of(folder)[role], signal.SIGKILL)
-    code, out, err = end(process)
-    found = json.loads(out)
-    assert code == 3
-    assert (found["status"], found["reason"]) == ("safe", f"the {role} was ended by SIGKILL")
-    assert found["reason"] in err
-    recorded = signals(folder)
-    assert len(recorded["t"]) == found["ticks"] >= 200
-    for name in ("true_p", "u_omega_u", "ref_P_ref"):
-        assert not np.isnan(recorded[name][:200]).any()
-    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
-    other = "plant" if role == "controller" else "controller"
-    assert [e["role"] for e in events if e["event"] == "end"] == [other]
-    assert roles_of(folder) == {}
+    assert found["wall_s"] > 4.0
 
 
 STANDS_STILL = """\
@@ -235,7 +216,8 @@ def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(
     """The plant stands still before its first import, as one does that has to compile."""
     (tmp_path / "sitecustomize.py").write_text(STANDS_STILL, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    scenario = write(tmp_path, **LONG, link={"start_timeout_s": 1.0})
+    link = {"start_timeout_s": 1.0, "peer_timeout_s": 1.0}
+    scenario = write(tmp_path, **LONG, link=link)
     folder = tmp_path / "run"
     process = start("run", scenario, "--out", str(folder), "--json", "--no-figures")
     code, out, _ = end(process)
