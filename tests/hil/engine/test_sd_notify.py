@@ -96,6 +96,7 @@ def test_watchdog_comes_after_a_silent_peer_and_only_to_whom_it_is_meant_for(
         assert ("WATCHDOG_USEC=6000000" in manager.lines()) == (pid == "own")
 
 
+@pytest.mark.parametrize("manager", ["path"], indirect=True)
 def test_role_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
     manager, start, endpoint, tmp_path, monkeypatch
 ):
@@ -104,8 +105,6 @@ def test_role_is_ready_after_the_handshake_and_alive_while_the_other_one_is(
         toml_text({"title": "long", "duration": 600.0, "link": {"peer_timeout_s": 60.0}})
     )
     both = ("--endpoint", endpoint, "--mode", "lockstep", "--quiet")
-    if os.environ["NOTIFY_SOCKET"].startswith("@"):  # try a pumped link too
-        both += ("--option", "portable=true")
     monkeypatch.setenv("WATCHDOG_USEC", "400000")
     controller = start("controller", str(scenario), *both, "--out", "c")
     manager.wait_for(f"STATUS=waiting for the other side at {endpoint}")

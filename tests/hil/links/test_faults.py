@@ -76,8 +76,16 @@ def check(pair: Pair, link: str) -> None:
         assert not any(faults[f] for f in ("size", "magic", "version", "source", "tick", "state"))
 
 
-@pytest.mark.parametrize("kind", IMPAIRMENTS)
-@pytest.mark.parametrize("link", LINKS)
+#: the stage stands before every link: each fault hits one link with a port, and one without
+CASES = [
+    (link, kind)
+    for link in LINKS
+    for kind in IMPAIRMENTS
+    if REPORT or kind == "all" or link in ("shm", "zmq-portable")
+]
+
+
+@pytest.mark.parametrize(("link", "kind"), CASES)
 def test_every_fault_is_counted_and_no_result_changes(link, kind, place):
     pair = lockstep(place, link, IMPAIRMENTS[kind])
     check(pair, link)
