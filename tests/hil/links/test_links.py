@@ -72,18 +72,6 @@ def test_an_ipc_endpoint_that_a_killed_run_left_is_used_again(endpoint):
     ZmqLink("controller", endpoint).close()
 
 
-def test_a_tcp_port_that_is_taken():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(UserError) as found:
-            ZmqLink("controller", endpoint)
-    assert (
-        str(found.value) == f"link.endpoint = {endpoint!r}: cannot be bound: Address already in use"
-    )
-
-
 @pytest.mark.timeout(30)
 def test_a_plant_whose_controller_never_comes_ends():
     """What it sent before it tried anew would wait for ever to be sent."""

@@ -142,8 +142,9 @@ def test_the_token_s_holder_gets_in_among_pages_that_look(port, scope, attack_no
         for _ in range(16):
             stack.enter_context(connect(address(port)))
         wait_for(lambda: len(scope._sessions) == 16)
-        with pytest.raises(InvalidStatus), connect(address(port)):
+        with pytest.raises(InvalidStatus) as refused, connect(address(port)):
             pass
+        assert refused.value.response.status_code == 503
         with connect(address(port, "?control")) as page:
             say(page, kind="hello", token=scope.access.tokens["operator"])
             assert words(page, "control")["granted"] is True
