@@ -202,7 +202,7 @@ def test_roles_run_in_real_time_within_what_their_units_leave(state):
 def test_the_bench_and_a_stream_beside_it_run_within_what_their_units_leave(state):
     content: dict[str, Any] = {
         "title": "rig",
-        "duration": 600.0,
+        "duration": 120.0,
         "mode": "realtime",
         "late_policy": {"hold": 10_000_000},
         "link": {"type": "shm", "peer_timeout_s": 60.0, "start_timeout_s": 500.0},

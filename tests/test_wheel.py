@@ -75,8 +75,9 @@ def _installed(python: str | Path, folder: Path, wheel: Path) -> Path:
     _done(python, "-m", "venv", folder)
     new = folder / "bin" / "python"
     lock = ROOT / "requirements" / "container.txt"
-    _done(new, "-m", "pip", "install", "--quiet", "--require-hashes", "-r", lock)
-    _done(new, "-m", "pip", "install", "--quiet", "--no-deps", wheel)
+    install = [new, "-m", "pip", "install", "--quiet", "--no-compile"]  # what it imports does that
+    _done(*install, "--require-hashes", "-r", lock)
+    _done(*install, "--no-deps", wheel)
     _done(new, "-m", "pip", "check")
     return new
 
