@@ -81,8 +81,7 @@ def test_the_report_of_a_run_holds_its_curves(report):
 @pytest.mark.systems
 @pytest.mark.apt
 @pytest.mark.skipif(not HAS_BROWSER, reason="needs chromium and chromium-driver")
-@pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_a_browser_draws_the_report(report, width, scheme):
     with Browser() as browser:
         command = browser.driver.execute_cdp_cmd
