@@ -66,10 +66,10 @@ def test_the_strength_of_two_converters_on_one_line() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("law, inner", [("vsg-2", "virtual-stator"), ("droop-5", "virtual-stator"),
-                                        ("mimo-gfm", "virtual-stator")])  # fmt: skip
-def test_no_certified_network_is_unstable(law, inner) -> None:
+@pytest.mark.parametrize("law", ["vsg-2", "mimo-gfm"])
+def test_no_certified_network_is_unstable(law) -> None:
     """By the poles of random networks, of which some have a certificate."""
+    inner = "virtual-stator"
     classes, rng = ladder(law, inner), np.random.default_rng(7)
     certified = 0
     for _ in range(20):

@@ -158,7 +158,7 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [("rig_pref_step", 1.0), ("ride_through_fault", 0.5), ("phase_jump_within_rating", 0.5)],
 )
 def test_the_example_holds_the_plant(example, scenario, p_end, tmp_path):
-    found = run(tmp_path, example, scenario, "--mode", "lockstep")
+    found = run(tmp_path, example, scenario, "--mode", "lockstep", "--duration", "2.5")
     p, i = found.columns["true_p"][:], found.columns["true_i"][:]
     first = found.scenario.sorted_events()[0].at(found.scenario.T_s)
     assert found.summary["status"] == "completed"
