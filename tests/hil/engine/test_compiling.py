@@ -153,7 +153,8 @@ def test_after_a_warm_up_a_run_compiles_nothing_over_any_link(make, tmp_path):
     root = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[3])
     before = cached(root)
     assert before
-    kinds = [(link, inner) for link in link_names() for inner in ("none", "virtual-stator")]
+    # a link's functions are compiled apart from those of an inner stage
+    kinds = [(link, ("none", "virtual-stator")[k % 2]) for k, link in enumerate(link_names())]
     for link, inner in kinds:
         options = {"every": 2} if link == "can" else {}
         about = {"type": link, "peer_timeout_s": 60.0, "options": options}

@@ -32,6 +32,7 @@ from ...support.soak import MB, Clients, Sampler, ports_in
 pytestmark = [pytest.mark.systems, pytest.mark.alone]
 
 SOAK_S = float(os.environ.get("GFMHIL_SOAK_S", "0"))
+LINKS = ("zmq", "shm") if SOAK_S >= 60 else ("zmq",)  # seconds show the clients' leaks, no link's
 CSV = os.environ.get("GFMHIL_SOAK_CSV")
 FAULTS = """
 [link.impairment]
@@ -96,7 +97,7 @@ def bench(link: str, place: Path) -> Iterator[tuple[Clients, dict[str, subproces
 @pytest.mark.soak
 @pytest.mark.skipif(SOAK_S == 0, reason="takes as long as GFMHIL_SOAK_S says, which is not set")
 @pytest.mark.timeout(2 * SOAK_S + 600)
-@pytest.mark.parametrize("link", ["shm", "zmq"])
+@pytest.mark.parametrize("link", LINKS)
 @pytest.mark.attack(
     "11.1",
     "clients that come and go, law changes, trips and a faulty link for as long as wanted",

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 T_NS = 100_000
 #: by method, how many stalls and the least pause between them, s: /proc is read every 0.1 s
-STALLS = {"trace": (100, 0.08), "proc": (60, 0.3)}
+STALLS = {"trace": (60, 0.08), "proc": (40, 0.3)}
 NAMES = {"fifo": "thread stall-fifo", "busy": "thread stall-busy", "stop": STOPPED}
 #: provokes stalls of 2 to 5 ms of threads in turn, and prints (kind, begin, end) of each
 PROVOKE = """
@@ -72,7 +72,7 @@ def trace(tmp_path_factory):
 def provoked(tmp_path: Path, stalls_wanted: int, pause_s: float):
     """A run in real time with stalls; (kind, names of its missed ticks, their causes) of each."""
     content = {
-        "title": "stalls", "duration": 200.0, "T_s": 1e-4,
+        "title": "stalls", "duration": 100.0, "T_s": 1e-4,
         "mode": "realtime",
         "law": "mimo-gfm", "link": {"type": "shm", "peer_timeout_s": 5.0},
         "late_policy": {"hold": 10**9},
