@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import zmq
 
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams import BlockReader
@@ -236,6 +237,14 @@ def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint)
     for process in (*roles, stream):
         process.communicate(timeout=PATIENCE_S)
     assert [process.returncode for process in (*roles, stream)] == [130, 130, 0]
+
+
+def test_a_port_that_is_taken_is_named():
+    with Publisher("127.0.0.1", 0, 0) as first:
+        port = int(first.samples.rpartition(":")[2])
+        taken = f"--port {port}: tcp://127.0.0.1:{port}: Address already in use"
+        with pytest.raises(UserError, match=taken):
+            Publisher("127.0.0.1", port, 0)
 
 
 @pytest.mark.attack(
