@@ -180,11 +180,18 @@ def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
 
 @alone
 @pytest.mark.timeout(400)
-def test_a_killed_benchmark_leaves_nothing_behind(tmp_path):
-    """No process, no memory segment, no folder. The loop's are those of any run."""
+@pytest.mark.parametrize(
+    "line",
+    [
+        ["latency", "--links", "shm,zmq", "--peers", "none"],
+        ["loop", "--links", "shm", "--laws", "vsg-2"],
+    ],
+)
+def test_a_killed_benchmark_leaves_nothing_behind(line, tmp_path):
+    """No process, no memory segment, no folder."""
     shm = Path("/dev/shm")
     mark, before = f"GFMHIL_TEST={uuid.uuid4()}", {*shm.rglob("*"), shm / f"gfmhil-{os.geteuid()}"}
-    line = ["bench", "latency", "--links", "shm,zmq", "--peers", "none", "--seconds", "8"]
+    line = ["bench", *line, "--seconds", "8"]
     with subprocess.Popen(
         [*GFMHIL, *line, "--out", str(tmp_path / "bench")],
         env={**os.environ, **dict([mark.split("=")])},
