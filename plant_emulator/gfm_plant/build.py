@@ -20,7 +20,7 @@ from gfm_plant.components.swing import pack_swing
 from gfm_plant.layout import Record, make_net_and_now
 from gfm_plant.model import V_DC
 from gfm_plant.names import TRIPS
-from gfm_plant.network import Network
+from gfm_plant.network import Network, connect_new
 from gfm_plant.options import COMMANDS, MEASURED, Grid, Overload, Phases, Plant, Protection
 from gfm_plant.parameters import ConverterParameters, load_converter
 from gfm_plant.pv_array import diode
@@ -192,7 +192,7 @@ def _make(
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
-    network.connect(wiring)
+    connect_new(network, wiring)
     return network
 
 

@@ -7,6 +7,7 @@ every array under its name. Currents and voltages are complex: space vectors in 
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -399,31 +400,41 @@ def make_net_and_now(
         "n_slots": SLOTS if units and converters == 1 else 0,
         "n_strides": 2 if units and converters == 1 else 0,
     }  # fmt: skip
-    net, now = _allocate(net_dtype, _NET, lengths), _allocate(now_dtype, _NOW, lengths)
+    net, now = (_allocate(kind, tuple(lengths.items())) for kind in (net_dtype, now_dtype))
     net["connections"], net["sparse"] = connections, entries > 0
     net["flow_first"] = CHECK_SIDES + (converters if connections else 0)
     return net, now
 
 
-def _allocate(header: np.dtype[np.void], arrays: _Arrays, lengths: dict[str, int]) -> Record:
-    fields = dict(header.fields or {})
+def _allocate(header: np.dtype[np.void], lengths: tuple[tuple[str, int], ...]) -> Record:
+    whole, numbers = _laid_out(header, lengths)
+    memory = np.zeros(whole.itemsize + _LINE, np.uint8)
+    first = -memory.ctypes.data % _LINE
+    record: Record = memory[first : first + whole.itemsize].view(whole)
+    for name, value in numbers:
+        record[name] = value
+    return record
+
+
+@lru_cache(maxsize=16)
+def _laid_out(
+    header: np.dtype[np.void], lengths: tuple[tuple[str, int], ...]
+) -> tuple[np.dtype[np.void], list[tuple[str, int]]]:
+    """The type of a record, and the lengths and places of its arrays; most plants of a campaign
+    have the same."""
+    fields, of = dict(header.fields or {}), dict(lengths)
     formats, offsets = [f[0] for f in fields.values()], [f[1] for f in fields.values()]
     places, end = dict[str, int](), header.itemsize
+    arrays = _NET if header is net_dtype else _NOW
     for name, (kind, shape) in arrays.items():
         places[f"{name}_at"] = end = -(-end // _LINE) * _LINE
-        formats.append(np.dtype((kind, tuple(lengths.get(str(n), n) for n in shape))))
+        formats.append(np.dtype((kind, tuple(of.get(str(n), n) for n in shape))))
         offsets.append(end)
         end += formats[-1].itemsize
     whole: Any = {
         "names": [*fields, *arrays], "formats": formats, "offsets": offsets, "itemsize": end
     }  # fmt: skip
-    memory = np.zeros(end + _LINE, np.uint8)
-    first = -memory.ctypes.data % _LINE
-    record: Record = memory[first : first + end].view(np.dtype(whole))
-    for name, value in (lengths | places).items():
-        if name in fields:
-            record[name] = value
-    return record
+    return np.dtype(whole), [(n, value) for n, value in (of | places).items() if n in fields]
 
 
 def head(record: Record) -> Record:

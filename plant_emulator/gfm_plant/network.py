@@ -253,7 +253,7 @@ class Network:
         be told apart (`gfm_plant.circuit`), or one is too fast for the DC link. The plant is then
         unchanged."""
         changed = self.copy()
-        _connect(changed, wiring)
+        connect_new(changed, wiring)
         changed.wiring = wiring
         self.restore(changed)
         if "records" in vars(self):  # else they are made with all that this wiring needs
@@ -272,7 +272,9 @@ def _bytes(record: Record) -> NDArray[np.uint8]:
     return record.view(np.uint8)
 
 
-def _connect(plant: Network, wiring: Wiring) -> None:
+def connect_new(plant: Network, wiring: Wiring) -> None:
+    """Set the modes of all circuits in the memory of a plant that an error may leave half done;
+    arguments and errors as of ``Network.connect``."""
     net, N, order = plant.net[0], len(wiring.units), wiring.order
     net["n_states"] = len(order)
     plant.now["slot_key"] = plant.now["stride_for"] = 0

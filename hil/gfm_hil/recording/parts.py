@@ -198,7 +198,8 @@ class MemoryPart:
 
     def put(self, first: int, rows: NDArray[np.float64], flows: NDArray[np.float64]) -> None:
         """Record rows of consecutive ticks, the first of which is ``first``, and the network's."""
-        self._columns[:, first : first + len(rows)] = rows.T[self._places]
+        for column, place in zip(self._columns, self._places, strict=True):
+            column[first : first + len(rows)] = rows[:, place]
         if len(self._flows):
             self._flows[:, first : first + len(rows)] = flows.T
 
