@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from gfm_runtime.compiled import compiled
+from gfm_runtime.compiled import compiled, inlined
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -21,7 +21,7 @@ _C_4, _C_6, _C_8, _C_10 = (1 / math.factorial(n) for n in (4, 6, 8, 10))
 _S_3, _S_5, _S_7, _S_9 = (1 / math.factorial(n) for n in (3, 5, 7, 9))
 
 
-@compiled
+@inlined
 def _splitmix(counter: np.uint64) -> np.uint64:
     """Return the output of splitmix64 (Steele, Lea, Flood 2014) for one state."""
     z = counter
@@ -30,24 +30,41 @@ def _splitmix(counter: np.uint64) -> np.uint64:
     return z ^ (z >> _S31)
 
 
-@compiled
-def gaussians(seed: int, tick: int, pair: int) -> tuple[float, float]:
-    """Return two samples of N(0, 1), by Box-Muller from two uniform 32-bit numbers; none is larger
-    than 6.7. 0 <= pair < 8."""
+@inlined
+def random_bits(seed: int, tick: int, pair: int) -> np.uint64:
+    """Return 64 random bits."""
     key = np.uint64(seed) + _GOLDEN * (np.uint64(tick) * _PAIRS + np.uint64(pair))
-    bits = _splitmix(_splitmix(key))
-    one = (np.float64(bits >> _S32) + 1.0) * 2.0**-32  # in (0, 1], so that the logarithm is finite
-    length = math.sqrt(-2.0 * math.log(one))
+    bits: np.uint64 = _splitmix(_splitmix(key))
+    return bits
+
+
+@inlined
+def share_of(bits: np.uint64) -> float:
+    """Return a number in (0, 1], so that its logarithm is finite, by the upper half of the bits."""
+    return (np.float64(bits >> _S32) + 1.0) * 2.0**-32
+
+
+@inlined
+def normal_pair(bits: np.uint64, log: float) -> tuple[float, float]:
+    """Return two samples of N(0, 1) by the lower half of the bits and the logarithm of their
+    share."""
+    length = math.sqrt(-2.0 * log)
     # an angle between -45 and 45 degrees, by series, and one of four quarter turns
     x = (np.float64(bits & _LOW_30) * 2.0**-30 - 0.5) * (0.5 * math.pi)
     x2 = x * x
     c = length * (1 - x2 * (1 / 2 - x2 * (_C_4 - x2 * (_C_6 - x2 * (_C_8 - x2 * _C_10)))))
     s = length * x * (1 - x2 * (_S_3 - x2 * (_S_5 - x2 * (_S_7 - x2 * _S_9))))
     quarter = (bits & _LOW_32) >> _S30
-    if quarter == 0:
-        return c, s
-    if quarter == 1:
-        return -s, c
-    if quarter == 2:
-        return -c, -s
-    return s, -c
+    one, other = (c, s) if quarter == 0 or quarter == 2 else (s, c)
+    return (
+        -one if quarter == 1 or quarter == 2 else one,
+        -other if quarter == 2 or quarter == 3 else other,
+    )
+
+
+@compiled
+def gaussians(seed: int, tick: int, pair: int) -> tuple[float, float]:
+    """Return two samples of N(0, 1), by Box-Muller from two uniform 32-bit numbers; none is larger
+    than 6.7. 0 <= pair < 8."""
+    bits = random_bits(seed, tick, pair)
+    return normal_pair(bits, math.log(share_of(bits)))

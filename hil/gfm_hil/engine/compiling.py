@@ -17,6 +17,7 @@ from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.compiling_beside import Beside
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.inproc import compile_loop, rows
+from gfm_hil.engine.lanes import Lanes
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import Bench, make_bench, make_benches, unstarted_benches
 from gfm_hil.links import link_kind, link_names
@@ -175,6 +176,7 @@ def everything() -> list[Set]:
         Set("laws with an inner stage", with_inner),
         Set(_EVENTS, lambda: _find_event_ways(found()[0])),
         _both(found),
+        SIDE_BY_SIDE,
     ]
 
 
@@ -202,6 +204,7 @@ _START = "the operating point"
 _PERIOD = "the plant's period"
 _EVENTS = "what faults and breakers call"
 _IDLE = Set("the thread that keeps a processor busy", prevent_idle.warm_up)
+SIDE_BY_SIDE = Set("the loop of several runs", lambda: Lanes().run(0))
 _IMPAIRMENT = Set("a link's impairment", impaired.warm_up)
 
 

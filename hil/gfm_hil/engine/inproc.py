@@ -4,9 +4,11 @@ The result is bit for bit that of two processes over a link, because a frame car
 each tick calls the same functions in the same order.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,11 +214,16 @@ def run_inproc(
 ) -> int:
     """Run a whole scenario: of each converter its bench, its parts of the recording, and its
     timeline. ``go_on`` gets the ticks done and returns whether to go on. Returns the ticks done."""
-    whole = Converters(benches, plant_parts, controller_parts, timelines)
+    return drive(run_steps(Converters(benches, plant_parts, controller_parts, timelines), go_on))
+
+
+def run_steps(whole: Converters, go_on: Callable[[int], bool] | None = None) -> Steps[int]:
+    """``run_inproc`` step by step; None: nobody has to be asked."""
+    benches, timelines = whole.benches, whole.timelines
     chunk = max(_LEAST_CHUNK, CHUNK // len(benches))
 
     def ask(k: int) -> bool:
-        if not go_on(k):
+        if go_on is not None and not go_on(k):
             for timeline in timelines:
                 timeline.end("interrupted", "stopped by the operator", k)
         return any(timeline.running for timeline in timelines)
@@ -224,7 +231,7 @@ def run_inproc(
     if not any(timeline.running for timeline in timelines):
         k = 0
     elif benches[0].scenario.cores is None:
-        k = _run_plant(whole, chunk, ask)
+        k = yield from _run_plant(whole, chunk, ask, is_asked=go_on is not None)
     else:
         k = _run_parts(whole, benches[0].scenario.cores, chunk, ask)
     for timeline in timelines:
@@ -239,6 +246,30 @@ class Converters(NamedTuple):
     plant_parts: Sequence[RolePart | MemoryPart]
     controller_parts: Sequence[RolePart | MemoryPart]
     timelines: Sequence[Timeline]
+
+
+class Stretch(NamedTuple):
+    """The ticks [start, stop) of a run, in which no event is due."""
+
+    those: Converters
+    start: int
+    stop: int
+
+
+T = TypeVar("T")
+#: a run that does the first tick of each stretch, and is then told to which tick someone else has
+#: taken it; the rest of the stretch it does itself
+Steps = Generator[Stretch, int, T]
+
+
+def drive(run: Steps[T]) -> T:
+    """Have a run do all its ticks itself."""
+    try:
+        stretch = next(run)
+        while True:
+            stretch = run.send(stretch.start)
+    except StopIteration as end:
+        return cast(T, end.value)
 
 
 class FlowsOfPart(NamedTuple):
@@ -257,14 +288,19 @@ class FlowsOfPart(NamedTuple):
 
 
 def _run_plant(
-    those: Converters, chunk: int, ask: Callable[[int], bool], of_part: FlowsOfPart | None = None
-) -> int:
+    those: Converters,
+    chunk: int,
+    ask: Callable[[int], bool],
+    of_part: FlowsOfPart | None = None,
+    is_asked: bool = True,
+) -> Steps[int]:
     """Run the converters of one plant; returns the ticks done.
 
     Args:
-        chunk: a multiple of it ends each call of the compiled loop, if nothing else does.
+        chunk: a multiple of it ends each stretch, if nothing else does.
         ask: whether to go on after so many ticks.
         of_part: of a part of the plant, which columns of the network it records.
+        is_asked: at each multiple of ``chunk``, and not only where else a stretch ends.
     """
     benches, plant_parts, controller_parts, timelines = those
     bench, ticks, k = benches[0], benches[0].scenario.ticks, 0
@@ -281,10 +317,14 @@ def _run_plant(
     while k < ticks and going:
         for timeline in timelines:
             timeline.carry_out(k)
-        stop = min(k + chunk - k % chunk, ticks, *(timeline.next_tick() for timeline in timelines))
-        calm = True
+        stop = min(ticks, *(timeline.next_tick() for timeline in timelines))
+        if is_asked:
+            stop = min(stop, k + chunk - k % chunk)
+        calm, begun = True, k + 1  # by which all that an event has changed is known
         while k < stop and calm:
             end, first = (stop, 0) if where else (min(k + piece, stop), k)
+            if k < begun:
+                end = min(end, begun)
             if of_part is not None and of_part.columns:
                 end, here = min(k + piece, stop), of_part.put_to(flows, k, here)
             done, calm = _run_ticks(
@@ -296,6 +336,9 @@ def _run_plant(
             if of_part is not None and of_part.columns:
                 of_part.rows[k:done, of_part.columns] = flows[: done - k]
             k = done
+            if k == begun and calm and k < stop:
+                k = yield Stretch(those, k, stop)
+                begun = k + chunk
         if bench.plant.net[0]["joins"]:
             follow_trips(bench.plant)
         elif int(bench.plant.st["trip"][0]) and int(bench.controller.ctl["state"][0]) == READY:
@@ -326,7 +369,7 @@ def _run_parts(whole: Converters, cores: int, chunk: int, ask: Callable[[int], b
     def run(p: int, go_on: Callable[[int], bool]) -> int:
         recorded = each[p].benches[0].plant.wiring.recorded
         columns = [names.index(name) for one in recorded for name in one.columns]
-        return _run_plant(each[p], chunk, go_on, FlowsOfPart(flow_rows, columns))
+        return drive(_run_plant(each[p], chunk, go_on, FlowsOfPart(flow_rows, columns)))
 
     def meets(k: int) -> bool:
         return k % chunk == 0 or k == whole.benches[0].scenario.ticks

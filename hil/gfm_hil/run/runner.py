@@ -23,7 +23,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compile_external, compiled_benches
-from gfm_hil.engine.inproc import run_inproc
+from gfm_hil.engine.inproc import Converters, Steps, drive, run_inproc, run_steps
 from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import ONE_CONVERTER, Bench, make_benches
@@ -302,10 +302,20 @@ def run_in_memory(
         notice: is called with what is compiled meanwhile; None: each function is compiled when it
             is first called, without a word.
     """
+    with np.errstate(all="ignore"):  # a diverging run is a result
+        return drive(memory_steps(scenario, kept, notice))
+
+
+def memory_steps(
+    scenario: Scenario,
+    kept: tuple[MemoryPart, MemoryPart] | None = None,
+    notice: Notice | None = None,
+) -> Steps[Run]:
+    """``run_in_memory`` step by step."""
     if scenario.parts:
         raise UserError(ONE_CONVERTER)
     benches = _benches(scenario, notice)
-    (run,) = _in_memory(benches, [kept] if kept else make_room(benches))
+    (run,) = yield from _in_memory(benches, [kept] if kept else make_room(benches))
     return run
 
 
@@ -313,7 +323,8 @@ def run_network_in_memory(scenario: Scenario, notice: Notice | None = None) -> N
     """Run a scenario with a network in this process and leave nothing on the disk; ``notice`` as of
     ``run_in_memory``. Raises UserError: the scenario has no operating point."""
     benches = _benches(scenario, notice)
-    runs = _in_memory(benches, make_room(benches))
+    with np.errstate(all="ignore"):
+        runs = drive(_in_memory(benches, make_room(benches)))
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
@@ -332,15 +343,15 @@ def make_room(benches: Sequence[Bench]) -> list[tuple[MemoryPart, MemoryPart]]:
 
 def _in_memory(
     benches: Sequence[Bench], kept: Sequence[tuple[MemoryPart, MemoryPart]]
-) -> list[Run]:
+) -> Steps[list[Run]]:
     """Run benches; the runs' columns are those kept. Raises UserError: a snapshot has no place."""
     if benches[0].scenario.snapshot is not None:
         raise UserError("snapshot: is kept in a run folder, and a run in memory has none")
     plants, controllers = zip(*kept, strict=True)
     timelines = [TimelineInMemory(bench) for bench in benches]
     began, date = time.monotonic(), time.time()
-    with np.errstate(all="ignore"):  # a diverging run is a result
-        done = run_inproc(benches, plants, controllers, timelines, lambda ticks: True)
+    whole = Converters(benches, plants, controllers, timelines)
+    done = yield from run_steps(whole)
     wall_s = time.monotonic() - began
     runs = []
     for bench, plant, controller, timeline in zip(

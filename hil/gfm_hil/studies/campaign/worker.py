@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.engine.compiling import compiled_benches
+from gfm_hil.engine.compiling import SIDE_BY_SIDE, compile_sets, compiled_benches
+from gfm_hil.engine.inproc import Steps
+from gfm_hil.engine.lanes import is_plain, run_together
 from gfm_hil.recording.parts import MemoryPart
 from gfm_hil.results.report import finite
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.run.runner import run_in_memory, run_network_in_memory
+from gfm_hil.run.runner import memory_steps, run_network_in_memory
 from gfm_hil.run.summary import READ
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import Campaign
@@ -29,31 +31,37 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
     """Fill numba's cache here, so that workers need not all compile the same."""
     scenario, _ = campaign.scenario(0, campaign.file.laws[0])
     try:
-        compiled_benches(scenario, notice)
+        if is_plain(compiled_benches(scenario, notice)[0]):
+            compile_sets([SIDE_BY_SIDE], notice)
     except UserError:  # no steady state: the workers will compile
         return
 
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     """The records of some runs. Raises RunFailed: an error that is not the run's own."""
-    room: dict[int, tuple[MemoryPart, MemoryPart]] = {}
-    records = []
-    for run, law in jobs:
-        try:
-            scenario, drawn = campaign.scenario(run, law)
-            inner = scenario.signal_set
-            if inner not in room and not scenario.parts:
-                room[inner] = kept(scenario)
-            if scenario.parts:
-                summary, lasted = simulate_network(scenario, campaign.file.converter)
-            else:
-                summary, columns = simulate(scenario, room[inner])
-                lasted = len(columns["true_p"])
-        except Exception as problem:
-            words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
-            raise RunFailed(words) from problem
-        records.append(record(run, law, scenario, drawn, summary, lasted))
-    return records
+    room: dict[int, list[tuple[MemoryPart, MemoryPart]]] = {}
+    with np.errstate(all="ignore"):  # a diverging run is a result
+        return run_together(_record_steps(campaign, *job, room) for job in jobs)
+
+
+def _record_steps(
+    campaign: Campaign, run: int, law: str, room: dict[int, list[tuple[MemoryPart, MemoryPart]]]
+) -> Steps[Record]:
+    """The record of a run step by step; ``room``: what no run uses, by what it records."""
+    try:
+        scenario, drawn = campaign.scenario(run, law)
+        if scenario.parts:
+            summary, lasted = simulate_network(scenario, campaign.file.converter)
+        else:
+            free = room.setdefault(scenario.signal_set, [])
+            mine = free.pop() if free else kept(scenario)
+            summary, columns = yield from simulate(scenario, mine)
+            lasted = len(columns["true_p"])
+            free.append(mine)
+    except Exception as problem:
+        words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
+        raise RunFailed(words) from problem
+    return record(run, law, scenario, drawn, summary, lasted)
 
 
 def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
@@ -67,11 +75,11 @@ def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
 
 def simulate(
     scenario: Scenario, room: tuple[MemoryPart, MemoryPart]
-) -> tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]:
+) -> Steps[tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]]:
     """The summary of a run, as ``run_scenario`` would write it, and the columns that it reads,
     which are good until the next run in the same room."""
     try:
-        run = run_in_memory(scenario, room)
+        run = yield from memory_steps(scenario, room)
     except UserError as problem:
         return no_steady_state(problem), dict.fromkeys(READ, np.empty(0))
     return run.summary, {name: np.asarray(run.columns[name]) for name in READ}

@@ -1,0 +1,607 @@
+"""Several runs of one converter each, tick by tick in one compiled loop: run j is lane j of every
+number in two records, so that the processor computes the same of all runs at a time.
+
+A lane has the bits of a run alone: each operation is that of the plant's and the controller's own
+functions, in their order. It knows the calm ticks of the plainest plant, and looks in each tick
+whether it was one. In any other, as one in which a limit acts, a protection picks up or a number is
+not finite, the run goes on by itself from before it.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gfm_hil.engine.inproc import Steps, Stretch
+from gfm_hil.engine.setup import Bench
+from gfm_hil.realtime.atomics import row_at
+from gfm_hil.recording.parts import MemoryPart
+from gfm_plant.model import DELTA, V_DC, terminal
+from gfm_plant.noise import normal_pair, random_bits, share_of
+from gfm_plant.quantise import quantise
+from gfm_plant.records import MAX_DELAY, N_TRIPS
+from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.error_maps import LINEAR
+from gfm_runtime.inner import faded, limited
+from gfm_runtime.signals import NU, NY, REF_NAMES
+from gfm_runtime.states import RUNNING
+
+T = TypeVar("T")
+
+LANES = 8
+BLOCK = 50  # ticks after which one that was not calm is noticed
+_MODES = 3  # of the filter and the line, whose states are as many
+_PARTS = 2  # of a period, at most: one before and one behind a fraction of a sample of delay
+_ORDER = 5  # of a law, at most
+_AGES = MAX_DELAY + 2
+_FAR = 1e6  # p.u.; a state beyond that has diverged
+_ROUGH = 1e-6  # p.u.; a larger last term of v_dc asks for finer steps
+_SERIES = 0.03  # rad; up to which an angle's sine and cosine are series
+_NEAR = 1e-8  # of a mode, to the speed of a source
+_1_2, _1_3, _1_4, _1_5 = 1 / 2, 1 / 3, 1 / 4, 1 / 5
+#: what a lane records of the plant in each tick; a number that stays in calm ticks is none of them
+MOVING = ("true_p", "true_omega_u", "true_V", "true_i", "true_delta")
+_REFS = tuple(f"ref_{name}" for name in REF_NAMES)
+_RECORDED = {*MOVING, "true_omega_g", "true_V_g", "law", *_REFS}
+
+
+def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    return np.dtype([(name, kind, (*shape, LANES)) for name, kind, *shape in fields], align=True)
+
+
+_PLANT = ("m_max", "omega_b", "current", "i_u_gain", "k_p", "k_i", "C_dc", "seed")
+_SENSORS = ("gain", "offset", "noise_std", "adc_lo", "adc_hi", "adc_lsb")
+_DAC = ("dac_lo", "dac_hi", "dac_lsb")
+_LAW = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "W", "loop", "low", "high", "decay",
+        "follow")  # fmt: skip
+
+#: what stays; the names are those of the plant's, the circuits' and the law's records
+fixed_dtype = _record(
+    *((name, "f8") for name in _PLANT[:-1]), ("seed", "u8"), ("i_most", "f8", 2),
+    ("half_h", "f8", _PARTS), ("age", "i8", _PARTS), ("lag_weights", "f8", _PARTS, 4),
+    *((name, "f8", 4) for name in _SENSORS), *((name, "f8", NU) for name in _DAC),
+    ("rate", "f8", 2, _MODES), ("decay_z", "f8", _PARTS, 2, _MODES), ("drive", "f8", 2, _MODES),
+    ("states", "f8", _MODES, 2, _MODES), ("grid_gain", "f8", _PARTS, 2, _MODES),
+    ("grid_turn", "f8", 2, _PARTS), ("E_grid", "f8", 2, 1), ("omega_grid", "f8"),
+    ("trips", "i8", N_TRIPS), ("trip_limit", "f8", N_TRIPS),
+    ("y_low", "f8", NY), ("y_high", "f8", NY), ("ref", "f8", NY),
+    ("A", "f8", _ORDER, _ORDER), ("B_r", "f8", _ORDER, NY), ("B_y", "f8", _ORDER, NY),
+    ("C", "f8", NU, _ORDER), ("D_r", "f8", NU, NY), ("D_y", "f8", NU, NY), ("D_u0", "f8", NU, NY),
+    ("u_0", "f8", NU), ("W", "f8", _ORDER, NU), ("loop", "f8"), ("low", "f8", NU),
+    ("high", "f8", NU), ("decay", "f8"), ("follow", "f8"),
+)  # fmt: skip
+#: what changes from tick to tick
+moving_dtype = _record(
+    ("upset", "i8"), ("tick", "i8"), ("x", "f8", 8), ("i_reg", "f8"), ("sensed", "f8", 4),
+    ("u", "f8", _AGES, NU), ("E_q", "f8"), ("u_now", "f8", NU), ("E", "f8", 2), ("E_most", "f8"),
+    ("drawn", "f8", 3), ("seen", "f8", 3, 3), ("bits", "u8", 2), ("log", "f8", 2),
+    ("noise", "f8", 4), ("z", "f8", 2, _MODES), ("forced", "f8", 2, 2, _MODES),
+    ("w", "f8", 2, _MODES), ("unit", "f8", 2, 2), ("halfway", "f8", 2, 1), ("turn", "f8", 2, 1),
+    ("y", "f8", NY), ("seen_y", "f8", NY), ("x_law", "f8", _ORDER), ("x_next", "f8", _ORDER),
+    ("raw", "f8", NU), ("now", "f8", NU), ("off", "f8", NU), ("u_law", "f8", NU),
+    ("trend", "f8", NU), ("kept", "f8", len(MOVING)),
+)  # fmt: skip
+
+
+@inlined
+def _sample(n, c, s):
+    """As `gfm_plant.sensors.read_sensors`. What the compiler takes of all lanes at a time must not
+    call a library, so that the logarithms are apart."""
+    for pair in range(2):
+        for j in range(n):
+            s.bits[pair, j] = random_bits(c.seed[j], s.tick[j], pair)
+            s.log[pair, j] = share_of(s.bits[pair, j])
+        for j in range(n):
+            s.log[pair, j] = math.log(s.log[pair, j])
+        for j in range(n):
+            one, other = normal_pair(s.bits[pair, j], s.log[pair, j])
+            s.noise[2 * pair, j], s.noise[2 * pair + 1, j] = one, other
+    for k in range(4):
+        y = k if k < 2 else k + 1
+        for j in range(n):
+            value = (
+                c.gain[k, j] * s.sensed[k, j] + c.offset[k, j] + c.noise_std[k, j] * s.noise[k, j]
+            )
+            s.y[y, j] = quantise(value, c.adc_lo[k, j], c.adc_hi[k, j], c.adc_lsb[k, j])
+    for j in range(n):
+        s.y[2, j] = s.u_now[1, j]
+    for k in range(NY):
+        for j in range(n):
+            s.upset[j] |= 0 if c.y_low[k, j] <= s.y[k, j] <= c.y_high[k, j] else 1
+            s.seen_y[k, j] = s.y[k, j]
+
+
+@inlined
+def _row(n, c, s, order, i):
+    """As of `gfm_runtime.kernel`."""
+    for j in range(n):
+        s.raw[i, j] = c.u_0[i, j] + s.off[i, j]
+    for k in range(order):
+        for j in range(n):
+            s.raw[i, j] += c.C[i, k, j] * s.x_law[k, j]
+    for k in range(NY):
+        for j in range(n):
+            s.raw[i, j] += c.D_u0[i, k, j] * c.ref[k, j] + c.D_r[i, k, j] * c.ref[k, j]
+    for k in range(NY):
+        if k != 2:
+            for j in range(n):
+                s.raw[i, j] += c.D_y[i, k, j] * s.seen_y[k, j]
+
+
+@inlined
+def _control(n, c, s, order):
+    """As `look` and `advance` of `gfm_runtime.kernel`."""
+    _row(n, c, s, order, 1)
+    for j in range(n):
+        s.raw[1, j] *= c.loop[j]
+        s.now[1, j] = s.seen_y[2, j] = limited(s.raw[1, j], c.low[1, j], c.high[1, j])
+    for i in (0, 2):
+        _row(n, c, s, order, i)
+        for j in range(n):
+            s.raw[i, j] += c.D_y[i, 2, j] * s.seen_y[2, j]
+            s.now[i, j] = limited(s.raw[i, j], c.low[i, j], c.high[i, j])
+    for i in range(NU):
+        for k in range(order):
+            for j in range(n):
+                excess = s.now[i, j] - s.raw[i, j]
+                x = s.x_law[k, j]
+                s.x_law[k, j] = x + c.W[k, i, j] * excess if excess != 0 else x
+        for j in range(n):
+            s.upset[j] |= 0 if abs(s.now[i, j]) < math.inf else 1
+            s.off[i, j] = faded(s.off[i, j] * c.decay[j])
+            change = s.now[i, j] - s.u_law[i, j] - s.trend[i, j]
+            s.trend[i, j] = faded(s.trend[i, j] + c.follow[j] * change)
+            s.u_law[i, j] = s.now[i, j]
+    for i in range(order):
+        for j in range(n):
+            s.x_next[i, j] = c.B_r[i, 0, j] * c.ref[0, j]
+        for k in range(1, NY):
+            for j in range(n):
+                s.x_next[i, j] += c.B_r[i, k, j] * c.ref[k, j]
+        for k in range(NY):
+            for j in range(n):
+                s.x_next[i, j] += c.B_y[i, k, j] * s.seen_y[k, j]
+        for k in range(order):
+            for j in range(n):
+                s.x_next[i, j] += c.A[i, k, j] * s.x_law[k, j]
+    for i in range(order):
+        for j in range(n):
+            s.x_law[i, j] = faded(s.x_next[i, j])
+
+
+@inlined
+def _command(n, c, s):
+    """As `gfm_plant.emulator.plant_command`."""
+    for i in range(NU):
+        for age in range(_AGES - 1, 0, -1):
+            for j in range(n):
+                s.u[age, i, j] = s.u[age - 1, i, j]
+        for j in range(n):
+            s.u[0, i, j] = quantise(s.now[i, j], c.dac_lo[i, j], c.dac_hi[i, j], c.dac_lsb[i, j])
+
+
+@inlined
+def _z(numbers, k, j):
+    """Return complex number k of lane j; the compiler takes all lanes at a time of real numbers
+    only."""
+    return complex(numbers[0, k, j], numbers[1, k, j])
+
+
+@inlined
+def _set(numbers, k, j, z):
+    numbers[0, k, j], numbers[1, k, j] = z.real, z.imag
+
+
+@inlined
+def _look(n, c, s, which):
+    """As of `gfm_plant.period`."""
+    for j in range(n):
+        unit = _z(s.halfway, 0, j) if which == 1 else _z(s.unit, 0, j)
+        i, v, i_o, scale = _z(s.w, 0, j), _z(s.w, 1, j), _z(s.w, 2, j), c.current[j]
+        turned = unit.conjugate() * complex(i.real * scale, i.imag * scale)
+        s.drawn[which, j] = s.E[0, j] * turned.real + s.E[1, j] * turned.imag
+        s.seen[which, 0, j], s.seen[which, 1, j], s.seen[which, 2, j] = terminal(
+            v.real, v.imag, i_o.real * scale, i_o.imag * scale
+        )
+
+
+@inlined
+def _turn_on(s, k, j, turn):
+    """As of `gfm_plant.solution`; returns the phasor in the middle of a piece."""
+    middle = _z(s.unit, k, j) * turn
+    u = middle * turn
+    length = 1.5 - 0.5 * (u.real * u.real + u.imag * u.imag)
+    _set(s.unit, k, j, complex(u.real * length, u.imag * length))
+    return middle
+
+
+@inlined
+def _drive(n, c, s, part):
+    """As of `gfm_plant.solution`, of the bridge and the grid."""
+    for j in range(n):
+        x = c.omega_b[j] * (s.u_now[1, j] - 1.0) * c.half_h[part, j]
+        s.upset[j] |= 0 if abs(x) < _SERIES else 1
+        x2 = x * x
+        s.turn[0, 0, j] = 1 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320))))
+        s.turn[1, 0, j] = x * (
+            1 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))
+        )
+    for m in range(_MODES):
+        for j in range(n):
+            h, rate, turn = c.half_h[part, j], _z(c.rate, m, j), _z(s.turn, 0, j)
+            d = complex(-rate.real, c.omega_b[j] * (s.u_now[1, j] - 1.0) - rate.imag)
+            size = d.real * d.real + d.imag * d.imag
+            s.upset[j] |= 0 if size * h * h > _NEAR else 1
+            per_size = 1.0 / size
+            g = (turn - _z(c.decay_z[part], m, j)) * d.conjugate()
+            gain = complex(g.real * per_size, g.imag * per_size) * _z(c.drive, m, j)
+            f = gain * (complex(s.E[0, j], s.E[1, j]) * _z(s.unit, 0, j))
+            f_grid = _z(c.grid_gain[part], m, j) * (_z(c.E_grid, 0, j) * _z(s.unit, 1, j))
+            _set(s.forced[0], m, j, 0j + f + f_grid)
+            _set(s.forced[1], m, j, 0j + f * turn + f_grid * _z(c.grid_turn, part, j))
+    for j in range(n):
+        _set(s.halfway, 0, j, _turn_on(s, 0, j, _z(s.turn, 0, j)))
+        _turn_on(s, 1, j, _z(c.grid_turn, part, j))
+
+
+@inlined
+def _half_step(n, c, s, part, which):
+    for m in range(_MODES):
+        for j in range(n):
+            z = _z(c.decay_z[part], m, j) * _z(s.z, m, j) + _z(s.forced[which], m, j)
+            _set(s.z, m, j, z)
+    for i in range(_MODES):
+        for j in range(n):
+            w = 0j + _z(c.states[i], 0, j) * _z(s.z, 0, j)
+            w += _z(c.states[i], 1, j) * _z(s.z, 1, j)
+            _set(s.w, i, j, w + _z(c.states[i], 2, j) * _z(s.z, 2, j))
+
+
+@inlined
+def _asks(c, j, v, i, i_u):
+    """Whether the DC source's control is at a limit."""
+    asked = i_u + c.k_p[j] * (1.0 - v) + i
+    return asked > c.i_most[0, j] or asked < c.i_most[1, j]
+
+
+@inlined
+def _low_pass(c, part, j, sensed, f_0, f_1, f_2):
+    weights = c.lag_weights
+    return (
+        weights[part, 0, j] * sensed + weights[part, 1, j] * f_0
+        + weights[part, 2, j] * f_1 + weights[part, 3, j] * f_2
+    )  # fmt: skip
+
+
+@inlined
+def _dc_link(n, c, s, part):
+    """As `gfm_plant.dc_link.advance_dc_link` in one step, and the sensors."""
+    for j in range(n):
+        h, v, i, k_p = 2.0 * c.half_h[part, j], s.x[V_DC, j], s.i_reg[j], c.k_p[j]
+        i_u, H, K = c.i_u_gain[j] * s.u_now[0, j], h * c.omega_b[j] / c.C_dc[j], h * c.k_i[j]
+        d_0, d_1, d_2, v_0 = s.drawn[0, j], s.drawn[1, j], s.drawn[2, j], v
+        b, a = 4.0 * d_1 - 3.0 * d_0 - d_2, 2.0 * (d_0 + d_2) - 4.0 * d_1
+        upset, t_0, per_v = _asks(c, j, v, i, i_u), i_u + k_p * (1.0 - v) + i, 1.0 / v
+        c_0 = d_0 * per_v
+        v_1, i_1 = H * (t_0 - c_0), K * (1.0 - v)
+        t_1 = i_1 - k_p * v_1
+        c_1 = (b - v_1 * c_0) * per_v
+        v_2, i_2 = _1_2 * H * (t_1 - c_1), -_1_2 * K * v_1
+        t_2 = i_2 - k_p * v_2
+        c_2 = (a - v_1 * c_1 - v_2 * c_0) * per_v
+        v_3, i_3 = _1_3 * H * (t_2 - c_2), -_1_3 * K * v_2
+        t_3 = i_3 - k_p * v_3
+        c_3 = -(v_1 * c_2 + v_2 * c_1 + v_3 * c_0) * per_v
+        v_4, i_4 = _1_4 * H * (t_3 - c_3), -_1_4 * K * v_3
+        t_4 = i_4 - k_p * v_4
+        c_4 = -(v_1 * c_3 + v_2 * c_2 + v_3 * c_1 + v_4 * c_0) * per_v
+        v_5, i_5 = _1_5 * H * (t_4 - c_4), -_1_5 * K * v_4
+        v_middle = v + (v_1 + (v_2 + (v_3 + (v_4 + v_5 / 2) / 2) / 2) / 2) / 2
+        v += v_1 + (v_2 + (v_3 + (v_4 + v_5)))
+        i += i_1 + (i_2 + (i_3 + (i_4 + i_5)))
+        calm = abs(v_5) <= _ROUGH and not (upset or _asks(c, j, v, i, i_u))
+        s.upset[j] |= 0 if calm else 1
+        s.x[V_DC, j], s.i_reg[j] = v, i
+        s.sensed[0, j] = _low_pass(c, part, j, s.sensed[0, j], v_0, v_middle, v)
+    for k in range(3):
+        for j in range(n):
+            s.sensed[1 + k, j] = _low_pass(
+                c, part, j, s.sensed[1 + k, j], s.seen[0, k, j], s.seen[1, k, j], s.seen[2, k, j]
+            )
+
+
+@inlined
+def _advance(n, c, s, parts):
+    """As `gfm_plant.emulator.plant_step`."""
+    for part in range(parts):
+        for i in range(NU):
+            for j in range(n):
+                s.u_now[i, j] = s.u[c.age[part, j], i, j]
+        for j in range(n):
+            s.E[0, j], s.E[1, j] = s.u_now[2, j], s.E_q[j]
+            s.E_most[j] = most = c.m_max[j] * s.x[V_DC, j]
+            size = s.E[0, j] * s.E[0, j] + s.E[1, j] * s.E[1, j]
+            s.upset[j] |= 1 if size > most * most else 0
+        _look(n, c, s, 0)
+        _drive(n, c, s, part)
+        _half_step(n, c, s, part, 0)
+        _look(n, c, s, 1)
+        _half_step(n, c, s, part, 1)
+        _look(n, c, s, 2)
+        _dc_link(n, c, s, part)
+        for j in range(n):
+            away = s.u_now[1, j] - c.omega_grid[j]
+            s.x[DELTA, j] += 2.0 * c.half_h[part, j] * c.omega_b[j] * away
+    for i in range(_MODES):
+        for j in range(n):
+            w, scale = _z(s.w, i, j), 1.0 if i == 1 else c.current[j]
+            turned = complex(w.real * scale, w.imag * scale) * _z(s.unit, 0, j).conjugate()
+            s.x[2 * i, j], s.x[2 * i + 1, j] = turned.real, turned.imag
+            s.upset[j] |= 0 if abs(w.real) + abs(w.imag) < _FAR else 1
+    for j in range(n):
+        near = 0.0 < s.x[V_DC, j] < _FAR and abs(s.x[DELTA, j]) < _FAR * _FAR
+        s.upset[j] |= 0 if near and abs(s.i_reg[j]) < _FAR else 1
+        s.tick[j] += 1
+
+
+@inlined
+def _protect(n, c, s):
+    """As of `gfm_plant.protection`: whether any quantity is beyond its threshold."""
+    for j in range(n):
+        i = math.sqrt(s.x[0, j] ** 2 + s.x[1, j] ** 2)
+        v = math.sqrt(s.x[2, j] ** 2 + s.x[3, j] ** 2)
+        v_dc, omega, limit, on = s.x[V_DC, j], s.u_now[1, j], c.trip_limit, c.trips
+        s.upset[j] |= on[0, j] if i - limit[0, j] > 0.0 else 0
+        s.upset[j] |= on[1, j] if v - limit[1, j] > 0.0 else 0
+        s.upset[j] |= on[2, j] if limit[2, j] - v > 0.0 else 0
+        s.upset[j] |= on[3, j] if v_dc - limit[3, j] > 0.0 else 0
+        s.upset[j] |= on[4, j] if limit[4, j] - v_dc > 0.0 else 0
+        s.upset[j] |= on[5, j] if omega - limit[5, j] > 0.0 else 0
+        s.upset[j] |= on[6, j] if limit[6, j] - omega > 0.0 else 0
+
+
+@inlined
+def _keep(n, s, used, columns, k):
+    """Record what moves of the used lanes, as `gfm_plant.emulator.plant_truth`."""
+    for j in range(n):
+        s.kept[0, j], _, s.kept[2, j] = terminal(s.x[2, j], s.x[3, j], s.x[4, j], s.x[5, j])
+        s.kept[1, j], s.kept[4, j] = s.u_now[1, j], s.x[DELTA, j]
+        s.kept[3, j] = math.sqrt(s.x[0, j] ** 2 + s.x[1, j] ** 2)
+    for j in range(n):
+        for i in range(len(columns) if used[j] else 0):
+            row_at(columns[i, j], 1, k)[0] = s.kept[i, j]
+
+
+@compiled
+def _run_lanes(n, fixed, moving, before, used, columns, order, parts, ticks):
+    """Run ticks, of all lanes, in whole blocks; returns after how many some ``used`` lane is upset,
+    which then is in the next block, at whose beginning all are."""
+    c, s = fixed[0], moving[0]
+    for first in range(0, ticks, BLOCK):
+        before[0] = moving[0]
+        for k in range(first, min(first + BLOCK, ticks)):
+            _keep(n, s, used, columns, k)
+            _sample(n, c, s)
+            _control(n, c, s, order)
+            _advance(n, c, s, parts)
+            _protect(n, c, s)
+            _command(n, c, s)
+        upset = 0
+        for j in range(n):
+            upset |= s.upset[j] & used[j]
+        if upset:
+            for j in range(n):
+                before[0].upset[j] = s.upset[j]
+            moving[0] = before[0]
+            return first
+    return ticks
+
+
+class Lanes:
+    """Runs side by side, each in a lane; a lane may be empty."""
+
+    def __init__(self) -> None:
+        self._fixed, self._moving = np.zeros(1, fixed_dtype), np.zeros(1, moving_dtype)
+        self._before, self._used = self._moving.copy(), np.zeros(LANES, np.int64)
+        self._kind: tuple[int, int] = 0, 0  # what all lanes have in common: order and parts
+        # where the next tick of each lane is recorded, by columns; an empty one's nowhere
+        self._columns = np.empty((len(MOVING), LANES), np.int64)
+
+    def enter(self, j: int, stretch: Stretch) -> bool:
+        """Put a run into the empty lane j, if its ticks may be calm and like those of the others;
+        returns whether."""
+        kind, bench = _kind_of(stretch), stretch.those.benches[0]
+        if kind is None or (self._used.any() and kind != self._kind):
+            return False
+        self._kind, self._used[j] = kind, 1
+        columns = _columns(stretch)
+        self._columns[:, j] = [columns[name][stretch.start :].ctypes.data for name in MOVING]
+        fixed, moving, parts = self._fixed[0], self._moving[0], kind[1]
+        plant, c = bench.plant, bench.controller
+        r, s, n, now, ctl = plant.par[0], plant.st[0], plant.net[0], plant.now[0], c.ctl[0]
+        law, state = (one[int(ctl["active"])] for one in (c.laws, c.states))
+        for name in _PLANT:
+            fixed[name][j] = r[name]
+        for name in _SENSORS:
+            fixed[name][:, j] = r[name][:4]
+        for name in _DAC:
+            fixed[name][:, j] = r[name][:NU]
+        for name in _LAW:
+            to = fixed[name][..., j]
+            to[...] = law[name][tuple(map(slice, to.shape))]
+        fixed["i_most"][:, j] = s["i_most"]
+        fixed["half_h"][:parts, j], fixed["age"][:parts, j] = n["half_h"][:parts], n["age"][:, 0]
+        fixed["lag_weights"][:parts, :, j] = n["lag_weights"][:parts, 0]
+        fixed["rate"][..., j] = _pair(n["rate"][0, :_MODES])
+        fixed["drive"][..., j] = _pair(n["drive"][0, 0, :_MODES, 0])
+        fixed["decay_z"][:parts, ..., j] = _pairs(n["decay"][0, :parts, :_MODES])
+        fixed["states"][..., j] = _pairs(n["states"][0, :_MODES, :_MODES])
+        fixed["grid_gain"][:parts, ..., j] = _pairs(now["gain"][:parts, 1, :_MODES])
+        fixed["grid_turn"][:, :parts, j] = _pair(now["turn"][:parts, 1])
+        E = now["sequence"][0]
+        fixed["E_grid"][:, 0, j] = now["V_g"] * E.real, now["V_g"] * E.imag
+        fixed["omega_grid"][j] = now["omega_g"]
+        fixed["trips"][:, j], fixed["trip_limit"][:, j] = (
+            r["trip_ticks"][:N_TRIPS] >= 0, r["trip_limit"][:N_TRIPS]
+        )  # fmt: skip
+        for name in ("y_low", "y_high"):
+            fixed[name][:, j] = ctl[name][:NY]
+        fixed["ref"][:, j] = ctl["ref"]
+        moving["upset"][j] = 0
+        for name in ("tick", "i_reg", "E_most"):
+            moving[name][j] = s[name]
+        moving["x"][:, j], moving["sensed"][:, j] = s["x"], s["sensed"]
+        moving["u"][:, :, j], moving["E_q"][j] = s["u"][:, :NU], s["u"][0, NU]
+        moving["u_now"][:, j] = s["u_now"][:NU]
+        for name, count in _PHASORS.items():
+            moving[name][..., j] = _pair(now[name][:count])
+        moving["E"][:, j], moving["y"][:, j] = s["E"], ctl["y"][:NY]
+        for name, of in _STATE.items():
+            moving[name][:, j] = state[of][: len(moving[name])]
+        return True
+
+    def leave(self, j: int, stretch: Stretch, k: int) -> None:
+        """Give the run in lane j back its records, as they are now at tick k, with what stayed in
+        its columns, and empty the lane."""
+        bench = stretch.those.benches[0]
+        self._used[j] = 0
+        moving, plant, c = self._moving[0], bench.plant, bench.controller
+        s, now, ctl = plant.st[0], plant.now[0], c.ctl[0]
+        state = c.states[int(ctl["active"])]
+        for name in ("tick", "i_reg", "E_most"):
+            s[name] = moving[name][j]
+        s["x"], s["sensed"] = moving["x"][:, j], moving["sensed"][:, j]
+        s["u"][:, :NU], s["u_now"][:NU] = moving["u"][:, :, j], moving["u_now"][:, j]
+        s["E"] = s["E_commanded"] = moving["E"][:, j]
+        for name, count in _PHASORS.items():
+            z = now[name][:count]
+            z.real, z.imag = moving[name][..., j]
+        for name, of in _STATE.items():
+            state[of][: len(moving[name])] = moving[name][:, j]
+        ctl["y"][:NY], ctl["u"] = moving["y"][:, j], moving["u_law"][:, j]
+        bench.y[:], bench.u[:] = moving["y"][:, j], moving["u_law"][:, j]
+        stayed = {"true_omega_g": now["omega_g"], "true_V_g": now["V_g"], "law": ctl["active"]}
+        stayed |= zip(_REFS, ctl["ref"], strict=True)
+        for name, column in _columns(stretch).items():
+            if name in stayed:
+                column[stretch.start : k] = stayed[name]
+
+    def run(self, ticks: int) -> tuple[int, list[int]]:
+        """Run all lanes for up to ``ticks``; returns the ticks done, and the lanes that have to go
+        on by themselves."""
+        done = int(
+            _run_lanes(
+                LANES, self._fixed, self._moving, self._before, self._used, self._columns,
+                *self._kind, ticks,
+            )
+        )  # fmt: skip
+        self._columns += 8 * done
+        upset = self._moving[0]["upset"] & self._used
+        self._moving["upset"] = 0
+        return done, np.flatnonzero(upset).tolist()
+
+
+def _columns(stretch: Stretch) -> dict[str, NDArray[np.float64]]:
+    """The columns that a run keeps in memory, up to the end of a stretch; none of a run that has
+    them elsewhere."""
+    parts = stretch.those.plant_parts[0], stretch.those.controller_parts[0]
+    return {
+        name: column
+        for part in parts
+        if isinstance(part, MemoryPart) and part.rows is None
+        for name, column in part.by_name(stretch.stop).items()
+    }
+
+
+def _pair(z: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Real and imaginary parts, (2, ...)."""
+    return np.stack([z.real, z.imag])
+
+
+def _pairs(z: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Those of each row of z (rows, ...), (rows, 2, ...)."""
+    return np.stack([z.real, z.imag], axis=1)
+
+
+def run_together(runs: Iterable[Steps[T]]) -> list[T]:
+    """Have runs do all their ticks, those that fit side by side; returns what each returns, in
+    their order. A run begins when there is a lane for it."""
+    lanes, results = Lanes(), dict[int, T]()
+    there: dict[int, tuple[int, Steps[T], Stretch]] = {}  # by lane
+    at = [0] * LANES  # tick of each
+
+    def go_on(j: int, which: int, run: Steps[T], k: int | None) -> None:
+        """Tell a run that it is at tick k, None: it has not begun; until it enters lane j."""
+        try:
+            stretch = next(run) if k is None else run.send(k)
+            while not lanes.enter(j, stretch):
+                stretch = run.send(stretch.start)
+            there[j], at[j] = (which, run, stretch), stretch.start
+        except StopIteration as end:
+            results[which] = end.value
+
+    waiting, more = enumerate(runs), True
+    while more or there:
+        for j in range(LANES):
+            while more and j not in there:
+                if more := (one := next(waiting, None)) is not None:
+                    go_on(j, *one, None)
+        alone, done, upset = len(there) == 1, 0, list[int]()
+        if len(there) > 1:  # one is quicker by itself
+            done, upset = lanes.run(min(s.stop - at[j] for j, (_, _, s) in there.items()))
+        for j, (which, run, stretch) in [*there.items()]:
+            at[j] += done
+            if alone or j in upset or at[j] == stretch.stop:
+                lanes.leave(j, stretch, at[j])
+                del there[j]
+                go_on(j, which, run, at[j])
+    return [results[k] for k in range(len(results))]
+
+
+#: of the state of a plant's circuits, and how many of each
+_PHASORS = {"z": _MODES, "w": _MODES, "unit": 2}
+#: of a law's state, by their names here
+_STATE = {"x_law": "x", "off": "offset", "u_law": "u", "trend": "trend", "seen_y": "y",
+          "now": "now", "raw": "raw"}  # fmt: skip
+
+
+def is_plain(bench: Bench) -> bool:
+    """Whether a run's plant and law are such as lanes know."""
+    r, n, laws = bench.plant.par[0], bench.plant.net[0], bench.controller.laws
+    parts = int(n["n_parts"])
+    return bool(
+        n["n_converters"] == 1 and n["n_states"] == _MODES and n["n_modes"][0] == _MODES
+        and parts <= _PARTS and (n["pieces"][:parts] == 1).all()
+        and not (n["n_units"] or n["n_dynamic"] or n["connections"] or n["batteries"])
+        and not (n["sparse"] or n["unbalanced"][0] or n["conversions"] > 1)
+        and r["filtered"] and r["noisy"] and r["i_peak"] == math.inf and r["places"] == 0
+        and r["dc_steps"] == 1 and r["tau_dc"] == 0 and r["energy"] == 0 and r["array"] == 0
+        and r["chopper"][0] == 0 and r["delay"] > 0 and not bench.inner
+        and (laws["n"] <= _ORDER).all() and (laws["error_map"] == LINEAR).all()
+        and laws.dtype["A"].base == np.float64 and len(bench.trace.plan) == 0
+    )  # fmt: skip
+
+
+def _kind_of(stretch: Stretch) -> tuple[int, int] | None:
+    """What the lanes of runs have to have in common: a law's order and the parts of a period; None
+    if a run's next ticks are none of theirs."""
+    bench, columns = stretch.those.benches[0], _columns(stretch)
+    if not (is_plain(bench) and {*MOVING} <= {*columns} <= _RECORDED):
+        return None
+    plant, c = bench.plant, bench.controller
+    s, n, now, ctl = plant.st[0], plant.net[0], plant.now[0], c.ctl[0]
+    parts, omega = int(n["n_parts"]), now["omega_g"]
+    calm = (
+        s["trip"] == 0 and not s["crossed"].any() and (s["u"][:, NU + 1] < 0).all()
+        and (s["u"][:, NU] == s["u"][0, NU]).all()
+        and not (now["row"] or now["contact"] or now["joint"] or now["clearing"] or now["check"])
+        and now["unbalance_left"] <= 0 and now["sag_left"] <= 0 and now["omega_g_slope"] == 0
+        and now["omega_g_to"] == omega and now["V_g_to"] == now["V_g"]
+        and (now["gain_omega"][:parts, 1] == omega).all()
+        and ctl["state"] == RUNNING and ctl["request"] < 0 and ctl["stages"] == 0
+        and not (ctl["joins"] or ctl["aligns"]) and (ctl["ref"] == ctl["ref_target"]).all()
+    )  # fmt: skip
+    order = int(c.laws["n"][int(ctl["active"])])
+    return (order, parts) if calm else None
