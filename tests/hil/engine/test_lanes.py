@@ -1,13 +1,18 @@
 """Several runs side by side: each has the bits of a run alone, whatever happens to the others."""
 
+import inspect
+import re
+
 import numpy as np
 import pytest
 
+from gfm_hil.engine import lanes
 from gfm_hil.engine.lanes import LANES, Lanes, run_together
 from gfm_hil.run.runner import memory_steps, run_in_memory
 from gfm_hil.run.summary import READ
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.campaign.worker import kept
+from gfm_plant.records import converter_par_dtype
 
 _STEP = {"t": 0.1, "type": "reference", "P_ref": 0.9}
 _RAMP = {"t": 0.1, "type": "reference", "P_ref": 0.7, "ramp_s": 0.05}
@@ -80,3 +85,21 @@ def test_laws_of_each_order_side_by_side(law):
         alone = run_in_memory(scenario)
         for name, column in columns.items():
             assert column.tobytes() == np.asarray(alone.columns[name][:]).tobytes(), name
+
+
+#: of a converter's parameters what the modes of its circuit contain, what only goes with something
+#: that ``is_plain`` refuses, and what nothing reads after the start
+_ELEMENTS = {"L_f", "R_f", "C_f", "L_g", "R_g", "L_line_n", "R_line_n"}
+_OF_OTHERS = {
+    "soc", "P_most", "R_battery", "place_ticks", "by_voltage", "levels", "counts", "count_s",
+    "dead", "least", "leg", "wide", "band", "band_kind", "cancels", "I_sc", "I_0", "v_T",
+    "irradiance", *(f"phase_{x}" for x in ("gain", "offset", "noise", "skew", "lo", "lsb", "top")),
+    "phase_weights", "phase_samples",
+}  # fmt: skip
+_OF_THE_START = {"omega_s", "T_s", "fraction", "i_max"}
+
+
+def test_lanes_know_every_parameter_of_a_converter_or_refuse_what_it_goes_with():
+    """A new one has to be copied to a lane, refused by ``is_plain``, or named above."""
+    known = {*re.findall(r'"(\w+)"', inspect.getsource(lanes))}
+    assert {*converter_par_dtype.names} - known == _ELEMENTS | _OF_OTHERS | _OF_THE_START
