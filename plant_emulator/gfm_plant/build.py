@@ -182,9 +182,8 @@ def _make(
     network.net["updates"], network.net["switched"] = updates, switched[0] if port else -1
     network.net["batteries"] = par["energy"].any()
     now = network.now
-    st["x"][:, V_DC] = 1.0
+    st["x"][:, V_DC] = st["sensed"][:, 0] = 1.0
     now["unit"] = now["sequence"][:, 0] = 1.0
-    st["sensed"][:, 0] = 1.0
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
     st["phase_seen"] = st["phase_sums"] = math.nan
     network.net["conversions"] = conversions
