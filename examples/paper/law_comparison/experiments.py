@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gfm_hil.engine.inproc import drive
 from gfm_hil.scenario import check_scenario
 from gfm_hil.studies.campaign.worker import kept, simulate
 
@@ -48,7 +49,7 @@ def experiment(name: str, law: str) -> dict[str, Any]:
         "events": [{"t": AT, **event} | ({"law": law} if switched else {})],
     }
     scenario = check_scenario(content, f"law comparison, {name}")
-    summary, columns = simulate(scenario, kept(scenario))
+    summary, columns = drive(simulate(scenario, kept(scenario)))
     p = columns["true_p"]
     out: dict[str, Any] = {"status": summary["status"], "reason": summary["reason"]}
     at = round(AT / scenario.T_s)
