@@ -43,6 +43,7 @@ def _told(run):
     return [{k: v for k, v in e.items() if k not in clocks} for e in (run.summary, *run.events)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "fraction, events, more, share",
     [
@@ -78,6 +79,7 @@ def test_runs_side_by_side_have_the_bits_of_runs_alone(monkeypatch, fraction, ev
     assert ticks > share * recorded
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("law", _LAWS)
 def test_laws_of_each_order_side_by_side(law):
     scenarios = [_scenario(k, 0.3, [_STEP], law=law) for k in range(2)]
