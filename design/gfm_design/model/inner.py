@@ -123,7 +123,6 @@ def linearise_stage(
     c = np.zeros(1, np.dtype([*INNER_NUMBERS, *inner_fields(np.dtype(float))]))[0]
     pack_inner(inner, c, T_s, omega_b)
     omega_0, dual = float(op.u[1]), isinstance(inner, DualSequence)
-    stator = isinstance(inner, VirtualStator)
     i_0, v_0, i_o_0 = (complex(op.x[k], op.x[k + 1]) for k in (0, 2, 4))
     _check_limits(inner, op, abs(i_0))
     both, states = _states(inner, c)
@@ -158,7 +157,7 @@ def linearise_stage(
         omega, turns = seen, seen + c["give_back"] * E.imag / op.u[2]
         i_ref, own = _asked_current(inner, c, op, w, n, then["v_f"], seen, turned)
         after = [*own, *after]
-    elif stator:
+    elif isinstance(inner, VirtualStator):
         lacks = op.e - v_0 - 1j * omega_0 * c["L_f"] * i_0
         i_ref_0 = i_0 if inner.k_ci > 0.0 else i_0 + lacks / c["k_c"]
         turn = 1j * omega_0 * c["half_turn"]

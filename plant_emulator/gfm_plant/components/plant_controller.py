@@ -158,6 +158,7 @@ class PlantController(Dynamic):
 
     title: ClassVar = "Plant controller"
     example: ClassVar = {
+        "grid": "far",
         "lines": {"feeder": {"start": "bus", "end": "far", "L": 0.1, "R": 0.01}},
         "plant_controllers": {"x": {"line": "feeder", "node": "bus"}},
     }
