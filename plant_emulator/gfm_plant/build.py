@@ -91,7 +91,7 @@ def make_network(
     """
     each = [*parts.components(), *_cores(converters)]
     elements = [element for _, name, one in each for element in one.elements(name)]
-    names = [*converters, *(element.name for element in elements)]
+    names = [*converters, *(element.name for element in elements), *parts.plant_controllers]
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         raise ValueError(f"network: {twice[0]} is the name of two parts")
     opened = frozenset(name for _, name, one in each if not getattr(one, "closed", True))

@@ -19,13 +19,11 @@ from gfm_runtime.by_address import call_at, on_stack
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.impedance import estimate
 from gfm_runtime.kernel import advance, look
-from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, group, names
+from gfm_runtime.signals import NU, NU_INNER, NY, NY_INNER, SET_HIGH, SET_LOW, SET_REF, group
 from gfm_runtime.states import BAD_U, BAD_Y, PLANT_TRIP, READY, RUNNING, SAFE, STALE
 from gfm_runtime.switchover import change_law, settle_into
 
 MAX_STAGES = 8
-_SET_LOW, _SET_HIGH = tuple(s.low for s in group("set")), tuple(s.high for s in group("set"))
-_SET_REF = tuple(names("ref").index(s.name.replace("set", "ref")) for s in group("set"))
 
 controller_dtype = np.dtype(
     [
@@ -154,8 +152,8 @@ def take_set_points(c, y, own):
     from this tick on: those that are numbers within the signal table's range."""
     for j in range(len(y) - own):
         value = y[own + j]
-        if _SET_LOW[j] <= value <= _SET_HIGH[j]:
-            c.ref_target[_SET_REF[j]], c.ref_rate[_SET_REF[j]] = value, 0.0
+        if SET_LOW[j] <= value <= SET_HIGH[j]:
+            c.ref_target[SET_REF[j]], c.ref_rate[SET_REF[j]] = value, 0.0
 
 
 @inlined

@@ -40,10 +40,9 @@ from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller
-from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, Vector, carried, names
+from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, SET_REF, Vector, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
-_SET = [REF_NAMES.index(name.replace("set", "ref")) for name in names("set")]
 ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
 
 
@@ -178,7 +177,7 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
                 check_dc_side(plant.par[k : k + 1], law)
         x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
         plant.start(x, u, rests)
-        begin_set_points(plant, np.stack(refs)[:, _SET])
+        begin_set_points(plant, np.stack(refs)[:, SET_REF])
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"
         raise UserError(f"{where}: {problem}") from None

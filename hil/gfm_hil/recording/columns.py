@@ -289,7 +289,7 @@ _FLOWS = {
     "Q": ("Q", "p.u. (S_n)", "reactive power"),
     "i_re": (r"\Re i", "p.u. (S_n/V_n)", "current, real part in the frame that turns at omega_n"),
     "i_im": (r"\Im i", "p.u. (S_n/V_n)", "current, imaginary part in that frame"),
-    "omega": (r"\omega", "p.u. (f_n)", "speed, or frequency of the PLL,"),
+    "omega": (r"\omega", "p.u. (f_n)", "speed, or frequency by a PLL or meter,"),
     "V": ("V", "p.u. (V_n)", "voltage"),
     "P_set": ("P_{set}", "p.u. (S of the plant)", "set-point of the power"),
     "Q_set": ("Q_{set}", "p.u. (S of the plant)", "set-point of the reactive power"),

@@ -29,7 +29,7 @@ from gfm_runtime.signals import COUNTS, INNER, PLAIN, REF_NAMES, SET_POINTS, tab
 #: default of ``link.peer_timeout_s`` by mode: real time cannot wait; in lockstep simulated time
 #: stands still, and a busy machine may delay a side by seconds
 PEER_TIMEOUT_S = {"realtime": 0.5, "lockstep": 20.0}
-_WITH_COUNTS = ("shm", "zmq")  # links, with set-points too
+_WITH_MORE = ("shm", "zmq")  # links whose frames have room for counts and set-points
 _MOST_FLOWS = 3500  # columns of a network, in a file of signals
 INPROC = "inproc"  # no link: both sides in one compiled loop
 
@@ -462,15 +462,15 @@ class Scenario(StrictSchema):
             options = kind.options.model_validate(link.options)
             where = f"network.converters.{name}.link" if name else "link"
             try:
-                if self.exchanged >= COUNTS and link.type not in _WITH_COUNTS:
-                    what = (
-                        "counts, which laws with [measure] and [modulate] exchange"
-                        if self.signal_set == COUNTS
-                        else "set-points, which network.plant_controllers send"
-                    )
+                more = {
+                    "counts, which laws with [measure] and [modulate] exchange": COUNTS,
+                    "set-points, which network.plant_controllers send": SET_POINTS,
+                }
+                lacks = [what for what, bit in more.items() if self.exchanged & bit]
+                if lacks and link.type not in _WITH_MORE:
                     problems.append(
-                        f"{where}.type = {link.type!r}: carries no {what}; use"
-                        f" {', '.join(_WITH_COUNTS)} or {INPROC}"
+                        f"{where}.type = {link.type!r}: carries no {lacks[0]}; use"
+                        f" {', '.join(_WITH_MORE)} or {INPROC}"
                     )
                     continue
                 kind.check(options.of_run(self.signal_set), self.T_s)

@@ -34,7 +34,7 @@ from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.steady_state import NoEquilibrium
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import group
+from gfm_runtime.signals import SET_HIGH, SET_LOW
 
 if TYPE_CHECKING:
     from gfm_plant.network import Network
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 P_SET, Q_SET, V_SET = range(3)
 """Places among the set-points, the group ``set`` of the signal table."""
-_RANGES = {s.name: (s.low, s.high) for s in group("set")}
-_LOW, _HIGH = zip(*_RANGES.values(), strict=True)
 MEASURED = ("V", "omega")
 """What a run records of it besides power and current: size and speed of the voltage; then its
 commands P_set and X."""
@@ -125,10 +123,10 @@ def _arrive(n: Any, now: Any, one: Any) -> None:
         if of[k] == one.number:
             if one.sends_P != 0:
                 value = begin[k, P_SET] + P - one.begin[0]
-                to[k, P_SET] = _within(value, _LOW[P_SET], _HIGH[P_SET])
+                to[k, P_SET] = _within(value, SET_LOW[P_SET], SET_HIGH[P_SET])
             if one.sends_X != 0:
                 value = begin[k, one.X] + X - one.begin[1]
-                to[k, one.X] = _within(value, _LOW[one.X], _HIGH[one.X])
+                to[k, one.X] = _within(value, SET_LOW[one.X], SET_HIGH[one.X])
 
 
 @compiled
@@ -201,7 +199,7 @@ class PlantController(Dynamic):
         None, description="power out of the plant, p.u. of its rating; what it is at the start"
     )
     Q_ref: float | None = Field(None, description="reactive power, likewise")
-    V_ref: float | None = Field(None, gt=0, le=2, description="V_m, p.u., likewise")
+    V_ref: float | None = Field(None, description="V_m, p.u., likewise")
     omega_ref: float = Field(1.0, ge=0.8, le=1.2, description="frequency, p.u.")
     T_fltr: NonNegative = Field(0.02, description="lag of the measured V and Q, s")
     T_p: NonNegative = Field(0.02, description="lag of the measured P, s")
@@ -230,9 +228,11 @@ class PlantController(Dynamic):
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:
-        for x, name in (("P", "P_set"), ("Q", "Q_set"), ("V", "V_set")):
-            low, high = _RANGES[name]
+        for x, low, high in zip("PQV", SET_LOW, SET_HIGH, strict=True):
             least, most = getattr(self, f"{x}_min"), getattr(self, f"{x}_max")
+            ref = getattr(self, f"{x}_ref")
+            if ref is not None and not low <= ref <= high:
+                raise ValueError(f"{x}_ref = {ref:g}: must lie in [{low:g}, {high:g}]")
             if not low <= least < most <= high:
                 raise ValueError(
                     f"{x}_min = {least:g}, {x}_max = {most:g}: must rise within [{low:g}, {high:g}]"

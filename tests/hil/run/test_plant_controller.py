@@ -222,6 +222,7 @@ def test_over_a_link_every_bit_is_that_in_process(link: str, tmp_path: Path) -> 
         ({"converters": ["A", "A"]}, {}, "'A' has another plant controller already"),
         ({"period_s": 0.00015}, {}, "park.period_s = 0.00015: must be a multiple of T_s"),
         ({"delay_s": 9.0}, {}, "park.delay_s = 9: at most 63 cycles"),
+        ({"P_ref": 2.5}, {}, "P_ref = 2.5: must lie in [-2, 2]"),
         ({"P_max": 3.0}, {}, "P_min = 0, P_max = 3: must rise within [-2, 2]"),
         ({"K_i": 0.0, "K_ig": 0.0}, {}, "K_p, K_i, K_pg and K_ig are 0: it would send nothing"),
         ({}, {"link": {"type": "can"}}, "carries no set-points"),
@@ -240,6 +241,13 @@ def test_what_it_cannot_do_is_refused(park: Any, more: dict[str, Any], named: st
     with pytest.raises(UserError) as problem:
         load_scenario(network(park, **more))
     assert named in str(problem.value)
+
+
+def test_its_name_is_no_other_part_s() -> None:
+    content = network()
+    content["network"]["plant_controllers"] = {"feeder": PARK}
+    with pytest.raises(UserError, match="feeder is the name of two parts"):
+        load_scenario(content)
 
 
 @pytest.mark.full

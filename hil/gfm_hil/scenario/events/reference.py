@@ -68,8 +68,8 @@ class Reference(ControllerEvent):
 
     def check_now(self, target: EventTarget) -> None:
         super().check_now(target)
-        if found := self.misfits(target.scenario):
-            raise ValueError(found[0])
+        if problems := self.misfits(target.scenario):
+            raise ValueError(problems[0])
 
     def carry_out(self, target: EventTarget) -> None:
         for name, value in self.values().items():
