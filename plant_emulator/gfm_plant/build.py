@@ -12,6 +12,7 @@ from gfm_plant.bridge import TOPOLOGIES, bands
 from gfm_plant.circuit import GROUND, Branch, Capacitor, Shunt
 from gfm_plant.components import DYNAMIC, NetworkParts
 from gfm_plant.components.finite_grid import FiniteGrid
+from gfm_plant.components.grid_following import GridFollowing
 from gfm_plant.components.line import Line
 from gfm_plant.components.part import Component, Dynamic, Fed, Terminal
 from gfm_plant.components.plant_controller import PlantController
@@ -151,6 +152,7 @@ def _make(
         ((name, one) for _, name, one in each if isinstance(one, Fed)),
         key=lambda item: not item[1].is_voltage,
     )
+    supervisors = [(name, one) for _, name, one in each if isinstance(one, PlantController)]
     wiring = Wiring(
         first.bases.omega_b,
         tuple(units),
@@ -161,7 +163,7 @@ def _make(
         grid_node,
         opened=opened,
         recorded=recorded,
-        supervisors=tuple((name, x) for _, name, x in each if isinstance(x, PlantController)),
+        supervisors=tuple(name for name, _ in supervisors),
     )
     _check_paths(wiring)
     dynamic = [(f"network.{table}", n, x) for table, n, x in each if isinstance(x, Dynamic)]
@@ -187,6 +189,7 @@ def _make(
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
     st["phase_seen"] = st["phase_sums"] = math.nan
     network.net["conversions"] = conversions
+    network.net["followers"] = any(one.commands_any(converters) for _, one in supervisors)
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
@@ -279,7 +282,7 @@ def _network(
             sum(len(one.columns) for one in wiring.recorded),
         ),
         len(par) + 1 if port else 0,
-        bool(wiring.supervisors),
+        len(par) + len(wiring.neighbours) if wiring.supervisors else 0,
     )  # two states more for a fault within a branch
     net["omega_b"], net["T_s"] = wiring.omega_b, T_s
     _pack_timing(par, net, cuts)
@@ -301,7 +304,8 @@ def _network(
             if isinstance(one, Fed):
                 record["source"] = places[one.sources(name)[0]]
             elif isinstance(one, PlantController):
-                one.place(name, record, k + 1, wiring, net["supervisor"][0])
+                neighbours = parts[DYNAMIC.index(GridFollowing)]
+                one.place(name, record, k + 1, wiring, net["supervisor"][0], neighbours)
     net["n_dynamic"] = len(dynamic)
     return Network(par, st, net, now, tuple(parts), wiring)
 

@@ -109,7 +109,8 @@ _NET: _Arrays = {
     "flow_G": (float, ("n_flows",)),
     "flow_turns": (int, ("n_flows",)),  # the source whose speed is recorded; -1: it has none
     "flow_more": (int, ("n_flows",)),  # columns after these that a component writes
-    "supervisor": (int, ("n_followers",)),  # by converter its plant controller, from 1 on; 0: none
+    # by converter, then by grid-following neighbour, its plant controller, from 1 on; 0: none
+    "supervisor": (int, ("n_commanded",)),
     # of a large plant, see `sparse.Sparse`, of each contact its axis alpha and its axis beta: how
     # many states, sums for the voltages, rows of ``extra_at``, sums on the way in, and sums of no
     # more than two, of three and of four entries; and of each node whose voltage is looked at its
@@ -178,9 +179,10 @@ _NOW: _Arrays = {
     "flow_i": (complex, ("n_flow_sources",)),
     "flow_omega": (float, ("n_flow_sources",)),  # the speeds of components with such, p.u.
     "flow_row": (float, ("n_flow_columns",)),  # as recorded at the last look
-    # set-points of plant controllers by converter, p.u. of it: P, Q, V; NaN: none
-    "set_points": (float, ("n_followers", 3)),
-    "set_begin": (float, ("n_followers", 3)),  # its references at the start
+    # set-points of plant controllers by converter, then by grid-following neighbour, p.u. of it:
+    # P, Q, V; NaN: none
+    "set_points": (float, ("n_commanded", 3)),
+    "set_begin": (float, ("n_commanded", 3)),  # its references at the start
     "halfway": (complex, ("n_phasors",)),  # in the middle of a piece
     "w_before": (complex, ("n_w",)),  # at the last tick
     "unit_before": (complex, ("n_s",)),
@@ -250,6 +252,7 @@ net_dtype = _header(
         # the address of the records themselves, as a tuple of arrays, and that tuple
         ("records", "i8"),
         ("in_memory", "i8", (_MOST_WORDS,)),
+        ("followers", "i8"),  # whether converters have set-points of plant controllers
         ("conversions", "i8"),  # of the A/D at the phases in a period
         ("sparse", "i8"),  # whether it is large: solved by `sparse`, and without modes
         ("joins", "i8"),  # a converter that is reset starts in the network as it is by then
@@ -354,7 +357,7 @@ def make_net_and_now(
     entries: int = 0,
     flows: tuple[int, int, int, int] = (0, 0, 0, 0),
     ports: int = 0,
-    followers: bool = False,
+    commanded: int = 0,
 ) -> tuple[Record, Record]:
     """Return a network's parameters and state, shape (1,) each, zero but for lengths and places.
 
@@ -373,7 +376,7 @@ def make_net_and_now(
         flows: recorded terminals, their nodes, and currents that these are sums of, at most, and
             columns of all.
         ports: rows of circuits with tables of a `port`.
-        followers: whether converters have set-points of plant controllers.
+        commanded: converters and neighbours that may have set-points of plant controllers.
     """
     modes, circuits = 2 * states - zeros, MOST_CONTACTS * (converters + 1) + 1
     if entries:
@@ -387,7 +390,7 @@ def make_net_and_now(
         "n_flows": flows[0], "n_flow_nodes": flows[1], "n_flow_sums": flows[2],
         "n_flow_sources": sources if flows[0] else 0, "n_flow_columns": flows[3],
         "n_flow_ends": flows[0] + 1 if flows[0] else 0,
-        "n_followers": converters if followers else 0,
+        "n_commanded": commanded,
         "n_units": units, "n_rates": circuits if units else 0,
         "n_q": modes, "n_poles": breakers if modes else 0, "n_joint": breakers + 1,
         "n_sparse": 2 * MOST_CONTACTS if entries else 0, "n_sum": entries,

@@ -20,7 +20,7 @@ from gfm_runtime.signals import N_SET, NY, NY_INNER
 def plant_set_points(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
     """Write the set-points of converter k's plant controller to the end of y, if the network has
     one: (P_set, Q_set, V_set), p.u. of the converter, NaN where it sends none."""
-    if plant.net[0].n_followers > 0:
+    if plant.net[0].followers > 0:
         points = field(plant.now[0], "set_points")
         for j in range(N_SET):
             y[len(y) - N_SET + j] = points[k, j]

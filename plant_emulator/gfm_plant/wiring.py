@@ -32,8 +32,8 @@ from gfm_plant.circuit import (
     rest,
     without_ends,
 )
+from gfm_plant.components.grid_following import GridFollowing
 from gfm_plant.components.part import Fed, Terminal, emf
-from gfm_plant.components.plant_controller import PlantController
 from gfm_plant.contacts import zero_circuit
 from gfm_plant.names import FAULTED_PHASES
 
@@ -225,7 +225,7 @@ class Wiring:
     check: Check | None = None  # the synchro-check that waits to close a breaker, or None
     recorded: tuple[Terminal, ...] = ()  # where the run records currents and powers
     led: bool = False  # whether another part of the plant sets the frequency, see `parted`
-    supervisors: tuple[tuple[str, PlantController], ...] = ()  # plant controllers by their names
+    supervisors: tuple[str, ...] = ()  # names of the plant controllers
 
     @cached_property
     def order(self) -> tuple[str, ...]:
@@ -254,6 +254,11 @@ class Wiring:
         ends += [sink.node for sink in self.sinks]
         within = {GROUND, *(unit.terminal for unit in self.units)}  # which a core may be at
         return tuple(dict.fromkeys(node for node in ends if node not in within))
+
+    @property
+    def neighbours(self) -> tuple[str, ...]:
+        """The names of the neighbours that follow the grid."""
+        return tuple(name for name, one in self.fed if isinstance(one, GridFollowing))
 
     @property
     def recorded_nodes(self) -> tuple[str, ...]:

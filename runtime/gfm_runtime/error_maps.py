@@ -24,6 +24,8 @@ from gfm_runtime.compiled import inlined
 LINEAR, DC_ENERGY, DVOC, HYBRID_ANGLE = 0, 1, 2, 3
 
 ERROR_MAPS = {"linear": LINEAR, "dc-energy": DC_ENERGY, "dvoc": DVOC, "hybrid-angle": HYBRID_ANGLE}
+#: by map the references that move errors besides their own, and the columns of these, zero-based
+MAPPED = {"dvoc": {"V_ref": {1, 3}}, "hybrid-angle": {"Q_ref": {1}, "V_ref": {1}}}
 #: maps across a line, which need its R and X
 WITH_IMPEDANCE = ("hybrid-angle",)
 

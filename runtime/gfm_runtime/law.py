@@ -17,6 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from gfm_runtime.counts import Counts
 from gfm_runtime.elements import INTEGRATOR, ZERO, Element, stable
+from gfm_runtime.error_maps import MAPPED
 from gfm_runtime.errors import LawError, Mistakes, meant
 from gfm_runtime.inner import InnerStage
 from gfm_runtime.signals import NU, NY, REF_NAMES, U_NAMES
@@ -144,6 +145,17 @@ class BuiltLaw:
         """The element of ``"phi"`` or ``"psi"`` at a cell, ZERO where there is none."""
         cells = self.phi if matrix == "phi" else self.psi
         return cells.get(cell, ZERO)
+
+    def takes(self, reference: str) -> bool:
+        """Whether a reference, by its name, moves its commands."""
+        others = MAPPED.get(self.error_map, {}).get(reference, set())
+        columns = {REF_NAMES.index(reference), *others}
+        rows = (0, 1, 2) if self.inner is None else self.inner.rows
+        return (
+            reference in (self.u_0[row] for row in rows)
+            or any(column in columns and not x.is_zero for (_, column), x in self.phi.items())
+            or (self.inner is not None and reference in self.inner.references)
+        )
 
     def dynamic(self, row: int | None = None) -> str:
         """The elements with states of one row, or of all, by the paper's names."""

@@ -137,6 +137,7 @@ def names(name: Group) -> tuple[str, ...]:
 Y_NAMES, U_NAMES, REF_NAMES, D_NAMES = names("y"), names("u"), names("ref"), names("d")
 #: of the set-points: their places among the references, and between which values each is taken
 SET_REF = tuple(REF_NAMES.index(name.replace("set", "ref")) for name in names("set"))
+P_SET, Q_SET, V_SET = range(N_SET)
 SET_LOW, SET_HIGH = tuple(s.low for s in group("set")), tuple(s.high for s in group("set"))
 
 

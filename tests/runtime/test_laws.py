@@ -17,7 +17,7 @@ from gfm_runtime import (
 )
 from gfm_runtime.elements import IF, PD, Element, P, union
 from gfm_runtime.lawfile import ElementSpec
-from gfm_runtime.signals import NU, NY
+from gfm_runtime.signals import NU, NY, REF_NAMES
 
 from ..support.files import text_of
 from ..support.laws import LAWS, REF, Running
@@ -224,6 +224,20 @@ def test_droop_5_is_vsg_2_from_p_and_not_from_p_ref():
         np.testing.assert_allclose(answer(name, 1, on_reference=False), -lag, atol=1e-9)
     np.testing.assert_allclose(answer("vsg-2", 1, on_reference=True), lag, atol=1e-9)
     np.testing.assert_allclose(answer("droop-5", 1, on_reference=True), 0.01, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_takes_the_references_that_move_what_it_commands(name):
+    law, y = LAWS[name], REF + np.array([0.01, -0.02, 0.0, 0.03, -0.01])
+    loop = discretise(law, 1e-4)
+
+    def u(ref):
+        return Running.of(loop).unlimited().settle(3, ref, y)
+
+    for k, reference in enumerate(REF_NAMES):
+        moved = (u(REF + 0.01 * (np.arange(NY) == k)) != u(REF)).any()
+        followed = reference in law.u_0  # by u_0, which is not of the step
+        assert law.takes(reference) == (moved or followed)
 
 
 @pytest.mark.parametrize(("name", "start"), [("mimo-gfm-scheduled", 0), (THROUGH, 1)])

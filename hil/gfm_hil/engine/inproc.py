@@ -148,7 +148,7 @@ def _run_ticks(plant, stack, places, start, stop, first, survives_trip, plan, ke
             trips += tripped
             mine, estimate = ctl[i : i + 1], est[i : i + 1]
             if not stands_still(plan, k):
-                if plant.net[0].n_followers > 0:
+                if plant.net[0].followers > 0:
                     take_set_points(ctl[i], field(plant.now[0], "set_points")[i], 0)
                 answer(mine, laws[stack.row[i]], states[i], estimate, y[i], u[i], tripped != 0)
             other = row_at(places.controller[i], widths[1], k - first)

@@ -287,6 +287,7 @@ def check_scenario(
         for member in each:
             for law in member.laws():
                 wrong += [f"{where}: {line}" for line in _counts_mistakes(law, member)]
+        wrong += [f"{where}: {line}" for line in _plant_controller_mistakes(scenario)]
     try:
         _try_plant(scenario)
     except UserError as problem:
@@ -304,6 +305,26 @@ def _stage_mistakes(name: str | None) -> Sequence[str]:
     except LawError as problem:
         return problem.lines
     return ()
+
+
+def _plant_controller_mistakes(scenario: Scenario) -> Iterator[str]:
+    """What plant controllers send and no law takes."""
+    if scenario.network is None:
+        return
+    for name, one in scenario.network.plant_controllers.items():
+        members = one.converters or [*scenario.each]
+        if not scenario.each.keys() >= {*members}:
+            continue  # a neighbour takes P and Q
+        own = [scenario.each[member] for member in members]
+        files = [load_law(law, x.inner, x.counts) for x in own for law in x.laws()]
+        laws = [law for file in files for law in file.laws]
+        for reference in one.sent():
+            if not any(law.takes(reference) for law in laws):
+                names = ", ".join(sorted({law.name for law in laws}))
+                yield (
+                    f"network.plant_controllers.{name}: sends {reference}, which none of its laws"
+                    f" takes: {names}"
+                )
 
 
 def _law_mistakes(law: str, scenario: Scenario) -> Sequence[str]:

@@ -400,7 +400,8 @@ class Scenario(StrictSchema):
     @property
     def exchanged(self) -> int:
         """The signals of frames, ``signal_set`` and with a plant controller ``SET_POINTS``."""
-        sent = self.network is not None and bool(self.network.plant_controllers)
+        each = {} if self.network is None else self.network.plant_controllers
+        sent = any(one.commands_any(self.converters) for one in each.values())
         return self.signal_set + SET_POINTS * sent
 
     @property
@@ -445,7 +446,7 @@ class Scenario(StrictSchema):
                 f"cores = {self.cores}: with link.type = {INPROC!r} only; over links each loop has"
                 " a processor of its own"
             )
-        if self.cores is not None and self.exchanged & SET_POINTS:
+        if self.cores is not None and self.network and self.network.plant_controllers:
             problems.append(f"cores = {self.cores}: cannot go with network.plant_controllers")
         if kinds == {INPROC} and self.mode == "realtime":
             problems.append("link.type = 'inproc': runs in lockstep only; use zmq or shm")

@@ -28,6 +28,7 @@ from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.solution import draw
 from gfm_runtime.compiled import compiled
+from gfm_runtime.signals import P_SET, Q_SET
 
 THETA, X, I_D, I_Q, V = range(5)
 """Its states."""
@@ -61,6 +62,15 @@ def _drawn(one: Any, s: Any) -> complex:
     """Return the current that it draws, p.u. of the network, in the common frame."""
     cos, sin = math.cos(s[THETA]), math.sin(s[THETA])
     return complex(-one.S * (s[I_D] * cos - s[I_Q] * sin), -one.S * (s[I_D] * sin + s[I_Q] * cos))
+
+
+@compiled
+def _take_set_points(n: Any, now: Any, one: Any, c: int, part: int) -> None:
+    """Take P and Q of its plant controller, if it has one."""
+    if one.follower >= 0:
+        points = field(now, "set_points")
+        P, Q = points[one.follower, P_SET], points[one.follower, Q_SET]
+        one.P, one.Q = (P if P == P else one.P), (Q if Q == Q else one.Q)
 
 
 @compiled
@@ -140,7 +150,7 @@ class GridFollowing(Drawing):
     lacks: ClassVar = "{} brings a current, so the node needs a bank of network.capacitors"
     record: ClassVar = np.dtype(
         [
-            *DRAWN,
+            *DRAWN, ("follower", "i8"),  # its place among the set-points; -1: it has none
             *((x, "f8") for x in ("S", "P", "Q", "k_p", "k_i", "T_i", "I_max", "least_v2")),
             *((x, "f8") for x in ("k_V", "band", "T_V")),
             *((x, "f8", (N_STATES,)) for x in ("s", "kept", "rate", "guess")),
@@ -149,8 +159,8 @@ class GridFollowing(Drawing):
         align=True,
     )  # fmt: skip
     hooks: ClassVar = {
-        "keep": _keep, "drive": _draw, "middle": see_middle, "end": _end, "go_back": _go_back,
-        "flow": _flow,
+        "keep": _keep, "begin": _take_set_points, "drive": _draw, "middle": see_middle,
+        "end": _end, "go_back": _go_back, "flow": _flow,
     }  # fmt: skip
 
     node: str = Field(min_length=1, description="where it is; one with a capacitor bank")
@@ -183,7 +193,7 @@ class GridFollowing(Drawing):
                 )
         for name in ("S", "P", "Q", "k_p", "k_i", "T_i", "I_max", "k_V", "band", "T_V"):
             record[name] = getattr(self, name)
-        record["least_v2"] = self.V_least**2
+        record["least_v2"], record["follower"] = self.V_least**2, -1
 
     def brings(self, v: complex) -> complex:
         """Its current at rest, p.u. of its rating, at a voltage v."""

@@ -21,7 +21,7 @@ the start, and by how much P_set or X has moved since, in p.u. of its own rating
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -29,19 +29,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from gfm_plant.components.grid_following import GridFollowing, X
 from gfm_plant.components.part import Dynamic, Terminal
 from gfm_plant.layout import field
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_plant.steady_state import NoEquilibrium
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import SET_HIGH, SET_LOW
+from gfm_runtime.signals import P_SET, Q_SET, SET_HIGH, SET_LOW, V_SET
 
 if TYPE_CHECKING:
     from gfm_plant.network import Network
     from gfm_plant.wiring import Wiring
 
-P_SET, Q_SET, V_SET = range(3)
-"""Places among the set-points, the group ``set`` of the signal table."""
 MEASURED = ("V", "omega")
 """What a run records of it besides power and current: size and speed of the voltage; then its
 commands P_set and X."""
@@ -152,7 +151,7 @@ class PlantController(Dynamic):
     """A plant controller: it holds the power of a plant and its voltage or reactive power at the
     point of connection, with droop by frequency and voltage, by set-points of P, and of Q or V,
     that it sends to the controllers of its converters in every cycle. They arrive after a delay,
-    and are the references of any law from then on."""
+    and are the references of any law from then on, or P and Q of a grid-following neighbour."""
 
     title: ClassVar = "Plant controller"
     example: ClassVar = {
@@ -187,7 +186,10 @@ class PlantController(Dynamic):
         None, min_length=1, description="the end of it on the side of the plant; node if none"
     )
     converters: list[str] | None = Field(
-        None, min_length=1, description="names of those that it sends set-points to; all if none"
+        None,
+        min_length=1,
+        description="names of those that it sends set-points to, grid-following neighbours among "
+        "them; all converters, and no neighbours, if none",
     )
     period_s: Positive = Field(0.1, le=3600, description="its cycle, s")
     delay_s: NonNegative = Field(
@@ -253,6 +255,10 @@ class PlantController(Dynamic):
         """The references that it commands."""
         return ["P_ref"] * (self.K_pg + self.K_ig > 0) + [self.sends] * (self.K_p + self.K_i > 0)
 
+    def commands_any(self, converters: Iterable[str]) -> bool:
+        """Whether it sends set-points to any of these converters."""
+        return self.converters is None or not {*self.converters}.isdisjoint(converters)
+
     def measures(self, name: str, ends: Mapping[str, Sequence[Terminal]]) -> Terminal:
         """Where it measures.
 
@@ -303,16 +309,21 @@ class PlantController(Dynamic):
         refs = self.P_ref, self.Q_ref, self.V_ref, self.omega_ref
         record["ref"] = [math.nan if ref is None else ref for ref in refs]
 
-    def place(self, name: str, record: Any, number: int, wiring: Wiring, supervisor: Any) -> None:
+    def place(
+        self, name: str, record: Any, number: int, wiring: Wiring, supervisor: Any, neighbours: Any
+    ) -> None:
         """Set where it measures, and which converters are its own.
 
         Args:
             name: its own.
             number: from 1 on.
-            supervisor: by converter the number of its plant controller, 0: it has none.
+            supervisor: by converter, then by neighbour, the number of its plant controller, 0: it
+                has none.
+            neighbours: the records of those that follow the grid.
 
         Raises:
-            ValueError: there is no such converter, or it has another plant controller.
+            ValueError: there is no such converter, or it has another plant controller, or does not
+                take what this one sends.
         """
         row = 0
         for terminal in wiring.recorded:
@@ -320,40 +331,54 @@ class PlantController(Dynamic):
                 record["row"] = row + len(terminal.columns) - len(terminal.more)
                 record["node"] = wiring.recorded_nodes.index(terminal.node)
             row += len(terminal.columns)
-        names = [unit.name for unit in wiring.units]
-        at = f"network.plant_controllers.{name}.converters"
-        for one in self.converters or names:
+        own = [unit.name for unit in wiring.units]
+        names = [*own, *wiring.neighbours]
+        at = f"network.plant_controllers.{name}"
+        for one in self.converters or own:
             if one not in names:
-                raise ValueError(f"{at}: {one!r} must be one of {names}")
-            if supervisor[names.index(one)]:
-                raise ValueError(f"{at}: {one!r} has another plant controller already")
-            supervisor[names.index(one)] = number
+                raise ValueError(f"{at}.converters: {one!r} must be one of {names}")
+            k = names.index(one)
+            if supervisor[k]:
+                raise ValueError(f"{at}.converters: {one!r} has another plant controller already")
+            supervisor[k] = number
+            if k >= len(own):
+                neighbours["follower"][k - len(own)] = k
+                if "V_ref" in self.sent():
+                    raise ValueError(
+                        f'{at}.sends = "V_ref": {one} follows the grid and takes "Q_ref" only'
+                    )
         record["number"] = number
 
 
 def begin_set_points(plant: Network, references: NDArray[np.float64]) -> None:
     """Have the plant controllers begin with the references of their converters, (N, 3): P_ref,
     Q_ref and V_ref of each, p.u. of its own. Raises NoEquilibrium: one is beyond a limit."""
-    net, now = plant.net[0], plant.now[0]
-    if not net["n_followers"]:
+    net, now, neighbours = plant.net[0], plant.now[0], plant.of(GridFollowing)
+    if not net["n_commanded"]:
         return
-    now["set_begin"], now["set_points"] = references, math.nan
+    theirs = np.full((len(neighbours), 3), math.nan)
+    theirs[:, P_SET], theirs[:, Q_SET] = neighbours["P"], neighbours["Q"]
+    now["set_begin"], now["set_points"] = np.vstack([references, theirs]), math.nan
+    ratings = np.concatenate([1.0 / plant.par["current"], neighbours["S"]])
+    speeds = 1.0 + neighbours["s"][:, X] / net["omega_b"]
+    speeds = np.concatenate([plant.st["u_now"][:, 1], speeds])
     each = zip(plant.wiring.supervisors, plant.of(PlantController), strict=True)
-    for (name, one), record in each:
+    for name, record in each:
         own = net["supervisor"] == record["number"]
-        ratings = 1.0 / plant.par["current"][own]
-        record["S"] = ratings.sum()
-        mean = ratings @ now["set_begin"][own] / ratings.sum()
+        record["S"] = ratings[own].sum()
+        mean = ratings[own] @ now["set_begin"][own] / record["S"]
         begin = mean[P_SET], mean[record["X"]]
-        limits = record["P_limits"], record["X_limits"]
-        for x, value, (low, high) in zip(("P", one.sends[0]), begin, limits, strict=True):
-            if f"{x}_ref" in one.sent() and not low <= value <= high:
+        for x, sends, value, (low, high) in (
+            ("P", record["sends_P"], begin[0], record["P_limits"]),
+            ("PQV"[record["X"]], record["sends_X"], begin[1], record["X_limits"]),
+        ):
+            if sends and not low <= value <= high:
                 raise NoEquilibrium(
                     f"plant_controllers.{name}: {x}_ref of its converters, {value:g} at the start,"
                     f" must lie within {x}_min = {low:g} and {x}_max = {high:g}"
                 )
         record["begin"] = record["x"] = record["out"] = begin
-        record["m"][3] = plant.st["u_now"][own][0, 1]  # until there are two voltages
+        record["m"][3] = speeds[own][0]  # until there are two voltages
 
 
 def set_plant_reference(
@@ -371,9 +396,9 @@ def set_plant_reference(
     Raises:
         ValueError: There is no such plant controller.
     """
-    names = [one for one, _ in plant.wiring.supervisors]
+    names = plant.wiring.supervisors
     if name not in names:
-        raise ValueError(f"name = {name!r}: must be a plant controller of the network, {names}")
+        raise ValueError(f"name = {name!r}: must be a plant controller of the network, {[*names]}")
     record = plant.of(PlantController)[names.index(name)]
     for j, key in enumerate(("P_ref", "Q_ref", "V_ref", "omega_ref")):
         if key in references:

@@ -37,6 +37,7 @@ class GridFollowingStage(InnerStage):
     """A current by set-points of P and Q in the frame of a PLL, a limit, and a current loop."""
 
     rows: ClassVar = (0,)
+    references: ClassVar = ("V_dcref", "P_ref", "Q_ref")
 
     type: Literal["grid-following"] = Field("grid-following", description="kind of stage")
     f_pll: Positive = Field(10.0, description="natural frequency of the PLL, Hz")

@@ -81,6 +81,8 @@ class InnerStage(TomlTable):
 
     rows: ClassVar[tuple[int, ...]] = (0, 1, 2)
     """Rows of Phi that act, zero-based."""
+    references: ClassVar[tuple[str, ...]] = ()
+    """The references that the stage takes itself."""
 
     m: Positive = Field(PAPER_M, description="limit of abs(e) over v_dc, p.u.")
     freeze: bool = Field(

@@ -104,7 +104,8 @@ def test_its_commands_are_those_of_the_block_diagram(control: str, sends: str) -
         {"type": "grid-frequency", "t": 0.4, "f_hz": 50.3, "rate": 2.5},
         SAG,
     ]
-    done = run(network(park, events=events))
+    law = {"V_ref": "droop-3", "Q_ref": "vsg-2"}[sends]
+    done = run(network(park, events=events, law=law))
     rows, every = block_diagram(done, park), round(park["period_s"] / T_S)
     for j, name in enumerate(("P_set", sends.replace("ref", "set"))):
         recorded = column(done, f"park.{name}")
@@ -185,13 +186,61 @@ def test_an_event_gives_it_references_and_cuts_its_link() -> None:
     assert ref[9001] == pytest.approx(0.3 + sent[8001] - 0.25, abs=1e-12)
 
 
+def wind_park(park: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Converter A at the point of connection of two neighbours that follow the grid."""
+    content = network(None, **more)
+    lines = {w: {"start": f"at_{w}", "end": "hub", "L": 0.02, "R": 0.002} for w in ("w1", "w2")}
+    lines |= {"to_hub": {"start": "hub", "end": "bus", "L": 0.02, "R": 0.002}}
+    content["network"] |= {
+        "converters": {"A": {"node": "bus"}},
+        "grid_following": {
+            "w1": {"node": "at_w1", "S": 2.0, "P": 0.4, "T_i": 0.01},
+            "w2": {"node": "at_w2", "S": 1.0, "P": 0.6, "Q": 0.1, "T_i": 0.01},
+        },
+        "capacitors": {f"c{w}": {"node": f"at_{w}", "Q": 0.05} for w in ("w1", "w2")},
+        "lines": content["network"]["lines"] | {f"l_{w}": x for w, x in lines.items()},
+        "plant_controllers": {"park": {
+            "line": "l_to_hub", "node": "bus", "plant_end": "hub", "converters": ["w1", "w2"],
+            "control": "Q", "sends": "Q_ref",
+        } | park},
+        "record": ["w1", "w2"],
+    }  # fmt: skip
+    return content
+
+
+@pytest.mark.full
+def test_neighbours_that_follow_the_grid_take_its_set_points() -> None:
+    """After the delay, in p.u. of their own; the circuit may change meanwhile."""
+    park = {"period_s": 0.05, "delay_s": 0.03, "P_ref": 0.6, "Q_ref": 0.1, "K_i": 2.0, "K_ig": 2.0}
+    bump = {"type": "breaker", "t": 4.0, "name": "bump", "closed": True}
+    content = wind_park(park, duration=8.0, events=[bump])
+    load = {"node": "hub", "P": 0.2, "closed": False}
+    content["network"]["loads"] = {"bump": load}
+    done = run(content)
+    begin, S = {"w1": (0.4, 0.0), "w2": (0.6, 0.1)}, {"w1": 2.0, "w2": 1.0}
+    sent = np.stack([column(done, f"park.{x}_set") for x in "PQ"])
+    mean = sum(S[w] * np.array(begin[w]) for w in S) / 3
+    for w in S:
+        own = np.stack([column(done, f"{w}.{x}") for x in "PQ"]) / S[w]
+        assert np.ptp(own[:, :300], axis=1).max() < 1e-6
+        assert abs(own[0, 310] - begin[w][0]) > 1e-3
+        assert own[:, -1] - begin[w] == pytest.approx(sent[:, -1] - mean, abs=1e-6)
+    for x, ref in (("P", 0.6), ("Q", 0.1)):
+        assert column(done, f"park.{x}")[[39_999, -1]] / 3 == pytest.approx(ref, abs=1e-4)
+
+
+def test_the_frames_of_converters_that_it_does_not_command_are_those_without_it() -> None:
+    assert load_scenario(wind_park({}, link={"type": "can"})).exchanged == 0
+    assert load_scenario(wind_park({"converters": ["w1", "A"]})).exchanged == 4
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(
     "more", [{"inner": "cascaded"}, {"counts": "rig"}, {"law": "grid-following"}], ids=str
 )
 def test_set_points_follow_the_signals_of_stages_and_of_counts(more: dict[str, Any]) -> None:
     """The references of those runs move as they do without."""
-    park = {"period_s": 0.02, "delay_s": 0.05, "P_ref": 0.4}
+    park = {"period_s": 0.02, "delay_s": 0.05, "P_ref": 0.4, "K_i": 0.0}
     done = run(network(park, duration=0.3, **more))
     sent, ref = column(done, "park.P_set"), column(done, "A.ref_P_ref")
     assert ref[500:] == pytest.approx(0.3 + sent[1:-499] - 0.25, abs=1e-12)
@@ -220,11 +269,16 @@ def test_over_a_link_every_bit_is_that_in_process(link: str, tmp_path: Path) -> 
         ({"plant_end": "hub"}, {}, "plant_controllers.park.plant_end = 'hub'"),
         ({"converters": ["C"]}, {}, "plant_controllers.park.converters: 'C' must be one of"),
         ({"converters": ["A", "A"]}, {}, "'A' has another plant controller already"),
+        ({"converters": ["A", "w"]}, {"network": {"grid_following": {"w": {
+            "node": "bus", "S": 1.0, "P": 0.1}}, "capacitors": {"c": {"node": "bus", "Q": 0.1}}}},
+         'park.sends = "V_ref": w follows the grid and takes "Q_ref" only'),
         ({"period_s": 0.00015}, {}, "park.period_s = 0.00015: must be a multiple of T_s"),
         ({"delay_s": 9.0}, {}, "park.delay_s = 9: at most 63 cycles"),
         ({"P_ref": 2.5}, {}, "P_ref = 2.5: must lie in [-2, 2]"),
         ({"P_max": 3.0}, {}, "P_min = 0, P_max = 3: must rise within [-2, 2]"),
         ({"K_i": 0.0, "K_ig": 0.0}, {}, "K_p, K_i, K_pg and K_ig are 0: it would send nothing"),
+        ({"sends": "Q_ref"}, {}, "park: sends Q_ref, which none of its laws takes: droop-3"),
+        ({"sends": "V_ref"}, {"law": "grid-following"}, "park: sends V_ref, which none of its"),
         ({}, {"link": {"type": "can"}}, "carries no set-points"),
         ({}, {"cores": 1}, "cores = 1: cannot go with network.plant_controllers"),
         ({}, {"events": [{"type": "reference", "t": 0.1, "P_ref": 0.5}]},
@@ -238,8 +292,10 @@ def test_over_a_link_every_bit_is_that_in_process(link: str, tmp_path: Path) -> 
     ],
 )  # fmt: skip
 def test_what_it_cannot_do_is_refused(park: Any, more: dict[str, Any], named: str) -> None:
+    content = network(park) | {key: value for key, value in more.items() if key != "network"}
+    content["network"] |= more.get("network", {})
     with pytest.raises(UserError) as problem:
-        load_scenario(network(park, **more))
+        load_scenario(content)
     assert named in str(problem.value)
 
 
