@@ -95,19 +95,21 @@ def _on_stderr(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _explain_and_report(run: Run | NetworkRun) -> None:
-    """The figures and the report of a run; if it did not last because its linear loop is unstable,
-    its summary says so."""
-    if isinstance(run, Run) and run.status not in ("completed", "interrupted"):
-        from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
+def explain_and_report(run: Run | NetworkRun) -> None:
+    """Write the figures and the report of a run, and into its summary what its linear loop says of
+    it: which mode ended it, and how many missed ticks its law bears. Of a network the converters
+    come first, one by one."""
+    if isinstance(run, Run):
+        if run.scenario.network is None and run.status not in ("completed", "interrupted"):
+            from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
 
-        if why := why_it_ended(run):
-            run.summary["unstable_mode"] = why
-    if isinstance(run, Run) and run.summary["mode"] == "realtime":
-        from gfm_hil.studies.latency import in_a_row_words
+            if why := why_it_ended(run):
+                run.summary["unstable_mode"] = why
+        if run.summary["mode"] == "realtime":
+            from gfm_hil.studies.latency import in_a_row_words
 
-        if words := in_a_row_words(run):
-            run.summary["latency"] = words
+            if words := in_a_row_words(run):
+                run.summary["latency"] = words
     write_report(run)
 
 
@@ -154,7 +156,7 @@ def run(
         checked = _load(scenario, {**changes, "law": law})
         notice = notice or _silent
         command = runner.controller_program(checked, controller, ports, notice)
-        report = _explain_and_report if figures else None
+        report = explain_and_report if figures else None
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
         raise UserError("controller, ports: take a folder")
@@ -206,7 +208,7 @@ def run_network(
         name: runner.controller_program(checked.each[name], controller, ports.get(name), notice)
         for name, controller in controllers.items()
     }
-    report = write_report if figures else None
+    report = explain_and_report if figures else None
     return runner.run_network(checked, Path(folder), progress, notice, report, commands)
 
 
@@ -266,8 +268,8 @@ def recover(folder: str | Path) -> Run | NetworkRun:
     """
     folder = Path(folder)
     if converters_of(folder):
-        return NetworkRun.recover(folder, write_report)
-    return run_folder.recover(folder, write_report)
+        return NetworkRun.recover(folder, explain_and_report)
+    return run_folder.recover(folder, explain_and_report)
 
 
 def merge(
@@ -282,10 +284,10 @@ def merge(
     """
     others = [Path(one) for one in ([second] if isinstance(second, str | Path) else second)]
     if converters_of(Path(first)):
-        return NetworkRun.merge(Path(first), others, Path(folder), write_report)
+        return NetworkRun.merge(Path(first), others, Path(folder), explain_and_report)
     if len(others) != 1:
         raise UserError(f"{first}: is not of a network, whose folders may be more than two")
-    return run_folder.merge_roles(Path(first), others[0], Path(folder), write_report)
+    return run_folder.merge_roles(Path(first), others[0], Path(folder), explain_and_report)
 
 
 class Comparison(dict[str, Run]):
@@ -450,7 +452,7 @@ def _compare_in(
             watch.progress(len(made) * one.ticks + ticks, len(scenarios) * one.ticks, said)
 
         start = runner.run_network if one.parts else runner.run_scenario
-        whole = start(one, folder / name, tell, watch.notice, _explain_and_report)
+        whole = start(one, folder / name, tell, watch.notice, explain_and_report)
         made[name] = _of_converters(whole)
         if whole.status == "interrupted":
             break

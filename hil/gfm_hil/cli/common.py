@@ -321,6 +321,8 @@ def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
         f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {shown(summary['misses'])} misses",
         highlight=False,
     )
+    if "latency" in summary:
+        console.print(escape(summary["latency"]), highlight=False, soft_wrap=True)
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         console.print(escape(f"round trip [µs]: {text}"), highlight=False)

@@ -17,6 +17,7 @@ from gfm_hil.results.table import Cell, Table
 from gfm_hil.studies.linear_loop import scenario_loop
 
 _STYLES = {"green": "good", "yellow": "warn", "red": "bad"}
+_MOST_STATES = 100  # of a loop, for that sentence; time grows with their cube
 _TRIED = 50  # misses in a row at least, for the sentence of a report
 
 
@@ -35,7 +36,7 @@ def in_a_row_words(run: Run) -> str:
     it was in lockstep, or the law has no stable linear loop."""
     try:
         misses, (loop, label) = misses_of(run), scenario_loop(run.scenario, run.scenario.converter)
-        if loop.modes()[0].sigma > 0.0:
+        if len(loop.A) > _MOST_STATES or loop.modes()[0].sigma > 0.0:
             return ""
     except (UserError, ArithmeticError, ValueError):
         return ""

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.api.runs import explain_and_report
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
@@ -157,6 +159,9 @@ def test_in_real_time_a_lost_controller_trips_its_converter_and_no_other(tmp_pat
     assert lost[0]["reason"] == "no fresh u for longer than late_policy.hold allows"
     assert summary(folder / "A")["status"] == "interrupted"
     assert summary(folder / "B")["status"] == "safe"
+    survivor = gfmhil.load_run(folder / "A")
+    explain_and_report(survivor)
+    assert re.search(r"; A \(vsg-2\) bears \d+ in a row here$", survivor.summary["latency"])
 
 
 def test_an_operator_speaks_to_one_converter_and_to_the_plant(tmp_path):
