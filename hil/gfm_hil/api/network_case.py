@@ -33,6 +33,7 @@ _NEAR = 1e-6  # p.u.; how far the network's steady state may lie from the power 
 _CONVERTER = {"L_f": 0.08, "R_f": 0.003, "C_f": 0.074, "L_g": 0.2, "R_g": 0.01}
 _STORED_S = 0.03  # energy of its DC capacitor by its rating, as of the paper's converter
 _V_N, _V_DC = 690.0, 1500.0  # V
+_FILTER = 0.05  # p.u. of a static generator's rating; the capacitor of its filter
 # of the machines in Kundur's two areas, whose other values are those of a machine here
 _MACHINE = {"H": 6.5, "avr": {}}
 
@@ -92,6 +93,8 @@ def network_from(
     Each bus with generators gets one synchronous machine of order 6 with a voltage regulator and a
     governor, or what ``dynamics`` says, or the converter that is named for it, which has the rating
     and the operating point of what it replaces, or a share of both beside a machine with the rest.
+    Static generators and storages of a bus become one grid-following neighbour with the capacitor
+    of its filter, in whose place a converter may stand where there is no machine.
     Loads become constant impedances that draw at the case's voltage what they draw there, the
     charging of transformers capacitors at the buses.
 
@@ -117,7 +120,11 @@ def network_from(
         str(bus): (one, 1.0) if isinstance(one, str) else (one[0], float(one[1]))
         for bus, one in converters.items()
     }
-    feeding = [b.name for b in flow.buses if b.machine or b.name == names[flow.slack]]
+    feeding = [
+        bus.name
+        for k, bus in enumerate(flow.buses)
+        if bus.machine or bus.static_rating or k == flow.slack
+    ]
     if not laws:
         raise UserError(
             f"{flow.title}: name a bus for a converter; {', '.join(feeding)} have generators"
@@ -160,12 +167,18 @@ class _Build:
 
     def _rating(self, k: int) -> float:
         bus = self.flow.buses[k]
+        if not self._is_machine(k):
+            return bus.static_rating * self.flow.S_b
         if bus.rating is None:
             raise UserError(
                 f"{self.flow.title}: bus {bus.name}: its generator has no rating: give sn_mva or"
                 " max_p_mw"
             )
         return bus.rating * self.flow.S_b
+
+    def _is_machine(self, k: int) -> bool:
+        """Whether a machine stands at a bus, besides what follows the grid."""
+        return bool(self.flow.buses[k].machine) or k == self.flow.slack
 
     def _put(self, table: str, name: str, part: dict[str, Any]) -> None:
         self.network.setdefault(table, {})[name] = part
@@ -178,8 +191,10 @@ class _Build:
         for k, bus in enumerate(self.flow.buses):
             self._load(k)
             left = 1.0 - self.laws.get(bus.name, ("", 0.0))[1]
-            if left and k != self.grid and (bus.machine or k == self.flow.slack):
+            if left and k != self.grid and self._is_machine(k):
                 self._machine(k, left)
+            if bus.static_rating and k != self.grid:
+                self._static(k, 1.0 if self._is_machine(k) else left)
         content = {
             "title": self.flow.title,
             "description": "Made from a power-flow case. " + " ".join(self.ignored),
@@ -233,8 +248,8 @@ class _Build:
             return  # the grid holds its voltage
         if drawn.real < 0:
             raise UserError(
-                f"{self.flow.title}: bus {bus.name}: its loads draw {bus.load.real:g} p.u.; static"
-                " generators are not for a network: make them generators"
+                f"{self.flow.title}: bus {bus.name}: its loads draw {bus.load.real:g} p.u.; make"
+                " them static generators"
             )
         if drawn.real or drawn.imag > 0:
             P_Q = {"P": drawn.real, "Q": max(drawn.imag, 0.0)}
@@ -257,11 +272,23 @@ class _Build:
         values |= self.machines.get(bus.name, _MACHINE)
         self._put("synchronous_machines", f"G{bus.name}", values)
 
+    def _static(self, k: int, share: float) -> None:
+        """What follows the grid at a bus, and the capacitor of its filter, which the power flow
+        has not."""
+        bus, S = self.flow.buses[k], share * self.flow.buses[k].static_rating * self.scale
+        if not S:
+            return
+        power = bus.static / bus.static_rating - 1j * _FILTER * abs(bus.V) ** 2
+        node = {"node": self._node(k)}
+        values = {"S": S, "P": power.real, "Q": power.imag}
+        self._put("grid_following", f"F{bus.name}", node | values)
+        self._put("capacitors", f"filter{bus.name}", node | {"Q": _FILTER * S})
+
     def _converter(self, k: int, law: str, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
         name, file = f"C{bus.name}", f"converter{bus.name}.toml"
         self.files[file] = _converter_file(share * S, self.flow.f)
-        power = bus.machine * self.flow.S_b / S
+        power = (bus.machine if self._is_machine(k) else bus.static) * self.flow.S_b / S
         if self.par is None:
             self.par = _parameters(self.files[file])
         try:

@@ -15,8 +15,7 @@ _MOST_BUSES = 500  # the matrices of a network are dense
 _NEAR = 1e-6  # p.u.; a smaller current comes from rounding
 _IGNORED = {
     "controller": "they stand where the power flow leaves them",
-    "sgen": "taken off the loads of their buses",
-    "storage": "taken off the loads of their buses",
+    "motor": "impedances, as loads are",
 }
 """Tables of pandapower that a network has no counterpart of, and what becomes of them."""
 
@@ -30,6 +29,8 @@ class Bus(NamedTuple):
     shunt: complex  # admittance
     machine: complex  # what its machines bring
     rating: float | None  # of its machines
+    static: complex = 0j  # what static generators and storages bring
+    static_rating: float = 0.0  # of these
 
 
 class FlowBranch(NamedTuple):
@@ -85,6 +86,8 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     for index, name in called.items():
         names.setdefault(int(where[index]), name)
     bus, branch = ppc["bus"], ppc["branch"]
+    for k, number in enumerate(int(one) for one in bus[:, 0]):
+        names.setdefault(number, f"-open{k}")  # where a line ends at a switch
     place = {int(number): k for k, number in enumerate(bus[:, 0])}
     V = bus[:, 7] * np.exp(1j * np.radians(bus[:, 8]))
     load, shunt = (bus[:, 2] + 1j * bus[:, 3]) / S_b, (bus[:, 4] + 1j * bus[:, 5]) / S_b
@@ -95,7 +98,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
         Z = complex(row[2], row[3])
         branches.append(FlowBranch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
-    ratings = _ratings(case, where, place, S_b)
+    ratings, static = _ratings(case, where, place, S_b), _static(case, where, place, S_b)
     ignored = [
         f"{len(case[table])} {table}: {why}."
         for table, why in _IGNORED.items()
@@ -104,8 +107,8 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     if turning := int((case.trafo.shift_degree % 30 != 0).sum()):
         ignored.append(f"{turning} trafo: they turn no phase.")
     buses = [
-        Bus(names[int(row[0])], V[k], load[k], shunt[k],
-             comes[k] if k in ratings else 0j, ratings.get(k))
+        Bus(names[int(row[0])], V[k], load[k] + static.get(k, (0j, 0.0))[0], shunt[k],
+            comes[k] if k in ratings else 0j, ratings.get(k), *static.get(k, (0j, 0.0)))
         for k, row in enumerate(bus)
     ]  # fmt: skip
     for k, one in enumerate(buses):
@@ -132,6 +135,23 @@ def _ratings(
             before = ratings.get(k, 0.0)
             ratings[k] = None if own is None or before is None else before + own / S_b
     return ratings
+
+
+def _static(
+    case: Any, where: Any, place: Mapping[int, int], S_b: float
+) -> dict[int, tuple[complex, float]]:
+    """What the static generators and the storages of each bus bring, and their rating, p.u.; one
+    without a rating, or beyond it, has what it brings."""
+    found: dict[int, tuple[complex, float]] = {}
+    for table, sign in (("sgen", 1.0), ("storage", -1.0)):
+        those = case[table].join(case[f"res_{table}"], rsuffix="_res")
+        for _, row in those[those.in_service].iterrows():
+            S = sign * complex(row.p_mw_res, row.q_mvar_res) / S_b
+            own = max(abs(S), row.sn_mva / S_b if row.sn_mva > 0 else 0.0)
+            k = place[int(where[row.bus])]
+            before = found.get(k, (0j, 0.0))
+            found[k] = before[0] + S, before[1] + own
+    return {k: one for k, one in found.items() if one[1] > 0.0}
 
 
 def _load_pandapower(case: str) -> Any:

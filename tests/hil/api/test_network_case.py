@@ -75,6 +75,40 @@ def test_of_python_a_net_of_ones_own(tmp_path):
     assert network["loads"]["loadc"]["P"] * abs(case.voltages["busc"]) ** 2 == pytest.approx(5 / 6)
 
 
+@pytest.mark.full
+def test_static_generators_follow_the_grid(tmp_path):
+    """They bring what the power flow says, from under what a load draws there, and a converter may
+    take a share of them."""
+    net = small()
+    pandapower.create_sgen(net, 2, p_mw=60.0, q_mvar=5.0, sn_mva=80.0, scaling=0.5)
+    pandapower.create_storage(net, 1, p_mw=10.0, max_e_mwh=1.0)
+    for converters, left in (({"b": "droop-3"}, 1.0), ({"b": "droop-3", "c": ("vsg-2", 0.4)}, 0.6)):
+        case = gfmhil.network_from(net, converters, title="mine")
+        case.content["network"]["record"] = ["grid_following"]
+        run = gfmhil.run_network(case.save(tmp_path / f"{left}"), duration=0.02)
+        assert case.distance(tmp_path / f"{left}" / "network.toml") < 1e-8
+        flows = {x: run.flows[x][:] * 60.0 for x in ("Fc.P", "Fc.Q", "Fb.P")}  # MW of 60 MVA
+        filters = 0.05 * 80 * left * abs(case.voltages["busc"]) ** 2
+        assert flows["Fc.P"] == pytest.approx(left * 30.0, abs=1e-6)
+        assert flows["Fc.Q"] + filters == pytest.approx(left * 2.5, abs=1e-6)
+        assert flows["Fb.P"] == pytest.approx(-10.0, abs=1e-6)
+        assert case.content["network"]["grid_following"]["Fc"]["S"] == pytest.approx(left * 80 / 60)
+
+
+@pytest.mark.full
+def test_the_distribution_grid_of_cigre_with_a_converter_in_place_of_its_wind_turbine(tmp_path):
+    """CIGRE's medium-voltage grid, TF C6.04.02: cables that end at open switches, eight PV plants,
+    and taps."""
+    net = networks.create_cigre_network_mv(with_der="pv_wind")
+    case = gfmhil.network_from(net, {"Bus 7": "vsg-2"}, "grid", title="CIGRE MV")
+    run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.1)
+    assert case.distance(tmp_path / "net" / "network.toml") < 1e-8
+    assert [*case.content["network"]["grid_following"]] == [
+        *(f"FBus {k}" for k in (3, 4, 5, 6, 8, 9, 10, 11))
+    ]
+    assert run.status == "completed" and np.ptp(run["CBus 7"].signals["p"]) < 1e-9
+
+
 def without_slack(net):
     net.ext_grid.in_service = False
 
@@ -92,7 +126,7 @@ def too_much(net):
 
 
 def generates(net):
-    pandapower.create_sgen(net, 2, p_mw=60.0)
+    net.load["p_mw"] = -6.0
 
 
 @pytest.mark.parametrize(
@@ -102,7 +136,7 @@ def generates(net):
         (island, "mine: bus c has no path to the slack"),
         (without_rating, "mine: bus b: its generator has no rating: give sn_mva or max_p_mw"),
         (too_much, "mine: its power flow does not converge: "),
-        (generates, "mine: bus c: its loads draw -0.1 p.u.; static generators"),
+        (generates, "mine: bus c: its loads draw -0.06 p.u.; make them static generators"),
     ],
 )
 def test_what_no_network_can_be_made_of(change, line):
