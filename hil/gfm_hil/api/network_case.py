@@ -2,6 +2,7 @@
 point of the power flow."""
 
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -153,6 +154,9 @@ class _Build:
         self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool, machines: Machines
     ) -> None:
         self.flow, self.laws, self.machines = flow, laws, machines.at
+        whole = [bus.name for bus in flow.buses]
+        short = [re.sub(r"(?i)^bus[\s_-]*(?=.)", "", name) for name in whole]
+        self.names = short if len({*short}) == len(short) else whole  # in those of the parts
         first, name = next((k, bus.name) for k, bus in enumerate(flow.buses) if bus.name in laws)
         self.S_b = laws[name][1] * self._rating(first)
         self.scale = flow.S_b / self.S_b
@@ -163,7 +167,7 @@ class _Build:
         self.network: dict[str, Any] = {} if self.grid is None else {"grid": self._node(self.grid)}
 
     def _node(self, k: int) -> str:
-        return f"bus{self.flow.buses[k].name}"
+        return f"bus{self.names[k]}"
 
     def _rating(self, k: int) -> float:
         bus = self.flow.buses[k]
@@ -211,7 +215,7 @@ class _Build:
         feeding = {k for k, bus in enumerate(self.flow.buses) if bus.machine}
         names = Counter[str]()
         for branch in self.flow.branches:
-            a, b = (self.flow.buses[k].name for k in (branch.start, branch.end))
+            a, b = (self.names[k] for k in (branch.start, branch.end))
             kind = "transformer" if branch.transformer else "line"
             name = f"{kind}{a}-{b}"
             names[name] += 1
@@ -253,15 +257,19 @@ class _Build:
             )
         if drawn.real or drawn.imag > 0:
             P_Q = {"P": drawn.real, "Q": max(drawn.imag, 0.0)}
-            self._put("loads", f"load{bus.name}", {"node": self._node(k), **P_Q})
+            self._put("loads", f"load{self.names[k]}", {"node": self._node(k), **P_Q})
         if shunt.real > 0:
-            self._put("loads", f"shunt{bus.name}", {"node": self._node(k), "P": shunt.real})
+            self._put("loads", f"shunt{self.names[k]}", {"node": self._node(k), "P": shunt.real})
         if shunt.imag < 0:
             self._put(
-                "loads", f"reactor{bus.name}", {"node": self._node(k), "P": 0.0, "Q": -shunt.imag}
+                "loads",
+                f"reactor{self.names[k]}",
+                {"node": self._node(k), "P": 0.0, "Q": -shunt.imag},
             )
         if capacitor:
-            self._put("capacitors", f"charging{bus.name}", {"node": self._node(k), "Q": capacitor})
+            self._put(
+                "capacitors", f"charging{self.names[k]}", {"node": self._node(k), "Q": capacitor}
+            )
 
     def _machine(self, k: int, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
@@ -270,7 +278,7 @@ class _Build:
         P = bus.machine.real * self.flow.S_b / S + R * abs(i) ** 2
         values = {"node": self._node(k), "S": share * S / self.S_b, "P": P, "V": abs(bus.V)}
         values |= self.machines.get(bus.name, _MACHINE)
-        self._put("synchronous_machines", f"G{bus.name}", values)
+        self._put("synchronous_machines", f"G{self.names[k]}", values)
 
     def _static(self, k: int, share: float) -> None:
         """What follows the grid at a bus, and the capacitor of its filter, which the power flow
@@ -281,12 +289,12 @@ class _Build:
         power = bus.static / bus.static_rating - 1j * _FILTER * abs(bus.V) ** 2
         node = {"node": self._node(k)}
         values = {"S": S, "P": power.real, "Q": power.imag}
-        self._put("grid_following", f"F{bus.name}", node | values)
-        self._put("capacitors", f"filter{bus.name}", node | {"Q": _FILTER * S})
+        self._put("grid_following", f"F{self.names[k]}", node | values)
+        self._put("capacitors", f"filter{self.names[k]}", node | {"Q": _FILTER * S})
 
     def _converter(self, k: int, law: str, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
-        name, file = f"C{bus.name}", f"converter{bus.name}.toml"
+        name, file = f"C{self.names[k]}", f"converter{self.names[k]}.toml"
         self.files[file] = _converter_file(share * S, self.flow.f)
         power = (bus.machine if self._is_machine(k) else bus.static) * self.flow.S_b / S
         if self.par is None:

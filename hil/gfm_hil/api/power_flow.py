@@ -87,7 +87,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
         names.setdefault(int(where[index]), name)
     bus, branch = ppc["bus"], ppc["branch"]
     for k, number in enumerate(int(one) for one in bus[:, 0]):
-        names.setdefault(number, f"-open{k}")  # where a line ends at a switch
+        names.setdefault(number, f"open{k}")  # where a line ends at a switch
     place = {int(number): k for k, number in enumerate(bus[:, 0])}
     V = bus[:, 7] * np.exp(1j * np.radians(bus[:, 8]))
     load, shunt = (bus[:, 2] + 1j * bus[:, 3]) / S_b, (bus[:, 4] + 1j * bus[:, 5]) / S_b
