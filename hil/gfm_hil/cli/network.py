@@ -22,8 +22,9 @@ def add(command: argparse.ArgumentParser) -> None:
     )
     read.add_argument(
         "--converter", action="append", default=[], metavar="BUS=LAW[:SHARE]",
-        help="a converter in place of the machine, or else of the static generators, at this"
-        " bus, with its law, or beside them with a share of its rating and power, such as 0.5; several times",
+        help="a converter in place of the machine, or else of the static generators, at this bus,"
+        " with its law, or beside them with a share of their rating and power, such as 0.5;"
+        " several times",
     )  # fmt: skip
     read.add_argument(
         "--slack", choices=("machine", "grid"), default="machine",
