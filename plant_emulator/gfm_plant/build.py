@@ -140,13 +140,8 @@ def _make(
     measured = any(options.lcl is not None for options, _ in converters.values())
     first = load_converter(next(iter(converters.values()))[0].converter)
     for k, (name, (options, node)) in enumerate(converters.items()):
-        one = par[k : k + 1]
-        units.append(_pack_converter_circuit(one, name, node, options, first))
-        _pack_measurement(one, options, T_s)
-        one["T_s"], one["delay"] = T_s, options.delay.samples
-        one["fraction"] = options.delay.fraction
-        _pack_protection(one, options.protection, T_s)
-        _pack_bridge(one, "plant" if len(converters) == 1 else f"{name}: plant", options, T_s)
+        where = "plant" if len(converters) == 1 else f"{name}: plant"
+        units.append(_pack_unit(par[k : k + 1], name, node, options, first, T_s, where))
     passive = [p for _, n, x in each if not isinstance(x, Fed) for p in x.elements(n)]
     fed = sorted(
         ((name, one) for _, name, one in each if isinstance(one, Fed)),
@@ -332,6 +327,25 @@ def _check_paths(wiring: Wiring) -> None:
                 f"network: {name} is at node {node!r}, which has no path to a converter; nodes with"
                 f" one are {sorted(reached)}"
             )
+
+
+def _pack_unit(
+    one: Record,
+    name: str,
+    node: str,
+    options: Plant,
+    first: ConverterParameters,
+    T_s: float,
+    where: str,
+) -> ConverterCircuit:
+    """Set what belongs to one converter alone, whose options the messages name ``where``; returns
+    its circuit."""
+    unit = _pack_converter_circuit(one, name, node, options, first)
+    _pack_measurement(one, options, T_s)
+    one["T_s"], one["delay"], one["fraction"] = T_s, options.delay.samples, options.delay.fraction
+    _pack_protection(one, options.protection, T_s)
+    _pack_bridge(one, where, options, T_s)
+    return unit
 
 
 def _pack_converter_circuit(
