@@ -343,17 +343,19 @@ def _references(par: Any, name: str, V_bus: float, S: complex) -> dict[str, floa
     Raises:
         NoEquilibrium: there are none.
     """
-    law = discretise(load_law(name).first, 1e-4)
+    first = load_law(name).first
+    law, by_V = discretise(first, 1e-4), first.takes("V_ref")
     i = (S / V_bus).conjugate()
     v = V_bus + complex(_CONVERTER["R_g"], _CONVERTER["L_g"]) * i
     s, V = v * i.conjugate(), abs(v)
 
     def missed(z: NDArray[np.float64]) -> NDArray[np.float64]:
-        ref = np.array([1.0, z[0], 1.0, s.imag, z[1]])
-        y = operating_point(par, law, ref, 1.0, V_bus).y
+        Q, V_ref = (s.imag, z[1]) if by_V else (z[1], V)
+        y = operating_point(par, law, np.array([1.0, z[0], 1.0, Q, V_ref]), 1.0, V_bus).y
         return np.array([y[P_AT] - s.real, y[V_AT] - V])
 
-    solution = root(missed, [s.real, V], tol=1e-13)
+    solution = root(missed, [s.real, V if by_V else s.imag], tol=1e-13)
     if np.abs(missed(solution.x)).max() > 1e-9:
         raise NoEquilibrium(f"{name} cannot bring P = {S.real:.4g}, Q = {S.imag:.4g} p.u. there")
-    return {"P_ref": float(solution.x[0]), "Q_ref": s.imag, "V_ref": float(solution.x[1])}
+    P, other = (float(x) for x in solution.x)
+    return {"P_ref": P, "Q_ref": s.imag if by_V else other, "V_ref": other if by_V else V}

@@ -33,6 +33,7 @@ def small():
         ("case9", {"2": "droop-3", "3": "mimo-gfm"}),
         ("case14", {"1": "vsg-2"}),  # taps, and a converter at the slack
         ("case9", {"2": ("droop-3", 0.4), "1": ("vsg-2", 0.5)}),  # beside machines
+        ("case9", {"1": "vsg-2", "2": "grid-following"}),  # which takes no V_ref
         pytest.param("case39", {"30": "droop-3", "38": "vsg-2"}, marks=pytest.mark.full),
         pytest.param("case118", {"69": "droop-3"}, marks=pytest.mark.full),
     ],
