@@ -10,10 +10,12 @@ from gfm_design.norms.performance import Weight
 from gfm_hil.api.design import Gamma, NotTuned, Tuning, gamma, latency_tolerance, margins, tune
 from gfm_hil.api.latency import Measured, measured_misses
 from gfm_hil.api.sweeps import GainSweep, StabilityMap, stability_map, sweep
+from gfm_hil.studies.forming_share import FormingShare, forming_shares
 from gfm_hil.studies.linear_loop import network_loop
 
 __all__ = [
     "ClosedLoop",
+    "FormingShare",
     "GainSweep",
     "Gamma",
     "LatencyTolerance",
@@ -27,6 +29,7 @@ __all__ = [
     "Unstable",
     "UnstableLoop",
     "Weight",
+    "forming_shares",
     "gamma",
     "latency_tolerance",
     "loop_margins",

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from gfm_hil.api.sweeps import GainSweep, StabilityMap
     from gfm_hil.api.transients import TransientMap
     from gfm_hil.studies.attraction import Attraction
+    from gfm_hil.studies.forming_share import FormingShare
 
 Vector = NDArray[np.float64]
 
@@ -457,6 +458,32 @@ def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     dress(axes)
     size = rc("legend.fontsize", 8)
     axes.legend(fontsize=size, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
+    return axes
+
+
+@with_look
+def forming_shares(each: Sequence[FormingShare], title: str = "") -> Axes:
+    """Draw the largest sigma [1/s] of ``gfmhil.design.forming_shares`` over the share of the rating
+    that forms the grid; a cross where it is not stable, and where there is no steady state a line.
+    """
+    (axes,) = pyplot_panels(1, (6.6, 3.6))
+    there = [one for one in each if one.mode is not None]
+    x, sigma = (np.array([getattr(one, name) for one in there]) for name in ("share", "sigma"))
+    axes.plot(100 * x, sigma, color=COLOURS[0], lw=rc("lines.linewidth", 1.2))
+    for marker, some in (("o", sigma < 0.0), ("X", sigma >= 0.0)):
+        axes.plot(100 * x[some], sigma[some], marker, color=COLOURS[0], ms=5)
+    for one in there:
+        axes.annotate(one.follows, (100 * one.share, one.sigma), (4, 4), fontsize=8,
+                      textcoords="offset points")  # fmt: skip
+    for one in each:
+        if one.mode is None:
+            axes.axvline(100 * one.share, color=GREY, lw=0.8, ls=":")
+    axes.axhline(0.0, color=GREY, lw=0.8)
+    axes.set(
+        xlabel="rating that forms the grid [%]; a name follows from there on", ylabel="σ [1/s]"
+    )
+    axes.set(xlim=(103.0, -3.0))
+    dress_alone(axes, f"{title}: mode with the largest σ")
     return axes
 
 

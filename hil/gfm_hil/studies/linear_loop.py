@@ -7,6 +7,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
@@ -151,7 +154,7 @@ def network_loop(
     if scenario.network is None:
         raise UserError("network: the scenario has none; use Law.closed_loop")
     try:
-        return _linearise(scenario, laws)
+        return linearise(scenario, laws)
     except NoEquilibrium as problem:
         raise UserError(f"network: {problem}") from None
 
@@ -160,15 +163,26 @@ def loop_under(law: BuiltLaw, scenario: Scenario, converter: str | None) -> Clos
     """The sampled loop of a checked scenario under another law, of one converter if there is a
     network. Raises NoEquilibrium: there is no operating point."""
     if converter is not None:
-        return _linearise(scenario, {converter: law}).converter(converter)
+        return linearise(scenario, {converter: law}).converter(converter)
     return ClosedLoop.of(law, scenario.plant, scenario.references.vector(), T_s=scenario.T_s)
 
 
-def _linearise(scenario: Scenario, laws: Mapping[str, BuiltLaw]) -> NetworkLoop:
-    each = [*scenario.each.values()]
+def linearise(
+    scenario: Scenario,
+    laws: Mapping[str, BuiltLaw],
+    references: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
+) -> NetworkLoop:
+    """The linear loop of a checked scenario with a network. Raises NoEquilibrium: there is no
+    operating point.
+
+    Args:
+        laws: by converter, other laws than the scenario's; they bring their own inner stage.
+        references: by converter, other ones than the scenario's, (5,), p.u.
+    """
+    each = scenario.each
     built = [
         discretise(laws[name], scenario.T_s) if name in laws else initial_law(one)[0]
-        for name, one in zip(scenario.converters, each, strict=True)
+        for name, one in each.items()
     ]
-    references = [one.references.vector() for one in each]
-    return NetworkLoop.of(plant_of(scenario), built, references)
+    refs = [references.get(name, one.references.vector()) for name, one in each.items()]
+    return NetworkLoop.of(plant_of(scenario), built, refs)
