@@ -77,10 +77,14 @@ class NetworkMode(Mode):
     #: over all parts (Pérez-Arriaga, Verghese and Schweppe, 1982). It does not depend on the
     #: coordinates that describe the part.
     participation: Mapping[str, float] = field(default_factory=dict)
+    #: its shape: how far, and with which phase, the angle and so the speed of each converter and
+    #: machine swings, by its name, of the largest one; empty if other modes have the same pole
+    shape: Mapping[str, complex] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
-        """As ``Mode.plain``, with the participation."""
-        return super().plain() | {"participation": dict(self.participation)}
+        """As ``Mode.plain``, with participation and shape, the latter as [size, degrees]."""
+        shape = {name: [abs(z), float(np.degrees(np.angle(z)))] for name, z in self.shape.items()}
+        return super().plain() | {"participation": dict(self.participation), "shape": shape}
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,8 @@ class LinearNetwork:
     #: by the name of each part the matrix (n, n) that keeps the part's share of the states, which
     #: are absolute angles here; the matrices add up to 1
     parts: dict[str, Matrix]
+    #: by the name of each part that turns, where its angle is among the states
+    angles: dict[str, int]
 
     @property
     def references(self) -> slice:
@@ -279,20 +285,28 @@ class NetworkLoop(LinearLoop):
                 continue
             equal = np.abs(s - s[k]) <= _SAME * (1.0 + abs(s[k]))
             r, rows = right[:, equal], left[:, equal].conj().T
-            shares = self._participation(values[k], np.linalg.solve(rows @ r, rows), r)
+            states = self._absolute(values[k], r)
+            shares = self._participation(np.linalg.solve(rows @ r, rows), r, states)
+            shape = _shape(states, self.network.angles) if equal.sum() == 1 else {}
             modes = [Mode.of(one) for one in s[equal & ~done]]
-            found += [NetworkMode(m.sigma, m.frequency_hz, shares) for m in modes]
+            found += [NetworkMode(m.sigma, m.frequency_hz, shares, shape) for m in modes]
             done |= equal
         return sorted(found, key=lambda mode: -mode.sigma)
 
-    def _participation(self, z: complex, left: Complex, right: Complex) -> dict[str, float]:
-        """The share of each part, from rows of left and columns of right eigenvectors of z."""
+    def _absolute(self, z: complex, right: Complex) -> Complex:
+        """The states of the network, with absolute angles, in columns of right eigenvectors of
+        z."""
         turning = self.network.references
         drift = np.delete(self._drift, turning, axis=1)
         by_turn = drift @ right / (z - 1.0) if abs(z - 1.0) > 1e-12 else 0.0 * (drift @ right)
-        n = turning.start
+        own = right[: turning.start] + self.network.turn @ by_turn
+        return np.concatenate([own, by_turn])
+
+    def _participation(self, left: Complex, right: Complex, states: Complex) -> dict[str, float]:
+        """The share of each part, from rows of left and columns of right eigenvectors, and the
+        states of the latter with absolute angles."""
+        n = self.network.references.start
         by_parts = dict.fromkeys(self.network.parts, 0j)
-        states = np.concatenate([right[:n] + self.network.turn @ by_turn, by_turn])
         rows = np.hstack([left[:, :n], -left[:, :n] @ self.network.turn])
         for name, part in self.network.parts.items():
             by_parts[name] += np.trace(rows @ part @ states)
@@ -385,6 +399,13 @@ class Surroundings:
         """A plant of all with the commands and measurements of this converter alone."""
         one, own = self.loop.members[self.place], slice(NY * self.place, NY * (self.place + 1))
         return LinearPlant(p.A, p.B[:, one.u], p.B_d, p.C[one.y], p.C_true[own])
+
+
+def _shape(states: Complex, angles: Mapping[str, int]) -> dict[str, complex]:
+    """How the angles swing in one mode, of the largest one."""
+    each = {name: complex(states[at, 0]) for name, at in angles.items()}
+    largest = max(each.values(), key=abs)
+    return {name: z / largest for name, z in each.items()} if largest else {}
 
 
 def _states(n: int, members: Sequence[LinearConverter]) -> list[slice]:
@@ -564,7 +585,9 @@ class _Writing:
         if GRID in names and not len(self.plant.of(FiniteGrid)):
             names.remove(GRID)  # an ideal grid takes part in nothing
         parts = {name: self._share(name)[np.ix_(order, order)] for name in names}
-        return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts)
+        at = order.tolist()
+        angles = {name: at.index(self.at[name].start) for name in self.island if name in names}
+        return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts, angles)
 
     def _share(self, part: str) -> Matrix:
         """The matrix that keeps the part's own share of the states."""

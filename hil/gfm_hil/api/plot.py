@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
     from gfm_hil.api.sweeps import GainSweep, StabilityMap
     from gfm_hil.api.transients import TransientMap
+    from gfm_hil.scenario import Scenario
     from gfm_hil.studies.attraction import Attraction
     from gfm_hil.studies.forming_share import FormingShare
 
@@ -458,6 +459,34 @@ def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     dress(axes)
     size = rc("legend.fontsize", 8)
     axes.legend(fontsize=size, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
+    return axes
+
+
+@with_look
+def mode_shape(loop: NetworkLoop, scenario: Scenario, number: int = 1) -> Axes:
+    """Draw who swings against whom in a mode, on the single-line diagram: the angle, and so the
+    speed, of each converter and machine as an arrow, of the largest one.
+
+    Args:
+        scenario: of the loop.
+        number: of the mode, from 1 on, the slowest to decay first.
+
+    Raises:
+        UserError: there is no such mode, or others have the same pole.
+    """
+    from matplotlib import pyplot
+
+    from gfm_hil.results.diagram import fill_diagram
+
+    modes = loop.modes()
+    if not 1 <= number <= len(modes):
+        raise UserError(f"mode {number}: must be one of 1 to {len(modes)}")
+    mode = modes[number - 1]
+    if not mode.shape:
+        raise UserError(f"mode {number}: others have the same pole, so it has no shape of its own")
+    axes = fill_diagram(pyplot.figure(), scenario, phasors=mode.shape)
+    axes.text(0.99, 0.99, f"mode {number}: {_label(mode).strip()}", transform=axes.transAxes,
+              ha="right", va="top", fontsize=9)  # fmt: skip
     return axes
 
 

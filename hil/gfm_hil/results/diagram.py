@@ -7,6 +7,7 @@ lines, loads and capacitors are in p.u. of the first one, as in the scenario.
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree
 
@@ -61,7 +62,11 @@ def draw_diagram(
 
 
 def fill_diagram(
-    figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
+    figure: Figure,
+    scenario: Scenario,
+    report: str | None = None,
+    leads_to: str = OF,
+    phasors: Mapping[str, complex] = MappingProxyType({}),
 ) -> Axes:
     """Draw the diagram into a figure and set its size; faults of the events are marked. A mesh
     whose nodes would overlap in columns is drawn as by ``fill_narrow``.
@@ -71,12 +76,13 @@ def fill_diagram(
             to the curves of the converters at its ends; None: no links.
         leads_to: fragment before the name of a converter: ``OF``, its chapter, or ``ONLY``, its
             curves among those of all.
+        phasors: drawn beside converters and machines, by their names; at most 1 long.
     """
     plants, laws, nodes = single_line.converters_of(scenario)
     bars, lines = single_line.bars_of(scenario, nodes)
     top = single_line.assign_rows(bars, lines)
     if single_line.collide(bars, lines):
-        return fill_narrow(figure, scenario, report, leads_to)
+        return fill_narrow(figure, scenario, report, leads_to, phasors)
     width = _BARS + _COLUMN * max(bar.column for bar in bars.values()) + 4.2
     figure.set_size_inches(0.72 * width, 0.72 * (_ROW * top + 0.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -95,8 +101,10 @@ def fill_diagram(
             spots[converter] = (_LINE + 1.1 if behind else _TERMINAL, -_ROW * row), (x, -_ROW * row)
             if report is not None:
                 _link_area(axes, (0.0, _LINE + 1.1), -_ROW * row, f"{report}#{leads_to}{converter}")
+            _phasor(axes, 1.75, -_ROW * row - 0.8, phasors.get(converter))
         for row, (symbol, text, closed) in zip(bar.rows, bar.right, strict=False):
             _shunt(axes, x, -_ROW * row, symbol, text, closed)
+            _phasor(axes, x + 1.5, -_ROW * row - 0.75, phasors.get(text.partition("\n")[0]))
         ys = [-_ROW * row for row in bar.rows]
         ys += [-_ROW * line.row for line in lines.values() if name in line.ends]
         ends = min(ys) - 0.35, max(ys) + 0.35
@@ -127,7 +135,11 @@ def fill_diagram(
 
 
 def fill_narrow(
-    figure: Figure, scenario: Scenario, report: str | None = None, leads_to: str = OF
+    figure: Figure,
+    scenario: Scenario,
+    report: str | None = None,
+    leads_to: str = OF,
+    phasors: Mapping[str, complex] = MappingProxyType({}),
 ) -> Axes:
     """As ``fill_diagram`` for a narrow page: nodes below each other, lines on their left, and a
     converter's filter as text. A mesh with many lines beside each other needs a wider one."""
@@ -138,7 +150,7 @@ def fill_narrow(
         single_line.assign_lanes(bars, lines),
     )
     x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
-    width, height = max(_NARROW, x + _WORDS), _STACKED_ROW * (top + 0.3)
+    width, height = max(_NARROW, x + _WORDS) + 0.9 * bool(phasors), _STACKED_ROW * (top + 0.3)
     figure.set_size_inches(0.72 * width, 0.72 * height)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, width), ylim=(0.75 - height, 0.75), aspect="equal")
@@ -156,8 +168,10 @@ def fill_narrow(
             spots[converter], labels[converter] = ((x + 0.35, y), (x, y)), (x + 0.3, y - 0.5)
             if report is not None:
                 _link_area(axes, (x, width), y, f"{report}#{leads_to}{converter}", 0.45)
+            _phasor(axes, width - 0.45, y, phasors.get(converter))
         for y, (symbol, text, closed) in zip(ys[len(bar.converters) :], bar.right, strict=False):
             _shunt(axes, x, y, symbol, _wrap_lines(text, width - x - 1.5), closed, 0.75)
+            _phasor(axes, width - 0.45, y, phasors.get(text.partition("\n")[0]))
     for name, line in lines.items():
         upper, lower = sorted(bars[node].rows for node in line.ends)
         y, at = -_STACKED_ROW * line.row, x - _LANE * (1 + lanes[name])
@@ -368,6 +382,16 @@ def _shunt(
         axes.text(end + 0.3, y - 0.02, symbol, ha="center", va="center", fontsize=size, color=_INK)
     place = 0.3 if symbol in ("load", "capacitor") else 0.75
     axes.text(end + place, y, text, va="center", **_SMALL)
+
+
+def _phasor(axes: Axes, x: float, y: float, z: complex | None) -> None:
+    """An arrow from the middle of a circle that stands for 1."""
+    if z is None:
+        return
+    axes.add_patch(Circle((x, y), 0.38, fc="white", ec=_GREY, lw=0.7, ls=":", zorder=3.5))
+    tip = x + 0.38 * z.real, y + 0.38 * z.imag
+    style = {"arrowstyle": "-|>", "color": _RED, "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", tip, (x, y), arrowprops=style, zorder=4)
 
 
 def _spot_of(event: Fault, spots: _Spots) -> str:

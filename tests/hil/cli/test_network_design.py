@@ -12,7 +12,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
-from gfm_hil.scenario import write_scenario
+from gfm_hil.scenario import toml_text, write_scenario
 from gfm_runtime.inner_file import named_inner
 
 pytestmark = pytest.mark.full  # compiles the start of several converters
@@ -37,6 +37,51 @@ def test_modes_with_their_participations(capsys, tmp_path):
     assert figure.read_text("utf-8").startswith("<?xml")
     assert main(["design", "poles", "--scenario", THREE]) == 0
     assert "A 50 %, B 50 %" in capsys.readouterr().out
+
+
+def test_who_swings_against_whom_is_what_a_run_shows(tmp_path, capsys):
+    """The speeds after a small step of a load, fitted by the exponentials of the slow modes."""
+    content = {
+        "title": "machine", "duration": 6.0, "link": {"type": "inproc"},
+        "references": {"P_ref": 0.4},
+        "network": {
+            "converters": {"A": {"node": "bus", "law": "vsg-2"},
+                           "B": {"node": "far", "law": "droop-3"}},
+            "lines": {"line": {"start": "bus", "end": "far", "L": 0.2, "R": 0.02}},
+            "loads": {"town": {"node": "bus", "P": 1.2, "Q": 0.3},
+                      "small": {"node": "bus", "P": 0.01, "closed": False}},
+            "machines": {"M": {"node": "bus", "S": 1.0, "H": 3.0, "X": 0.3, "P": 0.4}},
+            "record": ["M"],
+        },
+        "events": [{"type": "breaker", "t": 0.5, "name": "small", "closed": True}],
+    }  # fmt: skip
+    modes = gfmhil.design.network_loop(content).modes()
+    number, mode = next((k, m) for k, m in enumerate(modes, 1) if 1.0 < m.frequency_hz < 4.0)
+    run = gfmhil.run_network(content)
+    speeds = {x: run[x].signals["omega_u"][5_100:] for x in "AB"}
+    speeds["M"] = run.flows["M.omega"][5_100:]
+    t = 1e-4 * np.arange(len(speeds["M"]))
+    slow = [mode, *(m for m in modes if m.sigma > -12.0 and m is not mode)]
+    own = [complex(m.sigma, sign * 2 * np.pi * m.frequency_hz) for m in slow for sign in (1, -1)]
+    parts = np.exp(np.outer(t, own))
+    parts = np.concatenate([parts, np.ones((len(t), 1))], axis=1)
+    fit = {
+        x: np.linalg.lstsq(parts, v.astype(complex), rcond=1e-9)[0][0] for x, v in speeds.items()
+    }
+    assert mode.shape["M"] == 1.0 and abs(mode.shape["A"]) > 0.1
+    for name, z in fit.items():
+        assert abs(z / fit["M"] - mode.shape[name]) < 0.02
+    file, figure = tmp_path / "network.toml", tmp_path / "shape.svg"
+    file.write_text(toml_text(content), "utf-8")
+    asked = ["design", "poles", "--scenario", str(file), "--shape", str(number)]
+    assert main([*asked, "--out", str(figure)]) == 0
+    assert f"mode {number}" in figure.read_text("utf-8").replace("-->", "")
+    for more, problem in (
+        ([], "--shape: takes a scenario with a network, and --out"),
+        (["--out", "x.png", "--shape", "999"], "mode 999: must be one of 1 to "),
+    ):
+        assert main([*asked, *more]) == 2
+        assert problem in capsys.readouterr().err
 
 
 def test_a_step_of_all_and_of_one(capsys, tmp_path):

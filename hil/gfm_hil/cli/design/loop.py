@@ -10,7 +10,7 @@ import numpy as np
 from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
-from gfm_hil.api.plot import bode, nyquist, pole_map, step, stepped_by_default
+from gfm_hil.api.plot import bode, mode_shape, nyquist, pole_map, step, stepped_by_default
 from gfm_hil.cli.design.common import (
     add_figure,
     add_loop_options,
@@ -38,7 +38,7 @@ def add(kinds: Any) -> None:
             "nyquist", "L in the complex plane, one loop cut, and its margins", _margins,
             _draw_at(nyquist),
         ),
-        ("poles", "modes of the closed loop", _modes, lambda loop, options: pole_map(loop)),
+        ("poles", "modes of the closed loop", _modes, _draw_modes),
         (
             "step", "y after a unit step of one input", _step,
             lambda loop, options: step(loop, options.of, options.seconds),
@@ -50,6 +50,12 @@ def add(kinds: Any) -> None:
             command.add_argument(
                 "--at", help="channels of u or y, separated by commas; all of u by default"
             )
+        if find is _modes:
+            command.add_argument(
+                "--shape", type=int, metavar="MODE",
+                help="of a network: the figure is its diagram, with who swings against whom in the"
+                " mode of this number in the table",
+            )  # fmt: skip
         if find is _step:
             command.add_argument(
                 "--of", help="the input that steps; P_ref by default, in a network as A.P_ref"
@@ -69,6 +75,10 @@ def call(options: argparse.Namespace) -> int:
         label = ", ".join(member.title for member in loop.members)
     else:
         loop, label = scenario_loop(scenario, options.converter)
+    if options.find is _modes and options.shape is not None:
+        if scenario.network is None or not options.out:
+            raise UserError("--shape: takes a scenario with a network, and --out")
+        options.scenario = scenario
     if options.out:
         save_figure(options.out, lambda: options.draw(loop, options))
     console = terminal(highlight=False)
@@ -105,6 +115,12 @@ def _draw_at(draw: Callable[..., object]) -> Callable[[ClosedLoop, argparse.Name
     return lambda loop, options: draw(loop, *_at(options))
 
 
+def _draw_modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> object:
+    if isinstance(loop, NetworkLoop) and options.shape is not None:
+        return mode_shape(loop, options.scenario, options.shape)
+    return pole_map(loop)
+
+
 def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
     found = loop_margins(loop)
     channels = {c.name: c for c in (*found.u, *found.y)}
@@ -118,14 +134,14 @@ def _margins(loop: ClosedLoop, options: argparse.Namespace) -> Report:
 def _modes(loop: ClosedLoop | NetworkLoop, options: argparse.Namespace) -> Report:
     modes = loop.modes()
     heads = ["σ [1/s]", "frequency [Hz]", "damping ratio"]
-    heads += ["taking part"] if isinstance(loop, NetworkLoop) else []
+    heads = ["mode", *heads, "taking part"] if isinstance(loop, NetworkLoop) else heads
     rows = []
-    for mode in modes:
+    for k, mode in enumerate(modes, 1):
         cells = [f"{mode.sigma:.4g}", f"{mode.frequency_hz:.4g}", f"{mode.ratio:.3g}"]
         if isinstance(mode, NetworkMode):
             shares = [f"{part} {100 * x:.0f} %" for part, x in mode.participation.items()
                       if x >= _LEAST]  # fmt: skip
-            cells.append(", ".join(shares))
+            cells = [str(k), *cells, ", ".join(shares)]
         rows.append(cells)
     content = {"stable": modes[0].sigma < 0.0, "modes": [mode.plain() for mode in modes]}
     return content, Table(heads, rows)
