@@ -123,9 +123,13 @@ class LinearNetwork:
     plant: LinearPlant
     #: what a turn of each island by 1 rad does to the other states, (n - r, r) for r islands
     turn: Matrix
-    #: by the name of each part the matrix (n, n) that keeps the part's share of the states, which
-    #: are absolute angles here; the matrices add up to 1
-    parts: dict[str, Matrix]
+    #: the names of the parts, and of each state of ``own`` the place of its part there, (n,)
+    parts: tuple[str, ...]
+    owner: NDArray[np.intp]
+    #: own, from_own: the states, with absolute angles here, as those that belong to one part each:
+    #: currents and voltages of the circuit in place of its modes; and back, both (n, n)
+    own: Matrix
+    from_own: Matrix
     #: by the name of each part that turns, where its angle is among the states
     angles: dict[str, int]
 
@@ -305,16 +309,15 @@ class NetworkLoop(LinearLoop):
     def _participation(self, left: Complex, right: Complex, states: Complex) -> dict[str, float]:
         """The share of each part, from rows of left and columns of right eigenvectors, and the
         states of the latter with absolute angles."""
-        n = self.network.references.start
-        by_parts = dict.fromkeys(self.network.parts, 0j)
-        rows = np.hstack([left[:, :n], -left[:, :n] @ self.network.turn])
-        for name, part in self.network.parts.items():
-            by_parts[name] += np.trace(rows @ part @ states)
-        for k, name in enumerate(self._owners, n):
-            by_parts[name] += left[:, k] @ right[k]
-        sizes = {name: float(abs(share)) for name, share in by_parts.items()}
-        total = sum(sizes.values())
-        return {name: sizes[name] / total for name in sorted(sizes, key=lambda name: -sizes[name])}
+        network, n = self.network, self.network.references.start
+        rows = np.hstack([left[:, :n], -left[:, :n] @ network.turn])
+        shares = np.zeros(len(network.parts), complex)
+        each = (rows @ network.from_own) * (network.own @ states).T
+        np.add.at(shares, network.owner, each.sum(0))
+        np.add.at(shares, self._owners, (left[:, n:] * right[n:].T).sum(0))
+        sizes = np.abs(shares) / np.abs(shares).sum()
+        order = np.argsort(-sizes, kind="stable")
+        return {network.parts[k]: float(sizes[k]) for k in order}
 
     @cached_property
     def _drift(self) -> Matrix:
@@ -322,15 +325,17 @@ class NetworkLoop(LinearLoop):
         return _closed(self._held, self.members)[self.network.references]
 
     @cached_property
-    def _owners(self) -> list[str]:
-        """The converter that each state behind those of ``network`` belongs to."""
+    def _owners(self) -> list[int]:
+        """The place of the converter that each state behind those of ``network`` belongs to."""
         lines = delay_lines(self.network.plant, self.T_s, self.u_delay, self.y_delay)
         of_u = [m.name for m in self.members for _ in range(m.u.start, m.u.stop)]
         of_y = [m.name for m in self.members for _ in range(m.y.start, m.y.stop)]
         each = zip([*of_u, *of_y], lines, strict=True)
         owners = [name for name, line in each for _ in range(line.start, line.stop)]
         owners += [m.name for m in self.members for _ in m.reads]
-        return owners + [m.name for m in self.members for _ in m.controller.A]
+        owners += [m.name for m in self.members for _ in m.controller.A]
+        places = {name: k for k, name in enumerate(self.network.parts)}
+        return [places[name] for name in owners]
 
     def step_response(self, of: str, seconds: float = 1.0) -> tuple[Matrix, dict[str, Matrix]]:
         """(t, y of each converter by its name) after a unit step of one of ``inputs``.
@@ -584,19 +589,25 @@ class _Writing:
         names = [*self.at, LINES]
         if GRID in names and not len(self.plant.of(FiniteGrid)):
             names.remove(GRID)  # an ideal grid takes part in nothing
-        parts = {name: self._share(name)[np.ix_(order, order)] for name in names}
         at = order.tolist()
         angles = {name: at.index(self.at[name].start) for name in self.island if name in names}
-        return LinearNetwork(LinearPlant(A, B, B_d, C, C_true), turn, parts, angles)
+        plant = LinearPlant(A, B, B_d, C, C_true)
+        return LinearNetwork(plant, turn, tuple(names), *self._own(names, order), angles)
 
-    def _share(self, part: str) -> Matrix:
-        """The matrix that keeps the part's own share of the states."""
-        share = np.zeros((self.n, self.n))
-        own = np.array([owner == part for owner in self.owner_of_w], float)
-        share[self.z, self.z] = _real(self.modes.modes @ (own[:, None] * self.modes.states))
-        if part in self.at:
-            share[self.at[part], self.at[part]] = np.eye(self.at[part].stop - self.at[part].start)
-        return share
+    def _own(
+        self, names: Sequence[str], order: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], Matrix, Matrix]:
+        """Of which part each state is that belongs to one; these by all in their ``order``; and
+        all by these. An ideal grid is none of the parts: its angle is left out."""
+        n_z, n_w = self.z.stop, 2 * len(self.owner_of_w)
+        owners = [*self.owner_of_w, *self.owner_of_w]
+        owners += [name for name, at in self.at.items() for _ in range(at.start, at.stop)]
+        own, back = np.zeros((len(owners), self.n)), np.zeros((self.n, len(owners)))
+        own[:n_w, :n_z], back[:n_z, :n_w] = _real(self.modes.states), _real(self.modes.modes)
+        own[n_w:, n_z:] = back[n_z:, n_w:] = np.eye(self.n - n_z)
+        kept = np.array([k for k, owner in enumerate(owners) if owner in names])
+        places = np.array([names.index(owners[k]) for k in kept])
+        return places, own[np.ix_(kept, order)], back[np.ix_(order, kept)]
 
 
 def _parts(v: Complex) -> Matrix:
