@@ -1,19 +1,16 @@
 """gfmhil certify: the class of grids in which any number of converters is stable."""
 
 import argparse
-import json
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 from rich.markup import escape
 
 from gfm_hil.api.plot import certificate as draw
 from gfm_hil.api.studies import certify
-from gfm_hil.cli.common import add_inner, numbers, two_numbers, watching
+from gfm_hil.cli.common import add_inner, numbers, print_result, two_numbers, watching
 from gfm_hil.cli.design.common import add_figure, save_figure
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
-from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.certificate import CertifiedLaws, Strength, counter_run, strength_of
@@ -60,15 +57,12 @@ def call(options: argparse.Namespace) -> int:
             options.laws, scenario, scr=options.scr, x_over_r=options.x_over_r,
             powers=options.power, loads=options.loads, watch=watch,
         )  # fmt: skip
-    if options.out:
+    if options.figure:
         if found.certificate is None:
             raise UserError(f"--out: there is no certificate to draw; {found.unstable}")
-        save_figure(options.out, lambda: draw(found))
+        save_figure(options, lambda: draw(found))
     run = counter_run(scenario, found.unstable) if found.unstable else ""
-    if options.json:
-        print(json.dumps(finite(_plain(found, networks, run)), indent=2))
-    else:
-        _print(found, networks, run, options.out)
+    print_result(options, _plain(found, networks, run), *_in_words(found, networks, run))
     return 0 if found.holds else 1 if found.unstable else 4
 
 
@@ -91,27 +85,26 @@ def _plain(found: CertifiedLaws, networks: dict[str, Strength], run: str) -> dic
     }
 
 
-def _print(
-    found: CertifiedLaws, networks: dict[str, Strength], run: str, figure: Path | None
-) -> None:
-    console, grids = terminal(highlight=False), found.grids
+def _in_words(
+    found: CertifiedLaws, networks: dict[str, Strength], run: str
+) -> Iterator[str | Table]:
+    grids = found.grids
     low, high = grids.x_over_r
-    console.print(
+    yield (
         f"[bold]{escape(', '.join(found.laws))}[/] · strength {grids.weakest:g} to "
         f"{grids.stiffest:g}, X/R {low:g} to {high:g}, "
         f"{'with' if grids.loads else 'without'} loads, P_ref "
-        + ", ".join(f"{P:g}" for P in found.powers),
-        soft_wrap=True,
+        + ", ".join(f"{P:g}" for P in found.powers)
     )
     if found.unstable is not None:
-        console.print(f"counter-example: {found.unstable}", soft_wrap=True)
+        yield f"counter-example: {found.unstable}"
         if run:
-            console.print(f"a run of it after a phase jump of 0.5 degrees ends as {run}")
+            yield f"a run of it after a phase jump of 0.5 degrees ends as {run}"
     elif found.certificate is not None and found.holds:
-        console.print("certified: every network of this class is stable", style="bold")
+        yield "[bold]certified: every network of this class is stable[/]"
     elif found.certificate is not None:
         bands = ", ".join(f"{a:.4g} to {b:.4g} Hz" for a, b in found.certificate.void)
-        console.print(f"void at {bands}: such networks may be stable or not", soft_wrap=True)
+        yield f"void at {bands}: such networks may be stable or not"
     if networks:
         rows = [
             [name, s.weakest, s.stiffest, f"{s.x_over_r[0]:.3g} to {s.x_over_r[1]:.3g}",
@@ -119,6 +112,4 @@ def _print(
             for name, s in networks.items()
         ]  # fmt: skip
         heads = ["network", "weakest", "stiffest", "X/R", "loads", "in the class"]
-        console.print(Table(heads, rows, text=1))
-    if figure:
-        console.print(f"figure: {figure}", soft_wrap=True)
+        yield Table(heads, rows, text=1)

@@ -1,6 +1,7 @@
 """What several commands share: options, the progress bar, the closing table."""
 
 import argparse
+import json
 import re
 import sys
 import time
@@ -24,8 +25,8 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.core.terminal import terminal
 from gfm_hil.engine.processes import Progress as TellProgress
 from gfm_hil.recording.run import Run, controlled_by
-from gfm_hil.results.report import as_expected, events_table, has_stages, inner_stages
-from gfm_hil.results.table import shown
+from gfm_hil.results.report import as_expected, events_table, finite, has_stages, inner_stages
+from gfm_hil.results.table import Table, shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
 from gfm_hil.scenario import Scenario, load_scenario
@@ -285,6 +286,19 @@ def add_study_options(command: argparse.ArgumentParser, printed: str) -> None:
     """--json and --quiet; ``printed`` is what --json prints."""
     command.add_argument("--json", action="store_true", help=f"print {printed}, nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+def print_result(options: argparse.Namespace, content: Any, *parts: str | Table) -> None:
+    """Print what a command computed: ``content`` as JSON if --json is given, else ``parts``, lines
+    with rich's markup and tables, and last the file of ``add_figure``'s option, if it is given."""
+    if options.json:
+        print(json.dumps(finite(content), indent=2))
+        return
+    console = terminal(highlight=False)
+    for part in parts:
+        console.print(part, soft_wrap=isinstance(part, str))
+    if figure := getattr(options, "figure", None):
+        console.print(escape(f"figure: {figure}"), soft_wrap=True)
 
 
 @contextmanager

@@ -1,9 +1,8 @@
 """gfmhil conform: published tests of grid-forming converters, judged clause by clause."""
 
 import argparse
-import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.realtime.priority import processors
 from gfm_hil.results.report import PAGE
 from gfm_hil.results.table import Cell, Table
+from gfm_hil.studies.conformity import verdict
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.execute import PartResult
 from gfm_hil.studies.conformity.result import Conformity
@@ -28,24 +28,16 @@ from gfm_hil.studies.conformity.sets import (
     load_cases,
     shipped_sets,
 )
-from gfm_hil.studies.conformity.verdict import (
-    CANNOT,
-    CONSISTENT,
-    FAIL,
-    INFORMATIVE,
-    LIMITED,
-    PASS,
-    SIGNS,
-)
 from gfm_runtime import law_names
 
 EXIT_FAILED = 1
 _EXIT = {
-    **dict.fromkeys((PASS, LIMITED, CONSISTENT), 0),
-    FAIL: EXIT_FAILED,
-    **dict.fromkeys((CANNOT, INFORMATIVE), 4),
+    **dict.fromkeys((verdict.PASS, verdict.LIMITED, verdict.CONSISTENT), 0),
+    verdict.FAIL: EXIT_FAILED,
+    **dict.fromkeys((verdict.CANNOT, verdict.INFORMATIVE), 4),
 }
-_STYLES = {**dict.fromkeys(SIGNS, "dim"), PASS: "good", FAIL: "bad", CANNOT: "warn"}
+_COLOURED = {verdict.PASS: "good", verdict.FAIL: "bad", verdict.CANNOT: "warn"}
+_STYLES = {**dict.fromkeys(verdict.SIGNS, "dim"), **_COLOURED}
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -130,13 +122,9 @@ def call(options: argparse.Namespace) -> int:
     if options.list:
         cases = load_cases(against)
         rows = {"tests": _tests, "parts": _parts, "limits": all_limits}[options.list](cases)
-        if options.json:
-            print(json.dumps(rows, indent=2))
-        else:
-            heads = [*rows[0]]
-            terminal().print(Table(heads, [[*row.values()] for row in rows], text=None))
-            if options.list == "limits":
-                print(count_limits(rows))
+        table = Table([*rows[0]], [[*row.values()] for row in rows], text=None)
+        counts = [escape(count_limits(rows))] if options.list == "limits" else []
+        common.print_result(options, rows, table, *counts)
         return 0
     if options.recording is not None:
         return _recording(options)
@@ -145,8 +133,7 @@ def call(options: argparse.Namespace) -> int:
     if not options.law and options.controller is None and options.network is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
     laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
-    folder = common.new_folder(options.out, "conform")
-    began = time.monotonic()
+    folder, began = common.new_folder(options.out, "conform"), time.monotonic()
     with common.watching("conform", options.quiet, stoppable=True) as watch:
         found = conform(
             laws, against, folder, inner=options.inner, converter=options.converter,
@@ -154,12 +141,7 @@ def call(options: argparse.Namespace) -> int:
             network=options.network, judged=options.judged,
             workers=options.workers, figures=not options.no_figures, watch=watch,
         )  # fmt: skip
-    if options.json:
-        print(json.dumps(found.plain(), indent=1))
-    else:
-        _print(found, time.monotonic() - began)
-    common.show_page(options, folder / PAGE)
-    return _EXIT[found.verdict]
+    return _tell(options, found, time.monotonic() - began, folder)
 
 
 def _recording(options: argparse.Namespace) -> int:
@@ -173,21 +155,13 @@ def _recording(options: argparse.Namespace) -> int:
         raise UserError(
             "--against: name the one test that was recorded, such as ercot/2-phase-jump"
         )
-    folder = common.new_folder(options.out, "conform")
-    began = time.monotonic()
+    folder, began = common.new_folder(options.out, "conform"), time.monotonic()
     with common.watching("conform", options.quiet) as watch:
         found = judge_recording(
             options.recording, options.map, options.against[0], options.part, folder,
             converter=options.converter, figures=not options.no_figures, watch=watch,
         )  # fmt: skip
-    if options.json:
-        print(json.dumps(found.plain(), indent=1))
-    else:
-        for words in found.recordings.values():
-            terminal().print(escape(words), highlight=False, soft_wrap=True)
-        _print(found, time.monotonic() - began)
-    common.show_page(options, folder / PAGE)
-    return _EXIT[found.verdict]
+    return _tell(options, found, time.monotonic() - began, folder)
 
 
 def _diff(options: argparse.Namespace) -> int:
@@ -195,23 +169,17 @@ def _diff(options: argparse.Namespace) -> int:
     found = compare_results(read_results(options.old), read_results(options.new), options.share)
     if options.html is not None:
         write_text(options.html, found.page(str(options.old), str(options.new)))
-    if options.json:
-        print(json.dumps(found.plain(), indent=1))
-    else:
-        console = terminal()
-        for note in found.notes:
-            console.print(escape(note), highlight=False, soft_wrap=True)
-        heads = "", "law", "test", "part", "clause", "verdict", "measured"
-        rows = [
-            [
-                Cell(row.change, "bad" if row.counts else ""), row.law, row.test, row.part,
-                row.clause.clause, row.verdict, row.value,
-            ]
-            for row in found.rows
-        ]  # fmt: skip
-        if rows:
-            console.print(Table(heads, rows, text=None))
-        console.print(found.words, highlight=False)
+    heads = "", "law", "test", "part", "clause", "verdict", "measured"
+    rows = [
+        [
+            Cell(row.change, "bad" if row.counts else ""), row.law, row.test, row.part,
+            row.clause.clause, row.verdict, row.value,
+        ]
+        for row in found.rows
+    ]  # fmt: skip
+    tables = [Table(heads, rows, text=None)] if rows else []
+    notes = map(escape, found.notes)
+    common.print_result(options, found.plain(), *notes, *tables, escape(found.words))
     return EXIT_FAILED if found.worse else 0
 
 
@@ -240,33 +208,39 @@ def _why(part: PartResult) -> list[tuple[str, ...]]:
     return [*dict.fromkeys((v.clause, v.text) for v in part.wrong)] or [(part.reason,)]
 
 
-def _print(result: Conformity, wall_s: float) -> None:
-    """The short table that ends the command."""
-    console = terminal()
+def _tell(options: argparse.Namespace, result: Conformity, wall_s: float, folder: Path) -> int:
+    """What ends the command: a short table, the report; returns the exit code."""
+    parts = *map(escape, result.recordings.values()), *_in_words(result, wall_s)
+    common.print_result(options, result.plain(), *parts)
+    common.show_page(options, folder / PAGE)
+    return _EXIT[result.verdict]
+
+
+def _in_words(result: Conformity, wall_s: float) -> Iterator[str | Table]:
     rows: list[list[Any]] = []
     if len(result.laws) == 1:
         for case in result.cases:
-            verdict = result.matrix[result.laws[0], case.id]
+            judged = result.matrix[result.laws[0], case.id]
             wrong = [
                 ": ".join(filter(None, [f.part, *said]))
                 for f in result.of(result.laws[0], case.id)
-                if f.verdict == verdict != PASS
+                if f.verdict == judged != verdict.PASS
                 for said in _why(f)
             ]
-            rows.append([case.id, Cell(verdict, _STYLES[verdict]), "\n".join(wrong)])
-        console.print(Table(("test", "verdict", "why"), rows, text=None))
+            rows.append([case.id, Cell(judged, _STYLES[judged]), "\n".join(wrong)])
+        yield Table(("test", "verdict", "why"), rows, text=None)
     else:
-        cells = {at: Cell(f"{SIGNS[v]} {v}", _STYLES[v]) for at, v in result.matrix.items()}
+        signs = verdict.SIGNS
+        cells = {at: Cell(f"{signs[v]} {v}", _STYLES[v]) for at, v in result.matrix.items()}
         rows = [[case.id, *(cells[law, case.id] for law in result.laws)] for case in result.cases]
-        for table in Table(["test", *result.laws], rows, text=None).fitting(console):
-            console.print(table)
+        yield from Table(["test", *result.laws], rows, text=None).fitting(terminal())
     verdicts = list(result.matrix.values())
-    told = ", ".join(f"{verdicts.count(v)} {v}" for v in SIGNS if v in verdicts)
+    told = ", ".join(f"{verdicts.count(v)} {v}" for v in verdict.SIGNS if v in verdicts)
     count = len(result.parts)
     runs = f"{count} {'run' if count == 1 else 'runs'} in {wall_s:.1f} s"
-    console.print(f"{told}; {runs}", highlight=False)
+    yield f"{told}; {runs}"
     if result.network:
-        console.print(f"judged: {result.network}", highlight=False, soft_wrap=True)
+        yield escape(f"judged: {result.network}")
     elif not result.under.plant.model_fields_set - {"converter"}:
-        text = f"converter under test: {result.under.plant.converter}, {result.under.instruments}"
-        console.print(text, highlight=False, soft_wrap=True)
+        under = result.under
+        yield escape(f"converter under test: {under.plant.converter}, {under.instruments}")

@@ -1,11 +1,9 @@
 """gfmhil doctor: is this machine fit for real time, and what to do where it is not."""
 
 import argparse
-import json
 from typing import Any
 
-from gfm_hil.cli.common import EXIT_OTHERWISE
-from gfm_hil.core.terminal import terminal
+from gfm_hil.cli.common import EXIT_OTHERWISE, print_result
 from gfm_hil.results.table import Cell, Table
 from gfm_hil.run.doctor import examine, worst
 
@@ -21,14 +19,11 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     facts, findings = examine()
     level = worst(findings)
-    if options.json:
-        said = [finding._asdict() for finding in findings]
-        print(json.dumps({"worst": level, "findings": said, "facts": facts}, indent=2))
-    else:
-        rows: list[tuple[Any, ...]] = []
-        for f in findings:
-            rows.append((Cell(f.level, _STYLES[f.level]), f.what, f.found))
-            if f.advice:
-                rows.append(("", "", f"→ {f.advice}"))
-        terminal().print(Table((), rows, text=None, fold=2), highlight=False)
+    content = {"worst": level, "findings": [f._asdict() for f in findings], "facts": facts}
+    rows: list[tuple[Any, ...]] = []
+    for f in findings:
+        rows.append((Cell(f.level, _STYLES[f.level]), f.what, f.found))
+        if f.advice:
+            rows.append(("", "", f"→ {f.advice}"))
+    print_result(options, content, Table((), rows, text=None, fold=2))
     return EXIT_OTHERWISE if options.strict and level == "red" else 0

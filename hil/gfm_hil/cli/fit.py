@@ -2,12 +2,13 @@
 WECC's models that follow from them."""
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
 
+from rich.markup import escape
+
 from gfm_hil.api.runs import load_run
-from gfm_hil.core.terminal import terminal
+from gfm_hil.cli.common import print_result
 from gfm_hil.recording.foreign import ABOUT
 from gfm_hil.results.table import Table
 from gfm_hil.studies.unit_fit import fit_run
@@ -33,20 +34,16 @@ def add(command: argparse.ArgumentParser) -> None:
 def call(options: argparse.Namespace) -> int:
     run = load_run(options.what, options.map, options.scenario)
     found = fit_run(run)
-    if options.json:
-        print(json.dumps(asdict(found) | {"mp": found.mp, "TPf": found.TPf}, indent=1))
-        return 0
-    console = terminal(highlight=False)
-    if ABOUT in run.summary:
-        console.print(run.summary[ABOUT]["words"], markup=False, soft_wrap=True)
+    content = asdict(found) | {"mp": found.mp, "TPf": found.TPf}
+    about = [escape(run.summary[ABOUT]["words"])] if ABOUT in run.summary else []
     rows = [
         [name, f"{getattr(found, name):.4g}", f"{low:.4g} to {high:.4g}", _UNITS[name]]
         for name, (low, high) in ((name, found.interval[name]) for name in _UNITS)
     ]
-    console.print(Table(["", "", "95 %", ""], rows, text=None))
-    console.print("REGFM_A1: mp, TPf and X_L = X_eff; REGFM_B1: X_L = X_eff, 1/mp + D1 = D and")
-    console.print("H + D2/(2 omega_D) + TPf D/2 = H, which one jump does not part")
-    console.print(
-        f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}"
-    )
+    print_result(
+        options, content, *about, Table(["", "", "95 %", ""], rows, text=None),
+        "REGFM_A1: mp, TPf and X_L = X_eff; REGFM_B1: X_L = X_eff, 1/mp + D1 = D and",
+        "H + D2/(2 omega_D) + TPf D/2 = H, which one jump does not part",
+        f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}",
+    )  # fmt: skip
     return 0

@@ -3,16 +3,16 @@
 import argparse
 import json
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
 
 from gfm_hil.api.studies import scan
-from gfm_hil.cli.common import add_inner, add_study_options, new_folder, watching
+from gfm_hil.cli.common import add_inner, add_study_options, new_folder, print_result, watching
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
-from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table, shown
 from gfm_hil.scenario import find_scenario, shipped_scenarios
 from gfm_hil.studies.scan import AMPLITUDE, POINTS, SWITCHED_AMPLITUDE, WINDOW_S, FrequencyScan
@@ -73,10 +73,7 @@ def call(options: argparse.Namespace) -> int:
         )  # fmt: skip
     found.save(folder, options.grid)
     content = json.loads((folder / "identification.json").read_text(encoding="utf-8"))
-    if options.json:
-        print(json.dumps(content, indent=2))
-    else:
-        _print(found, content, folder)
+    print_result(options, content, *_in_words(found, content), escape(f"folder: {folder}"))
     return 0
 
 
@@ -116,9 +113,8 @@ def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
     return None, what
 
 
-def _print(found: FrequencyScan, content: dict[str, Any], folder: Path) -> None:
-    console = terminal(highlight=False)
-    console.print(f"[bold]{escape(found.name)}[/] · {escape(found.scenario.title)}")
+def _in_words(found: FrequencyScan, content: dict[str, Any]) -> Iterator[str | Table]:
+    yield f"[bold]{escape(found.name)}[/] · {escape(found.scenario.title)}"
     dev = found.deviation
     heads = ["f [Hz]", "|Y_dd|", "|Y_qq|", "λ_min(Y+Yᴴ)", "|Δp/Δω_g|"]
     heads += [] if dev is None else ["off the model [%]"]
@@ -132,22 +128,20 @@ def _print(found: FrequencyScan, content: dict[str, Any], folder: Path) -> None:
         ]
         for k in range(0, len(found.frequency), max(1, len(found.frequency) // _ROWS))
     ]  # fmt: skip
-    console.print(Table(heads, rows))
+    yield Table(heads, rows)
     if dev is not None:
-        console.print(
+        yield (
             f"largest deviation from the linear model: {100 * dev.max():.2g} % at "
             f"{content['at_hz']:.4g} Hz"
         )
     bands = ", ".join(f"{a:.4g} to {b:.4g} Hz" for a, b in content["not_passive_hz"])
-    console.print(f"not passive: {bands}" if bands else "passive at every frequency")
+    yield f"not passive: {bands}" if bands else "passive at every frequency"
     for grid in content["grids"]:
         verdict = {True: "stable", False: "unstable", None: "cannot be judged"}[grid["stable"]]
         why = f": {grid['reason']}" if grid["reason"] else ""
         if grid["stable"] is False:
             why = f": {grid['unstable_poles']} unstable poles"
-        console.print(
+        yield (
             f"SCR {grid['scr']:g}, X/R {grid['x_over_r']:g}: {verdict}{why}, margin "
-            f"{shown(grid['margin'])} at {grid['margin_at_hz']:.4g} Hz",
-            soft_wrap=True,
+            f"{shown(grid['margin'])} at {grid['margin_at_hz']:.4g} Hz"
         )
-    console.print(escape(f"folder: {folder}"), soft_wrap=True)

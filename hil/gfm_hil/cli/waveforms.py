@@ -1,7 +1,6 @@
 """gfmhil waveforms: currents and voltages of a switched bridge between the ticks of a run."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ from gfm_hil.api.runs import load_run
 from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
-from gfm_hil.core.terminal import terminal
 from gfm_hil.results.between_figure import SIZE, draw_between
 from gfm_hil.results.table import Table
 from gfm_hil.run.between import BetweenTicks
@@ -55,15 +53,12 @@ def call(options: argparse.Namespace) -> int:
     if sheet is not None:
         losses = between.losses(sheet)
         results["losses_W"] = {**losses.conduction, **losses.switching, "total": losses.total}
-    if options.json:
-        print(json.dumps(results, indent=2))
-    else:
-        rows = [
-            (f"{name}: {part}" if part else name, f"{value:.4g}")
-            for name, values in results.items()
-            for part, value in (values.items() if isinstance(values, dict) else [("", values)])
-        ]
-        terminal().print(Table(("", "value"), rows, text=None))
+    rows = [
+        (f"{name}: {part}" if part else name, f"{value:.4g}")
+        for name, values in results.items()
+        for part, value in (values.items() if isinstance(values, dict) else [("", values)])
+    ]
+    common.print_result(options, results, Table(("", "value"), rows, text=None))
     for file in options.out:
         _write(file, between, run.scenario.title)
     return 0

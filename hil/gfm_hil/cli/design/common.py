@@ -61,21 +61,24 @@ def grid_of(scenario: Scenario) -> tuple[float, float] | None:
 def add_figure(command: argparse.ArgumentParser) -> None:
     """The option that names the file of a figure."""
     command.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
+        "-o", "--out", dest="figure", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
     )
 
 
-def save_figure(path: Path, draw: Callable[[], object]) -> None:
-    """Save what ``draw`` draws in a figure of pyplot. Raises UserError: it cannot be saved."""
+def save_figure(options: argparse.Namespace, draw: Callable[[], object]) -> None:
+    """Save what ``draw`` draws in a figure of pyplot, if --out names a file. Raises UserError: it
+    cannot be saved."""
+    if options.figure is None:
+        return
     import matplotlib
     from matplotlib import pyplot
 
     matplotlib.use("Agg")
     draw()
     try:
-        pyplot.savefig(path, dpi=110)
+        pyplot.savefig(options.figure, dpi=110)
     except (OSError, ValueError) as problem:
-        raise UserError(f"--out {path}: {problem}") from None
+        raise UserError(f"--out {options.figure}: {problem}") from None
     finally:
         pyplot.close()
 

@@ -15,7 +15,7 @@ from gfm_design.norms.performance import WeightedChannel
 from gfm_design.tuning.paper import EVALUATIONS
 from gfm_hil.api import design
 from gfm_hil.api.law import Law
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, add_settings, watching
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, add_settings, numbers, watching
 from gfm_hil.cli.design.common import add_converter_option, chosen_scenario
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -93,14 +93,6 @@ def read_gains(text: str | None, option: str = "--gains") -> dict[str, float]:
             raise UserError(f"{option}: {name} is given twice")
         found[name] = number
     return found
-
-
-def read_numbers(text: str | None, option: str) -> list[float]:
-    """``1.5,20`` as numbers. Raises UserError: an entry that is none."""
-    try:
-        return [float(entry) for entry in text.split(",")] if text is not None else []
-    except ValueError:
-        raise UserError(f"{option} {text!r}: must be numbers separated by commas") from None
 
 
 def singular_is_users(
@@ -199,7 +191,7 @@ def _add_tune(kinds: Any) -> None:
         help="every mode of the loop must decay at least this fast, 1/s",
     )  # fmt: skip
     command.add_argument(
-        "--scr", metavar="A,B,…",
+        "--scr", metavar="A,B,…", type=numbers, default=[],
         help="short-circuit ratios of the scenario's grid, in all of which the law is judged",
     )  # fmt: skip
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
@@ -219,7 +211,14 @@ def _tune(options: argparse.Namespace) -> int:
     if options.full_order and law.file.inner is not None:
         raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
-        found = _search(law, on, options)
+        with watching(f"tuning {law.name}", options.quiet) as watch:
+            found = design.tune(
+                law, start=read_gains(options.gains),
+                only=None if options.only is None else options.only.split(","),
+                weights=options.weights, on=on, converter=options.converter, decay=options.decay,
+                scr=options.scr, seed=options.seed, evaluations=options.evaluations,
+                starts=options.starts, watch=watch,
+            )  # fmt: skip
     except design.NotTuned as none:
         if options.json:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
@@ -240,7 +239,7 @@ def _tune(options: argparse.Namespace) -> int:
         "seed": found.seed,
     }
     said = _bound(found, result) if options.full_order else ""
-    more = options.converter, options.weights, read_numbers(options.scr, "--scr")
+    more = options.converter, options.weights, options.scr
     if options.out:
         problem = None if on is None else design.problem_name(law.file, on, *more)
         design.write_law(Path(options.out), law.file, named, result, problem=problem)
@@ -259,25 +258,6 @@ def _tune(options: argparse.Namespace) -> int:
     ]
     terminal(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
     return 0
-
-
-def _search(law: Law, on: Scenario | None, options: argparse.Namespace) -> design.Tuning:
-    """The search, with a bar on stderr."""
-    with watching(f"tuning {law.name}", options.quiet) as watch:
-        return design.tune(
-            law,
-            start=read_gains(options.gains),
-            only=None if options.only is None else options.only.split(","),
-            weights=options.weights,
-            on=on,
-            converter=options.converter,
-            decay=options.decay,
-            scr=read_numbers(options.scr, "--scr"),
-            seed=options.seed,
-            evaluations=options.evaluations,
-            starts=options.starts,
-            watch=watch,
-        )
 
 
 def _bound(tuning: design.Tuning, result: dict[str, Any]) -> str:

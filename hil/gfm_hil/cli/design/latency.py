@@ -1,7 +1,6 @@
 """gfmhil design latency: how late, and how often missing, a law's u may be."""
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,9 @@ from gfm_design.misses.tolerance import LatencyTolerance
 from gfm_hil.api.design import latency_tolerance
 from gfm_hil.api.latency import measured_misses
 from gfm_hil.api.law import laws
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, watching
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, print_result, watching
 from gfm_hil.cli.design.common import add_converter_option
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
-from gfm_hil.results.report import finite
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.latency import as_json, tolerance_table, used_table
 
@@ -76,27 +73,23 @@ def call(options: argparse.Namespace) -> int:
                 found[name] = unstable
     stable = {name: of for name, of in found.items() if isinstance(of, LatencyTolerance)}
     used = [{name: of.used(one.misses) for name, of in stable.items()} for one in each]
-    if options.json:
-        content: dict[str, Any] = {
-            "scenario": scenario.title,
-            "laws": {name: as_json(of) for name, of in found.items()},
-            "measured": [
-                {
-                    "name": one.name,
-                    "ticks": one.misses.ticks,
-                    "misses": one.misses.misses,
-                    "in_a_row": one.misses.longest,
-                    "used": {n: {**asdict(u), "verdict": u.light} for n, u in of.items()},
-                }
-                for one, of in zip(each, used, strict=True)
-            ],
-        }
-        print(json.dumps(finite(content), indent=2))
-    else:
-        console = terminal(highlight=False)
-        console.print(f"[bold]{scenario.title}[/]", soft_wrap=True)
-        console.print(tolerance_table(found))
-        for one, of in zip(each, used, strict=True):
-            console.print(used_table(one.name, one.misses, of))
+    both = [*zip(each, used, strict=True)]
+    content: dict[str, Any] = {
+        "scenario": scenario.title,
+        "laws": {name: as_json(of) for name, of in found.items()},
+        "measured": [
+            {
+                "name": one.name,
+                "ticks": one.misses.ticks,
+                "misses": one.misses.misses,
+                "in_a_row": one.misses.longest,
+                "used": {n: {**asdict(u), "verdict": u.light} for n, u in of.items()},
+            }
+            for one, of in both
+        ],
+    }
+    tables = (used_table(one.name, one.misses, of) for one, of in both)
+    title = f"[bold]{scenario.title}[/]"
+    print_result(options, content, title, tolerance_table(found), *tables)
     red = any(u.light == "red" for of in used for u in of.values())
     return EXIT_OTHERWISE if red or not stable else 0

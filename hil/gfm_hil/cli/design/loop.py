@@ -1,7 +1,6 @@
 """gfmhil design bode, nyquist, poles, step: a law's linear loop as a table and a figure."""
 
 import argparse
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -11,16 +10,10 @@ from gfm_design.margins.all_margins import UnstableLoop, loop_margins
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.network import NetworkLoop, NetworkMode
 from gfm_hil.api.plot import bode, mode_shape, nyquist, pole_map, step, stepped_by_default
-from gfm_hil.cli.design.common import (
-    add_figure,
-    add_loop_options,
-    chosen_scenario,
-    heading,
-    save_figure,
-)
+from gfm_hil.cli.common import print_result
+from gfm_hil.cli.design import common
 from gfm_hil.cli.design.margins import channel_as_json, loops_table, no_margins
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.studies.linear_loop import network_loop, scenario_loop
 from gfm_runtime.signals import Y_NAMES
@@ -45,7 +38,7 @@ def add(kinds: Any) -> None:
         ),
     ):  # fmt: skip
         command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
-        add_loop_options(command)
+        common.add_loop_options(command)
         if find is _margins:
             command.add_argument(
                 "--at", help="channels of u or y, separated by commas; all of u by default"
@@ -61,13 +54,13 @@ def add(kinds: Any) -> None:
                 "--of", help="the input that steps; P_ref by default, in a network as A.P_ref"
             )
             command.add_argument("--seconds", type=_seconds, default=1.0, help="how long, s")
-        add_figure(command)
+        common.add_figure(command)
         command.set_defaults(call=call, find=find, draw=draw)
 
 
 def call(options: argparse.Namespace) -> int:
     """Print the table and draw the figure; exit code 3 where an unstable loop has no margins."""
-    scenario = chosen_scenario(options.scenario, options)
+    scenario = common.chosen_scenario(options.scenario, options)
     loop: ClosedLoop | NetworkLoop
     of_all = options.find is _modes or (options.find is _step and options.converter is None)
     if of_all and scenario.network is not None:
@@ -79,21 +72,13 @@ def call(options: argparse.Namespace) -> int:
         if scenario.network is None or not options.out:
             raise UserError("--shape: takes a scenario with a network, and --out")
         options.scenario = scenario
-    if options.out:
-        save_figure(options.out, lambda: options.draw(loop, options))
-    console = terminal(highlight=False)
+    common.save_figure(options, lambda: options.draw(loop, options))
     try:
         content, table = options.find(loop, options)
     except UnstableLoop as problem:
-        drawn = f"figure: {options.out}" if options.out else ""
-        return no_margins(label, scenario.title, problem, options.json, drawn)
-    if options.json:
-        print(json.dumps({"law": label, "scenario": scenario.title} | content, indent=2))
-    else:
-        console.print(heading(label, scenario, options), soft_wrap=True)
-        console.print(table)
-        if options.out:
-            console.print(f"figure: {options.out}", soft_wrap=True)
+        return no_margins(options, label, scenario.title, problem)
+    content = {"law": label, "scenario": scenario.title} | content
+    print_result(options, content, common.heading(label, scenario, options), table)
     return 0
 
 

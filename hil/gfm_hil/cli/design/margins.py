@@ -4,14 +4,12 @@ What has no limit is null in JSON, and "—" in a table.
 """
 
 import argparse
-import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 
 from gfm_design.margins.all_margins import (
@@ -26,12 +24,10 @@ from gfm_design.margins.locus import DiskMargin
 from gfm_design.margins.tolerance import POINTS, End, GridStrength, Range, Region, stable_region
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_design.model.dead_time import with_dead_time
-from gfm_hil.cli.common import EXIT_OTHERWISE, watching
+from gfm_hil.cli.common import EXIT_OTHERWISE, print_result, watching
 from gfm_hil.cli.design.common import add_loop_options, chosen_scenario
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
 from gfm_hil.recording.run import Run
-from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.run.loop_delay import LoopDelay, loop_delay
 from gfm_hil.studies.linear_loop import scenario_loop
@@ -72,29 +68,24 @@ def call(options: argparse.Namespace) -> int:
         except ValueError as problem:
             raise UserError(f"--dead-time: {problem}") from None
         label = f"{label}, {1e6 * options.dead_time:g} µs of dead time"
-    console = terminal(highlight=False)
     try:
         whole = scenario.network is None and options.dead_time is None
         ranges = margins(loop) if whole else None
         found = loop_margins(loop) if ranges is None else ranges.loop
     except UnstableLoop as problem:
-        none = "--figures: there is none to draw" if options.figures else ""
-        return no_margins(label, scenario.title, problem, options.json, none)
+        none = "; --figures: there is none to draw" if options.figures else ""
+        return no_margins(options, label, scenario.title, problem, none)
     margin = found.delay.seconds
     set_s = float(loop.u_delay[0])
     measured = None if run is None else loop_delay(run, set_s, margin)
     region = _draw(options.figures, loop, label, margin) if options.figures else None
-    if options.json:
-        content = {"law": label, "scenario": scenario.title, "stable": True}
-        content |= margins_as_json(found, ranges, set_s, measured)
-        if region is not None:
-            rows = {name: getattr(region, name).tolist() for name in ("L_g", "R_g", "sigma")}
-            content["region"] = finite(rows)
-        print(json.dumps(content, indent=2))
-    else:
-        print_margins(console, label, scenario.title, found, ranges, set_s, measured)
-        if options.figures:
-            console.print(f"figures: {options.figures}", soft_wrap=True)
+    content = {"law": label, "scenario": scenario.title, "stable": True}
+    content |= _as_json(found, ranges, set_s, measured)
+    said = [f"[bold]{label}[/] · {scenario.title}", *_in_words(found, ranges, set_s, measured)]
+    if region is not None:
+        content["region"] = {n: getattr(region, n).tolist() for n in ("L_g", "R_g", "sigma")}
+        said.append(f"figures: {options.figures}")
+    print_result(options, content, *said)
     return 0
 
 
@@ -107,7 +98,7 @@ def _draw(folder: Path, loop: ClosedLoop, label: str, margin: float) -> Region:
     return region
 
 
-def margins_as_json(
+def _as_json(
     loop: LoopMargins, more: Margins | None, set_s: float, measured: LoopDelay | None
 ) -> dict[str, Any]:
     """The margins of a loop, and the ranges of ``more``; ``set_s`` is the loop delay that they are
@@ -133,27 +124,23 @@ def margins_as_json(
             "fits": measured.fits(margin),
             "verdict": measured.words(margin),
         }
-    return dict(finite(out))
+    return out
 
 
 def no_margins(
-    law: str, scenario: str, problem: UnstableLoop, as_json: bool, figures: str = ""
+    options: argparse.Namespace, law: str, scenario: str, problem: UnstableLoop, more: str = ""
 ) -> int:
-    """Say that an unstable loop has none, and what became of the figures; returns the exit code."""
-    if as_json:
-        found = {"law": law, "scenario": scenario, "stable": False}
-        found |= {"mode": problem.mode.plain(), "reason": str(problem)}
-        print(json.dumps(found, indent=2))
-    else:
-        said = f"{law}: no margins, {problem}" + (f"; {figures}" if figures else "")
-        terminal(highlight=False).print(escape(said), soft_wrap=True)
+    """Say that an unstable loop has none, and ``more``; returns the exit code."""
+    content = {"law": law, "scenario": scenario, "stable": False}
+    content |= {"mode": problem.mode.plain(), "reason": str(problem)}
+    print_result(options, content, escape(f"{law}: no margins, {problem}{more}"))
     return EXIT_OTHERWISE
 
 
 def channel_as_json(c: ChannelMargins) -> dict[str, Any]:
-    """The margins of one channel; null where there is no limit."""
+    """The margins of one channel."""
     delay = {"delay_us": 1e6 * c.delay.seconds, "delay_hz": c.delay.frequency_hz}
-    return dict(finite({**asdict(c.gain_phase), **delay, "confirmed": c.confirmed}))
+    return {**asdict(c.gain_phase), **delay, "confirmed": c.confirmed}
 
 
 def _disk(d: DiskMargin) -> dict[str, Any]:
@@ -187,18 +174,11 @@ def _grid(g: GridStrength) -> dict[str, Any]:
     }
 
 
-def print_margins(
-    console: Console,
-    law: str,
-    scenario: str,
-    loop: LoopMargins,
-    ranges: Margins | None,
-    set_s: float,
-    run: LoopDelay | None,
-) -> None:
-    """Everything on a terminal; arguments as for ``margins_as_json``."""
-    console.print(
-        f"[bold]{law}[/] · {scenario}\n"
+def _in_words(
+    loop: LoopMargins, ranges: Margins | None, set_s: float, run: LoopDelay | None
+) -> Iterator[str | Table]:
+    """Everything for a terminal; arguments as for ``_as_json``."""
+    yield (
         f"least damped: damping ratio {loop.worst.ratio:.3g} at {loop.worst.frequency_hz:.4g} Hz, "
         f"sigma = {loop.worst.sigma:.4g} 1/s"
     )
@@ -207,29 +187,29 @@ def print_margins(
         if math.isinf(loop.delay.seconds)
         else f"{1e6 * loop.delay.seconds:.4g} µs, then {loop.delay.frequency_hz:.4g} Hz is lost"
     )
-    console.print(f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {delay}\n")
-    console.print(loops_table((*loop.u, *loop.y)))
+    yield f"[bold]delay margin[/] on top of {1e6 * set_s:g} µs: {delay}\n"
+    yield loops_table((*loop.u, *loop.y))
     for name, disk in (("u", loop.disk_u), ("y", loop.disk_y)):
         low, high = disk.gain
-        console.print(
+        yield (
             f"disk margin at {name}, all at once: α ≥ {disk.alpha:.4g} at "
             f"{disk.frequency_hz:.4g} Hz (gains {low:.3g} … {high:.3g}, ±{disk.phase_deg:.3g}°; "
             f"unstructured {disk.full:.3g})"
         )
     if ranges is not None:
-        console.print(_elements_table(ranges))
+        yield _elements_table(ranges)
         g = ranges.grid
         ends = f"strongest {g.strongest:.4g}{_why(g.range.low)}"
         ends += f", weakest {g.weakest:.4g}{_why(g.range.high)}"
-        console.print(f"grid at X/R = {g.x_over_r:.3g}: SCR {g.now:.4g}; {ends}")
+        yield f"grid at X/R = {g.x_over_r:.3g}: SCR {g.now:.4g}; {ends}"
     if run is not None:
-        console.print(f"\n[bold]this run[/] {run.words(1e6 * loop.delay.seconds)}")
+        yield f"\n[bold]this run[/] {run.words(1e6 * loop.delay.seconds)}"
         if run.round_trip_us:
             text = ", ".join(f"{k} {v:g}" for k, v in run.round_trip_us.items())
-            console.print(f"y\\[k] sent to u\\[k] received, µs: {text} (T_s = {run.T_s_us:g})")
+            yield f"y\\[k] sent to u\\[k] received, µs: {text} (T_s = {run.T_s_us:g})"
         if run.acting_us:
             text = ", ".join(f"{k} {v:g}" for k, v in run.acting_us.items())
-            console.print(f"y\\[k] sampled to u\\[k] acting, holds included, µs: {text}")
+            yield f"y\\[k] sampled to u\\[k] acting, holds included, µs: {text}"
 
 
 def loops_table(channels: Iterable[ChannelMargins]) -> Table:

@@ -1,7 +1,6 @@
 """gfmhil design sweep and map: a law's loop over one of its parameters, and over grids."""
 
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -10,18 +9,9 @@ from gfm_hil.api.law import Law, as_law
 from gfm_hil.api.plot import root_locus, stability_map
 from gfm_hil.api.sweeps import POINTS, GainSweep, StabilityMap, sweep
 from gfm_hil.api.sweeps import stability_map as map_stability
-from gfm_hil.cli.common import two_numbers, watching
-from gfm_hil.cli.design.common import (
-    add_figure,
-    add_loop_options,
-    chosen_scenario,
-    grid_of,
-    heading,
-    save_figure,
-)
+from gfm_hil.cli.common import print_result, two_numbers, watching
+from gfm_hil.cli.design import common
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
-from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario
 
@@ -30,14 +20,11 @@ _RANGE = two_numbers("LOW:HIGH, e.g. 1:20")
 
 
 def add(kinds: Any) -> None:
+    of_sweep = "poles over a parameter of the law, and where the loop is stable"
+    of_map = "where the loop is stable over a parameter and the short-circuit ratio"
     for name, text, call, points in (
-        (
-            "sweep",
-            "poles over a parameter of the law, and where the loop is stable",
-            _sweep,
-            POINTS,
-        ),
-        ("map", "where the loop is stable over a parameter and the short-circuit ratio", _map, 31),
+        ("sweep", of_sweep, _sweep, POINTS),
+        ("map", of_map, _map, 31),
     ):
         command = kinds.add_parser(name, help=text, description=f"{text} (linear model)")
         command.add_argument(
@@ -53,18 +40,17 @@ def add(kinds: Any) -> None:
                 help="short-circuit ratios (default: 1:20)",
             )  # fmt: skip
         command.add_argument("--points", type=int, default=points, help="values (%(default)s)")
-        add_loop_options(command)
-        add_figure(command)
+        common.add_loop_options(command)
+        common.add_figure(command)
         command.set_defaults(call=call)
 
 
 def _chosen(options: argparse.Namespace) -> tuple[Scenario, Law]:
-    scenario = chosen_scenario(options.scenario, options)
+    scenario = common.chosen_scenario(options.scenario, options)
     if scenario.network is not None and options.converter is None:
         raise UserError(f"--converter: must name one of {scenario.converters}")
-    return scenario, as_law(
-        (scenario.each[options.converter] if options.converter else scenario).law
-    )
+    one = scenario.each[options.converter] if options.converter else scenario
+    return scenario, as_law(one.law)
 
 
 def _sweep(options: argparse.Namespace) -> int:
@@ -74,34 +60,35 @@ def _sweep(options: argparse.Namespace) -> int:
             law, options.gain, *options.range, points=options.points, on=scenario,
             converter=options.converter, watch=watch,
         )  # fmt: skip
-    if options.out:
-        save_figure(options.out, lambda: root_locus(found))
-    if options.json:
-        content = {
-            "law": found.law, "scenario": scenario.title, "parameter": found.gain,
-            "own": found.own, "stable": found.stable(), "values": found.values.tolist(),
-            "slowest": [mode and mode.plain() for mode in found.slowest()],
-        }  # fmt: skip
-        print(json.dumps(content, indent=2))
-        return 0
+    common.save_figure(options, lambda: root_locus(found))
+    content = _about(found, scenario) | {
+        "stable": found.stable(),
+        "values": found.values.tolist(),
+        "slowest": [mode and mode.plain() for mode in found.slowest()],
+    }
     ranges = " and ".join(f"{low:.6g} to {high:.6g}" for low, high in found.stable())
-    console = terminal(highlight=False)
-    console.print(heading(found.law, scenario, options), soft_wrap=True)
-    console.print(_sweep_table(found))
-    console.print(
+    print_result(
+        options, content, common.heading(found.law, scenario, options), _sweep_table(found),
         f"stable for {found.gain} of {ranges or 'no value here'}; the law has {found.own:g}",
-        soft_wrap=True,
-    )
-    if options.out:
-        console.print(f"figure: {options.out}", soft_wrap=True)
+    )  # fmt: skip
     return 0
 
 
+def _about(found: GainSweep | StabilityMap, scenario: Scenario) -> dict[str, Any]:
+    """What the JSON of both commands begins with."""
+    about = {"law": found.law, "scenario": scenario.title, "parameter": found.gain}
+    return {**about, "own": found.own}
+
+
+def _some(count: int) -> list[int]:
+    """The places of the rows that a table shows of so many values."""
+    return sorted({*np.linspace(0, count - 1, _ROWS).round().astype(int).tolist()})
+
+
 def _sweep_table(found: GainSweep) -> Table:
-    some = np.unique(np.linspace(0, len(found.values) - 1, _ROWS).round().astype(int))
     modes = found.slowest()
     rows = []
-    for k in some:
+    for k in _some(len(found.values)):
         mode = modes[k]
         cells = ["no operating point", "", ""] if mode is None else [
             mode.sigma, mode.frequency_hz, mode.ratio
@@ -118,36 +105,28 @@ def _map(options: argparse.Namespace) -> int:
             law, options.gain, *options.range, scr=options.scr, points=options.points, on=scenario,
             watch=watch,
         )  # fmt: skip
-    if options.out:
-        save_figure(options.out, lambda: stability_map(found))
-    if options.json:
-        rows = {name: getattr(found, name).tolist() for name in ("values", "scr", "sigma")}
-        about = {"law": found.law, "scenario": scenario.title, "parameter": found.gain}
-        print(json.dumps({**about, "own": found.own, **finite(rows)}, indent=2))
-        return 0
-    console = terminal(highlight=False)
-    console.print(heading(found.law, scenario, options), soft_wrap=True)
-    console.print(_map_table(found))
-    console.print(
+    common.save_figure(options, lambda: stability_map(found))
+    rows = {name: getattr(found, name).tolist() for name in ("values", "scr", "sigma")}
+    said = [
         f"{min(_ROWS, len(found.scr))} of {len(found.scr)} grids, for each of which "
         f"{len(found.values)} values were tried"
-    )
-    if own := grid_of(scenario):
+    ]
+    if own := common.grid_of(scenario):
         low, high = (float(found.scr[k]) for k in (0, -1))
         inside = "contains" if low <= own[0] <= high else "does not contain"
-        console.print(
+        said.append(
             f"all have X/R {own[1]:.3g}; SCR {low:g} to {high:g} {inside} the scenario's "
             f"{own[0]:.3g}"
         )
-    if options.out:
-        console.print(f"figure: {options.out}", soft_wrap=True)
+    heading = common.heading(found.law, scenario, options)
+    print_result(options, _about(found, scenario) | rows, heading, _map_table(found), *said)
     return 0
 
 
 def _map_table(found: StabilityMap) -> Table:
     """Of some grids, between which values of the parameter the loop is stable."""
     rows = []
-    for i in np.unique(np.linspace(0, len(found.scr) - 1, _ROWS).round().astype(int)):
+    for i in _some(len(found.scr)):
         stable = found.values[found.sigma[i] < 0.0]
         share = f"{100 * len(stable) / len(found.values):.0f} %"
         ends = [float(stable.min()), float(stable.max())] if len(stable) else [None, None]

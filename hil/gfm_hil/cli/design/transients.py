@@ -2,18 +2,15 @@
 converter comes back, at one place or over a map."""
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 from gfm_hil.api import plot
 from gfm_hil.api.transients import SCR, WITHIN_S, attraction_map, clearing_map
-from gfm_hil.cli.common import numbers, watching
+from gfm_hil.cli.common import numbers, print_result, watching
 from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.terminal import terminal
-from gfm_hil.results.report import finite
 from gfm_hil.results.table import Table
 from gfm_hil.studies import attraction, clearing
 
@@ -118,7 +115,7 @@ def _tell(
     """Find and print; exit code 0 also where nothing is borne."""
     scenario = chosen_scenario(options.scenario, options)
     over = ({SCR: options.scr} if options.scr else {}) | dict(options.over)
-    if options.out and not over:
+    if options.figure and not over:
         raise UserError("--out: the figure is one over --scr or --over")
     with watching(options.design) as watch:
         if not over:
@@ -129,14 +126,8 @@ def _tell(
                 None, scenario, over=over, workers=options.workers, watch=watch, **how_map
             )
             each, rows = found.found, found.rows()
-            if options.out:
-                save_figure(options.out, lambda: draw(found))
-    if options.json:
-        all_of = [{SCR: None} | row | asdict(one) for row, one in zip(rows, each, strict=True)]
-        print(json.dumps(finite(all_of), indent=2))
-        return 0
-    console = terminal(highlight=False)
-    console.print(f"[bold]{scenario.law}[/] · {scenario.title}")
+            save_figure(options, lambda: draw(found))
+    content = [{SCR: None} | row | asdict(one) for row, one in zip(rows, each, strict=True)]
     heads = ["SCR" if name == SCR else name for name in over]
     cells = [
         [
@@ -146,7 +137,6 @@ def _tell(
         ]
         for row in rows
     ]
-    console.print(Table([*heads, *columns, "runs"], cells, text=0))
-    if options.out:
-        console.print(f"figure: {options.out}", soft_wrap=True)
+    table = Table([*heads, *columns, "runs"], cells, text=0)
+    print_result(options, content, f"[bold]{scenario.law}[/] · {scenario.title}", table)
     return 0
