@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def switchover() -> None:
     one = run(case)
     with tempfile.TemporaryDirectory() as place:
         shown = {**one.signals, **window(one, 0.8, 4.0)}
-        with draw_run(Path(place), case, shown, one.summary):
+        with draw_run(replace(one, scenario=case, columns=shown, folder=Path(place))):
             pass
         shutil.move(Path(place) / "signals.png", FIGURES / "switchover.png")
     s = one.summary

@@ -207,12 +207,12 @@ def _mark(
 
 def _in_symbols(label: str) -> str:
     """The label of an event with the symbols of the references and commands that it names."""
-    return re.sub(r"\b[A-Z]\w*_\w+\b", lambda name: _symbol_in(name[0]), label)
 
+    def symbol_of(name: re.Match[str]) -> str:
+        row = TABLE.get(f"ref_{name[0]}")
+        return f"${row.symbol}$" if row else name[0]
 
-def _symbol_in(name: str) -> str:
-    row = TABLE.get(f"ref_{name}")
-    return f"${row.symbol}$" if row else name
+    return re.sub(r"\b[A-Z]\w*_\w+\b", symbol_of, label)
 
 
 class Magnitude:
@@ -381,26 +381,24 @@ def _save(figure: Figure, path: Path, few_colours: bool = False) -> None:
 
 
 @contextmanager
-def draw_run(
-    folder: Path, scenario: Scenario, signals: Columns, summary: dict[str, Any]
-) -> Iterator[None]:
+def draw_run(run: Run) -> Iterator[None]:
     """Draw one run into signals.png and waveforms.png of its folder during a block, see ``beside``;
     a page shows them as ``panels_of_run`` and ``panels_of_waves``."""
 
     def signals_png() -> None:
         figure = _figure(SIZE)
-        draw_signals(figure, scenario, signals, summary)
-        _save(figure, folder / "signals.png")
+        draw_signals(figure, run)
+        _save(figure, run.file("signals.png"))
 
     def waveforms_png() -> None:
         figure = _figure(SIZE_WAVES)
-        if draw_waveforms(figure, scenario, signals, summary):
-            _save(figure, folder / "waveforms.png", few_colours=True)
+        if draw_waveforms(figure, run):
+            _save(figure, run.file("waveforms.png"), few_colours=True)
 
     with ExitStack() as stack:
-        if "true_p" in signals:
+        if "true_p" in run.columns:
             stack.enter_context(beside(signals_png))
-        if signals.keys() >= {*NEEDS}:
+        if run.columns.keys() >= {*NEEDS}:
             stack.enter_context(beside(waveforms_png))
         yield
 
@@ -428,11 +426,12 @@ class Quantity(NamedTuple):
     curves: list[tuple[str, str, str]]
 
 
-def quantities(scenario: Scenario, signals: Columns) -> tuple[list[Quantity], Columns]:
+def quantities(run: Run) -> tuple[list[Quantity], Columns]:
     """The six panels of a run, p, q, frequency, V, v_dc and currents, and the columns they show."""
     blue, red, green, purple, *_ = COLOURS
+    signals = run.columns
     # a regulated source ignores i_u
-    i_u = [("u_i_u", green, "i_u")] if scenario.plant.dc_source.mode == "controlled" else []
+    i_u = [("u_i_u", green, "i_u")] if run.scenario.plant.dc_source.mode == "controlled" else []
     inner = [("i_ref", purple, "|i*|")] if {*I_REF} <= signals.keys() else []
     E = "E_law" if "E_law" in signals else "u_E_u"  # with an inner stage u_E_u is e_d
     signals = {**signals, "i_ref": Magnitude(*(signals[n] for n in I_REF))} if inner else signals
@@ -447,20 +446,18 @@ def quantities(scenario: Scenario, signals: Columns) -> tuple[list[Quantity], Co
     return [Quantity(t, [c for c in curves if c[0] in signals]) for t, curves in panels], signals
 
 
-def draw_signals(
-    figure: Figure, scenario: Scenario, signals: Columns, summary: dict[str, Any]
-) -> list[Axes]:
+def draw_signals(figure: Figure, run: Run) -> list[Axes]:
     """Fill a figure with the ``quantities`` of a run."""
     axes = _panels(figure, 3, 2)
+    panels, signals = quantities(run)
     if "limited" in signals:
         _shade(axes[-1], signals["t"], signals["limited"])
-    panels, signals = quantities(scenario, signals)
     for a, (title, named) in zip(axes, panels, strict=True):
         curves = [(signals, n, colour, label) for n, colour, label in named]
-        _draw_columns(a, title, named[0][0], scenario, curves)
+        _draw_columns(a, title, named[0][0], run.scenario, curves)
         if len(curves) > 1:
             _legend(a, len(curves) + len(a.collections))
-    _mark_run(figure, axes, scenario, summary)
+    _mark_run(figure, axes, run)
     return axes
 
 
@@ -481,32 +478,28 @@ def _panel(
     return Panel(title, _at(t, at), curves, ends, events, colours=colours, bands=bands)
 
 
-def panels_of_run(
-    scenario: Scenario, signals: Columns, summary: dict[str, Any], most: int = POINTS
-) -> Iterator[Panel]:
+def panels_of_run(run: Run, most: int = POINTS) -> Iterator[Panel]:
     """The ``quantities`` of a run for a page in which a reader can zoom, ``most`` points each."""
-    panels, signals = quantities(scenario, signals)
+    panels, signals = quantities(run)
     t = signals["t"]
     limited = _limited_spans(t, signals["limited"]) if "limited" in signals else []
     for title, named in panels:
-        shown = TABLE[named[0][0]].display_unit(nominal_frequency(scenario))
+        shown = TABLE[named[0][0]].display_unit(nominal_frequency(run.scenario))
         curves = {label: signals[n] for n, _, label in named}
         yield _panel(
-            f"{title} [{shown.unit}]", t, curves, _marks_of(summary), [c for _, c, _ in named],
+            f"{title} [{shown.unit}]", t, curves, _marks_of(run), [c for _, c, _ in named],
             most, shown.factor, limited if title == "currents" else (),
         )  # fmt: skip
 
 
-def panels_of_waves(
-    scenario: Scenario, signals: Columns, summary: dict[str, Any]
-) -> Iterator[Panel]:
+def panels_of_waves(run: Run) -> Iterator[Panel]:
     """The panels of ``draw_waveforms`` for a page; none if nothing was recorded in the window."""
-    rows, waves = _waves(scenario, signals, summary)
-    t = signals["t"][rows]
+    rows, waves = _waves(run)
+    t = run.columns["t"][rows]
     if not len(t):
         return
     ends = float(t[0]), float(t[-1])
-    events = [(at, label) for at, label in _marks_of(summary) if ends[0] <= at <= ends[1]]
+    events = [(at, label) for at, label in _marks_of(run) if ends[0] <= at <= ends[1]]
     for title, phases in waves:
         curves = {name: np.asarray(x[rows], dtype=float) for name, x in phases.items()}
         yield Panel(title, np.asarray(t, dtype=float), curves, ends, events, colours=COLOURS[:3])
@@ -572,11 +565,16 @@ class _PaddedColumn:
         return np.pad(known, (0, last - first - len(known)), constant_values=np.nan)
 
 
-def _marks_of(summary: Mapping[str, Any]) -> list[tuple[float, str]]:
+def _trips(run: Run) -> list[dict[str, Any]]:
+    """The trips of a run, like its events."""
+    trips = run.summary.get("trips", [])
+    return [{"t": trip["t"], "label": reason_name(trip["reason"])} for trip in trips]
+
+
+def _marks_of(run: Run) -> list[tuple[float, str]]:
     """Events and trips of a run by their time, s."""
-    events = [(float(e["t"]), str(e["label"])) for e in summary["events"]]
-    trips = [(float(x["t"]), reason_name(x["reason"])) for x in summary.get("trips", [])]
-    return sorted(events + trips)
+    marks = (*run.summary["events"], *_trips(run))
+    return sorted((float(one["t"]), str(one["label"])) for one in marks)
 
 
 def _at(column: ColumnLike, ticks: NDArray[np.intp]) -> NDArray[Any]:
@@ -588,28 +586,18 @@ def _at(column: ColumnLike, ticks: NDArray[np.intp]) -> NDArray[Any]:
 
 
 def _mark_run(
-    figure: Figure,
-    axes: Sequence[Axes],
-    scenario: Scenario,
-    summary: dict[str, Any],
-    first: float = 0.0,
-    last: float = np.inf,
+    figure: Figure, axes: Sequence[Axes], run: Run, first: float = 0.0, last: float = np.inf
 ) -> None:
     """Mark events and trips from ``first`` to ``last``, s, and give the figure its title."""
-    events = [e for e in summary["events"] if first <= e["t"] <= last]
+    events = [e for e in run.summary["events"] if first <= e["t"] <= last]
     _mark(axes, events)
-    trips = [{"t": x["t"], "label": reason_name(x["reason"])} for x in summary.get("trips", [])]
-    trips = [x for x in trips if first <= x["t"] <= last]
+    trips = [x for x in _trips(run) if first <= x["t"] <= last]
     _mark(axes, trips, COLOURS[1], above=20 + 10 * min(3, len(events)))
-    headline(figure, f"{scenario.title} — {controlled_by(summary)}")
+    headline(figure, f"{run.scenario.title} — {controlled_by(run.summary)}")
 
 
 def draw_waveforms(
-    figure: Figure,
-    scenario: Scenario,
-    signals: Columns,
-    summary: dict[str, Any],
-    window: tuple[float, float] | None = None,
+    figure: Figure, run: Run, window: tuple[float, float] | None = None
 ) -> list[Axes]:
     """Fill a figure with v_abc, i_abc of the bridge and i_abc of the line. Raises UserError: the
     recording lacks what ``three_phase`` needs.
@@ -620,8 +608,8 @@ def draw_waveforms(
     Returns:
         The panels; none if nothing was recorded in the window.
     """
-    rows, waves = _waves(scenario, signals, summary, window)
-    t = signals["t"][rows]
+    rows, waves = _waves(run, window)
+    t = run.columns["t"][rows]
     if not len(t):
         return []
     axes = _panels(figure, 3, 1)
@@ -631,27 +619,24 @@ def draw_waveforms(
             for (phase, x), colour in zip(phases.items(), COLOURS, strict=False)
         ]
         draw_panel(a, title, curves, styles=("-",))
-        a.set_xlim(float(t[0]), max(rows.stop - 1, rows.start) * scenario.T_s)
-    if "limited" in signals:
-        _shade(axes[1], t, signals["limited"][rows])
+        a.set_xlim(float(t[0]), max(rows.stop - 1, rows.start) * run.scenario.T_s)
+    if "limited" in run.columns:
+        _shade(axes[1], t, run.columns["limited"][rows])
         if axes[1].collections:
             _legend(axes[1], len(PHASES) + 1)
     _legend(axes[0], len(PHASES))
-    _mark_run(figure, axes, scenario, summary, float(t[0]), float(t[-1]))
+    _mark_run(figure, axes, run, float(t[0]), float(t[-1]))
     return axes
 
 
 def _waves(
-    scenario: Scenario,
-    signals: Columns,
-    summary: Mapping[str, Any],
-    window: tuple[float, float] | None = None,
+    run: Run, window: tuple[float, float] | None = None
 ) -> tuple[slice, list[tuple[str, dict[str, ColumnLike]]]]:
     """The ticks of a window, see ``draw_waveforms``, and the columns of the phases by title."""
-    base = bases(scenario)
-    waves = three_phase(signals, base)
-    start, stop = window or scenario.waveforms or usual_window(summary, nominal_frequency(scenario))
-    rows = slice(max(0, round(start / scenario.T_s)), max(0, round(stop / scenario.T_s) + 1))
+    base, T_s, f_n = bases(run.scenario), run.scenario.T_s, nominal_frequency(run.scenario)
+    waves = three_phase(run.columns, base)
+    start, stop = window or run.scenario.waveforms or usual_window(run.summary, f_n)
+    rows = slice(max(0, round(start / T_s)), max(0, round(stop / T_s) + 1))
     V, A = (f"{np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
     titles = {
         "v": f"capacitor voltages [p.u. of {V} V]", "i": f"bridge currents [p.u. of {A} A]",
@@ -663,22 +648,21 @@ def _waves(
     ]
 
 
-def draw_timing(
-    folder: Path, scenario: Scenario, timing: Columns, summary: dict[str, Any]
-) -> Picture:
+def draw_timing(run: Run) -> Picture:
     """Draw into timing.png how long the round trips took, and when the plant had no fresh u."""
+    timing, summary, T_s = run.timing, run.summary, run.scenario.T_s
     figure = _figure((10.5, 3.4))
     left, right = figure.subplots(1, 2)
     for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
-        spread = duration.spread(timing, scenario.T_s)
+        spread = duration.spread(timing, T_s)
         before = np.cumsum(spread.count) - spread.count
         beyond = 1 - before / max(1, len(spread))
         us = np.maximum(spread.ns / 1e3, 0.1)
         left.loglog(us, beyond, color=colour, lw=1.2, label=duration.meaning)
-    left.axvline(scenario.T_s * 1e6, color=GREY, lw=0.8, ls=(0, (4, 3)))
+    left.axvline(T_s * 1e6, color=GREY, lw=0.8, ls=(0, (4, 3)))
     left.text(
-        scenario.T_s * 1e6, 0.98, f" T_s = {scenario.T_s * 1e6:g} µs", fontsize=8, va="top",
-        color="#444444", transform=left.get_xaxis_transform(),
+        T_s * 1e6, 0.98, f" T_s = {T_s * 1e6:g} µs", fontsize=8, va="top", color="#444444",
+        transform=left.get_xaxis_transform(),
     )  # fmt: skip
     dress(left, "share of ticks beyond a latency [µs]")
     left.legend(fontsize=8, frameon=False, loc="lower left")
@@ -686,12 +670,13 @@ def draw_timing(
     ticks = len(timing["plant_received"])
     for first in range(0, ticks, PIECE):
         missing = np.flatnonzero(missed(timing, first, first + PIECE))
-        counts += np.histogram((first + missing) * scenario.T_s, edges)[0]
+        counts += np.histogram((first + missing) * T_s, edges)[0]
     right.hist(edges[:-1], edges, weights=counts, color=COLOURS[1])
     dress(right, f"ticks without a fresh u: {summary['misses']} of {summary['ticks']}")
     right.set_xlabel("t [s]", fontsize=9)
-    _save(figure, folder / "timing.png")
-    return Picture(folder / "timing.png", panels(figure))
+    path = run.file("timing.png")
+    _save(figure, path)
+    return Picture(path, panels(figure))
 
 
 def draw_laws(
@@ -794,7 +779,7 @@ def plot(run: Run, *names: str, signals: Sequence[str] = ()) -> list[Axes]:
     UserError: a signal that was not recorded."""
     if names or signals:
         return _draw_named({"": run}, [*names, *signals], run.summary["events"])
-    return draw_signals(pyplot_figure(SIZE, 6), run.scenario, run.columns, run.summary)
+    return draw_signals(pyplot_figure(SIZE, 6), run)
 
 
 def _draw_named(
@@ -836,7 +821,7 @@ def plot_waveforms(run: Run, start: float | None = None, stop: float | None = No
         raise UserError(f"start = {start}, stop = {stop}: give both or neither")
     window = None if start is None or stop is None else (start, stop)
     figure = pyplot_figure(SIZE_WAVES, 3)
-    axes = draw_waveforms(figure, run.scenario, run.columns, run.summary, window)
+    axes = draw_waveforms(figure, run, window)
     if not axes:
         pyplot.close(figure)
         end = run.summary["duration_s"]

@@ -150,10 +150,10 @@ def write_report(run: Run | NetworkRun) -> None:
                 [*panels_of_network(run)] if len(run.flows) > 1 else [],
             )  # fmt: skip
         return
-    with draw_run(folder, scenario, run.columns, run.summary):
+    with draw_run(run):
         timing = None
         if run.summary["mode"] == "realtime" and run.summary["round_trip_us"]:
-            timing = draw_timing(folder, scenario, run.timing, run.summary)
+            timing = draw_timing(run)
         content = {
             "chapters": [_chapter("", run, POINTS, timing)], "shared": [], "kind": "",
             "commands": _commands({"": run}),
@@ -217,9 +217,8 @@ def write_together(
 def _chapter(name: str, run: Run, most: int, timing: Picture | None = None) -> Chapter:
     from gfm_hil.results.figures import panels_of_run, panels_of_waves
 
-    what = run.scenario, run.columns, run.summary
-    panels = [*panels_of_run(*what, most)] if "true_p" in run.columns else []
-    waves = [*panels_of_waves(*what)] if run.columns.keys() >= {*NEEDS} else []
+    panels = [*panels_of_run(run, most)] if "true_p" in run.columns else []
+    waves = [*panels_of_waves(run)] if run.columns.keys() >= {*NEEDS} else []
     return Chapter(name, run.summary, panels, waves, timing)
 
 

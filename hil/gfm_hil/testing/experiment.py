@@ -162,8 +162,7 @@ class Experiment(Steps):
 
             figure = run.file(f"{what}_{signal}.png")
             if what == "miss":  # when it was late, as in its report
-                timing = draw_timing(figure.parent, run.scenario, run.timing, run.summary)
-                timing.path.rename(figure)
+                draw_timing(run).path.rename(figure)
             else:
                 draw(figure, text, signal, self.signals, steps, finding, around)
             self._notice(figure)

@@ -284,7 +284,7 @@ def test_the_scope_draws_them_and_its_trigger_finds_a_zero_crossing(run):
 
 def test_the_figure_shows_the_cycles_around_the_first_event(run):
     one = run(duration=0.4, law="vsg-2", plant={"grid": WEAK}, events=[SAG])
-    axes = draw_waveforms(Figure(), one.scenario, one.columns, one.summary)
+    axes = draw_waveforms(Figure(), one)
     assert axes[0].get_xlim() == pytest.approx((0.04, 0.24))
     curves = {line.get_label(): line for line in axes[0].lines}
     shown = one.three_phase(0.04, 0.2401)
@@ -292,9 +292,9 @@ def test_the_figure_shows_the_cycles_around_the_first_event(run):
         assert np.array_equal(curves[phase].get_xdata(), shown["t"])
         assert np.array_equal(curves[phase].get_ydata(), shown[f"v_{phase}"])
     assert [text.get_text() for text in axes[0].texts] == [one.summary["events"][0]["label"]]
-    other = draw_waveforms(Figure(), one.scenario, one.columns, one.summary, (0.3, 0.35))
+    other = draw_waveforms(Figure(), one, (0.3, 0.35))
     assert other[2].get_xlim() == pytest.approx((0.3, 0.35)) and not other[0].texts
-    assert draw_waveforms(Figure(), one.scenario, one.columns, one.summary, (0.5, 0.6)) == []
+    assert draw_waveforms(Figure(), one, (0.5, 0.6)) == []
 
 
 def test_the_window_of_the_report_is_that_of_the_scenario(make, tmp_path, drawn):

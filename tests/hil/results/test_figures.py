@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from gfm_hil.recording.run import Run
 from gfm_hil.results.figures import draw_comparison, draw_signals
 from gfm_hil.results.figures import draw_run as drawn
 
@@ -24,8 +25,8 @@ def recording(ticks: int) -> dict[str, np.ndarray]:
     return {"t": t, **{n: wave.copy() for n in (*plant, *controller)}}
 
 
-def draw_run(*arguments) -> None:
-    with drawn(*arguments):
+def draw_run(folder, scenario, signals, summary) -> None:
+    with drawn(Run(scenario, summary, signals, folder=folder)):
         pass
 
 
@@ -58,7 +59,7 @@ def test_a_trip_is_marked_and_no_curve_hides_another(make):
     trips = [{"t": 0.2, "reason": "over-current: |i_dq| = 3.1 p.u."}]
     summary = {**RUN, "controller": "a foreign one", "events": events(2), "trips": trips}
     figure = Figure()
-    axes = draw_signals(figure, make(), recording(3000), summary)
+    axes = draw_signals(figure, Run(make(), summary, recording(3000)))
     assert "over-current" in [text.get_text() for text in axes[0].texts]
     assert figure.get_suptitle() == "test — a foreign one"
     assert [line.get_linestyle() for line in axes[0].lines] == ["-", "--"]

@@ -55,7 +55,7 @@ def test_the_report_names_the_stage(limited):
 
 
 def test_the_figure_shows_the_reference_current_and_shades_its_limit(limited):
-    axes = draw_signals(Figure(), limited.scenario, limited.columns, limited.summary)[-1]
+    axes = draw_signals(Figure(), limited)[-1]
     (curve,) = [line for line in axes.lines if line.get_label() == "|i*|"]
     assert max(curve.get_ydata()) == pytest.approx(1.2)
     (shade,) = [c for c in axes.collections if c.get_label() == "limited"]
