@@ -25,6 +25,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.synthesis import NotStabilised, Tuned
 from gfm_hil.api.law import Law, as_law
 from gfm_hil.core.errors import UserError, need
+from gfm_hil.results.report import finite
 from gfm_hil.scenario import Scenario, check_scenario, load_scenario, toml_text
 from gfm_hil.scenario.loading import drop_line
 from gfm_hil.scenario.schema import LatePolicy
@@ -401,15 +402,7 @@ def _weights(given: Weights) -> tuple[Weight, ...]:
 
 def channels_as_json(channels: Sequence[WeightedChannel]) -> dict[str, Any]:
     """gamma and its channels as plain data; a peak that is only a limit has no frequency."""
-    rows = [
-        {
-            "i": c.i,
-            "j": c.j,
-            "norm": c.norm,
-            "omega_rad_s": c.omega if np.isfinite(c.omega) else None,
-        }
-        for c in channels
-    ]
+    rows = [{"i": c.i, "j": c.j, "norm": c.norm, "omega_rad_s": finite(c.omega)} for c in channels]
     return {"gamma": max(c.norm for c in channels), "channels": rows}
 
 

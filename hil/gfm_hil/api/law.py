@@ -5,17 +5,20 @@ from __future__ import annotations
 import html
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gfm_hil.api.lti import cells_of, content_of, read_matrix
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, need
 from gfm_hil.core.files import check_empty, write_new, write_text
+from gfm_hil.results.page import fragment
+from gfm_hil.results.table import Table
 from gfm_hil.scenario import Scenario, load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant
 from gfm_runtime import (
@@ -30,7 +33,7 @@ from gfm_runtime import (
     parse_law,
 )
 from gfm_runtime.inner_file import named_inner
-from gfm_runtime.lawfile import ElementSpec, LawFile, tied
+from gfm_runtime.lawfile import LawFile, tied
 from gfm_runtime.signals import NU, NY, U_NAMES, Y_NAMES
 
 if TYPE_CHECKING:
@@ -64,23 +67,49 @@ def law_files(laws: Sequence[str | Path | Law]) -> Iterator[dict[str, str]]:
             raise UserError(text) from None
 
 
+@contextmanager
+def scenario_under(
+    law: str | Path | Law | None,
+    on: str | Path | Scenario | dict[str, Any],
+    in_process: bool = True,
+    **changes: Any,
+) -> Iterator[Scenario]:
+    """A scenario with its changes, and under a law if there is one; a ``Law`` has a file while this
+    lasts. Raises UserError, LawError: as ``load_scenario``."""
+    with law_files([] if law is None else [law]) as files:
+        for file in files.values():
+            changes = {**changes, "law": file}
+        yield load_scenario(on, in_process=in_process, **changes)
+
+
+def write_files(folder: Path, files: Mapping[str, str]) -> None:
+    """Write texts by their paths within a folder, which is made. Raises OSError: it cannot be."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_text(folder / name, text)
+
+
 def laws() -> tuple[str, ...]:
     """Names of the laws that ship."""
     return law_names()
 
 
-def element_text(spec: ElementSpec | list[ElementSpec]) -> str:
-    """An element as Table II of the paper writes it, e.g. ``IF×PD``."""
-    specs = spec if isinstance(spec, list) else [spec]
-    return "×".join(s.type for s in specs)
-
-
 def cell_text(file: LawFile, key: str) -> str:
-    """One cell of Table II, with the feedback-only term in braces; 0 if empty."""
-    phi, psi = file.phi.get(key), file.psi.get(key)
-    text = element_text(phi) if phi else ""
-    text += f"{{{element_text(psi)}}}" if psi else ""
-    return text or "0"
+    """One cell of the paper's Table II, e.g. ``IF×PD``, with the feedback-only term in braces; 0 if
+    empty."""
+    phi, psi = (
+        "×".join(spec.type for spec in (one if isinstance(one, list) else [one]))
+        for one in (file.phi.get(key, []), file.psi.get(key, []))
+    )
+    return phi + (f"{{{psi}}}" if psi else "") or "0"
+
+
+def table_ii(file: LawFile) -> list[list[str]]:
+    """The rows of Table II: an input of the converter, and its cells."""
+    return [
+        [u, *(cell_text(file, f"{i}{j}") for j in range(1, NY + 1))]
+        for i, u in enumerate(U_NAMES, 1)
+    ]
 
 
 _OF_LOOP = {"references", "T_s"}  # what ``Law.closed_loop`` takes that no scenario has
@@ -226,16 +255,15 @@ class Law:
         Raises:
             UserError: python-control is not installed.
         """
-        try:
-            import control
-        except ImportError:
-            raise UserError(
-                "to_control: needs python-control: pip install 'gfmhil[design]'"
-            ) from None
+        need("control", "python-control", "to_control", "design")
+        import control
+
         built = self.built()
         cells = [[built.element("phi", (i, j)) for j in range(NY)] for i in range(NU)]
         num = [[e.num[::-1] for e in row] for row in cells]
-        den = [[_product(e.den) for e in row] for row in cells]
+        den = [
+            [reduce(np.convolve, e.den, np.ones(1))[::-1].tolist() for e in row] for row in cells
+        ]
         return control.tf(num, den, inputs=[f"error_{y}" for y in Y_NAMES], outputs=list(U_NAMES))
 
     def closed_loop(
@@ -342,9 +370,7 @@ class Law:
         omega_b = 2 * math.pi * f_n
         files = export({self.name: self.built()}, T_s, real, "unrolled", omega_b)
         try:
-            for file, text in files.items():
-                (folder / file).parent.mkdir(parents=True, exist_ok=True)
-                write_text(folder / file, text)
+            write_files(folder, files)
         except OSError as problem:
             raise UserError(f"{folder}: {problem.strerror}") from None
         return folder
@@ -362,11 +388,7 @@ class Law:
         return write_new(Path(path), self.to_toml(), overwrite)
 
     def __repr__(self) -> str:
-        cells = [
-            [u, *(cell_text(self.file, f"{i + 1}{j + 1}") for j in range(NY))]
-            for i, u in enumerate(U_NAMES)
-        ]
-        rows = [["", *Y_NAMES], *cells]
+        rows = [["", *Y_NAMES], *table_ii(self.file)]
         wide = [max(len(row[j]) for row in rows) for j in range(NY + 1)]
         matrix = (
             "  " + "  ".join(x.ljust(n) for x, n in zip(row, wide, strict=True)).rstrip()
@@ -376,28 +398,10 @@ class Law:
 
     def _repr_html_(self) -> str:
         """The matrix of elements and the parameters, for a notebook."""
-        head = "".join(f"<th>{y}</th>" for y in Y_NAMES)
-        rows = "".join(
-            f"<tr><th>{u}</th>"
-            + "".join(
-                f"<td>{html.escape(cell_text(self.file, f'{i + 1}{j + 1}'))}</td>"
-                for j in range(NY)
-            )
-            + "</tr>"
-            for i, u in enumerate(U_NAMES)
-        )
-        title = f"{html.escape(self.name)}: {html.escape(self.file.title)}"
-        table = f"<table><caption>{title}</caption><tr><th>Φ(s)</th>{head}</tr>{rows}</table>"
+        title = f"{self.name}: {self.file.title}"
+        table = fragment(Table(["Φ(s)", *Y_NAMES], table_ii(self.file), title=title, text=None))
         gains = ", ".join(
             html.escape(f"{name} = {value:g} {self.units[name]}".removesuffix(" 1"))
             for name, value in self.gains.items()
         )
         return f"{table}<p>{gains}</p>"
-
-
-def _product(factors: Any) -> list[float]:
-    """The product of polynomials in ascending powers, in descending powers."""
-    found = np.ones(1)
-    for factor in factors:
-        found = np.convolve(found, factor)
-    return [float(c) for c in found[::-1]]

@@ -196,19 +196,10 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
         title = "poles, stable where σ < 0; colour: the part with the largest participation"
     else:
         poles = loop.poles()
-        for here, colour, marker in (
-            (poles.real < 0.0, COLOURS[0], "o"),
-            (poles.real >= 0.0, COLOURS[1], "X"),
-        ):
-            some = poles[here]
-            axes.plot(some.real, some.imag / (2 * np.pi), marker, color=colour, ms=5)
+        _mark_poles(axes, poles[poles.real < 0.0], "o", COLOURS[0])
+        _mark_poles(axes, poles[poles.real >= 0.0], "X", COLOURS[1])
         title = f"{_title(loop)}: poles, stable where σ < 0"
-    axes.axvline(0.0, color="k", lw=0.8)
-    axes.set_xscale("symlog", linthresh=1.0)
-    axes.set_yscale("symlog", linthresh=1.0)
-    axes.autoscale_view()  # of these scales
-    axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    dress_alone(axes, title)
+    _dress_poles(axes, title)
     if isinstance(loop, NetworkLoop):
         axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
     return axes
@@ -233,13 +224,24 @@ def root_locus(sweep: GainSweep) -> Axes:
             label = f"{sweep.gain} = {sweep.values[k]:.4g}, nearest to the law's {sweep.own:.4g}"
         crosses = axes.plot(near.real, near.imag / (2 * np.pi), "kx", ms=5, label=label)
         _explain(axes, crosses)
+    _dress_poles(axes, f"{_of(sweep)}: poles over {sweep.gain}, stable where σ < 0")
+    return axes
+
+
+def _mark_poles(
+    axes: Axes, poles: NDArray[np.complex128], marker: str, colour: str, label: str | None = None
+) -> None:
+    axes.plot(poles.real, poles.imag / (2 * np.pi), marker, color=colour, ms=5, label=label)
+
+
+def _dress_poles(axes: Axes, title: str) -> None:
+    """What a panel of poles has: symmetric logarithms, and a line where sigma is 0."""
     axes.axvline(0.0, color="k", lw=0.8)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.autoscale_view()  # of these scales
     axes.set(xlabel="σ [1/s]", ylabel="frequency [Hz]")
-    dress_alone(axes, f"{_of(sweep)}: poles over {sweep.gain}, stable where σ < 0")
-    return axes
+    dress_alone(axes, title)
 
 
 def _of_law(gain: str, own: float) -> str:
@@ -404,15 +406,12 @@ def _mark_parts(axes: Axes, loop: NetworkLoop) -> None:
     modes = loop.modes()
     for part, colour in _colours(loop).items():
         those = [m for m in modes if next(iter(m.participation)) == part]
+        upper = np.array([complex(m.sigma, 2 * np.pi * m.frequency_hz) for m in those])
+        poles = np.concatenate([upper, upper.conj()])
         label: str | None = part
-        for marker, some in (
-            ("o", [m for m in those if m.sigma < 0.0]),
-            ("X", [m for m in those if m.sigma >= 0.0]),
-        ):
-            sigma, hz = ([getattr(m, name) for m in some] for name in ("sigma", "frequency_hz"))
-            if some:
-                axes.plot(sigma * 2, [*hz, *(-f for f in hz)], marker, color=colour, ms=5,
-                          label=label)  # fmt: skip
+        for marker, some in (("o", poles[poles.real < 0.0]), ("X", poles[poles.real >= 0.0])):
+            if len(some):
+                _mark_poles(axes, some, marker, colour, label)
                 label = None
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from gfm_hil.api.law import Law, law_files
+from gfm_hil.api.law import Law, law_files, scenario_under
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.engine.processes import Progress
@@ -67,9 +67,7 @@ def look_between_ticks(run: Run, start: float, stop: float, step: float = 1e-6) 
             run cannot be repeated, as one in real time with misses.
     """
     law = Law.from_toml(run.law_text) if run.law_text else run.scenario.law
-    with law_files([law]) as files:
-        (file,) = files.values()
-        scenario = load_scenario(run.scenario, in_process=True, law=file)
+    with scenario_under(law, run.scenario) as scenario:
         return between_ticks(run, scenario, start, stop, step)
 
 
@@ -160,10 +158,7 @@ def run(
         return runner.run_scenario(checked, Path(folder), progress, notice, report, command)
     if controller is not None or ports is not None:
         raise UserError("controller, ports: take a folder")
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        checked = _load(scenario, changes, in_process=True)
+    with scenario_under(law, scenario, **changes) as checked:
         made = runner.run_in_memory(checked, notice=notice or _on_stderr)
     return _with_name(made, law) if isinstance(law, Law) else made
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_design.margins.certificate import GridClass
-from gfm_hil.api.law import Law, law_files
+from gfm_hil.api.law import Law, law_files, scenario_under
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty
 from gfm_hil.recording.run import nominal_frequency
@@ -254,9 +254,7 @@ def scan(
             does not complete, or a window whose ends still differ.
         LawError: the law is none.
     """
-    with law_files([] if law is None else [law]) as files:
-        named = next(iter(files.values()), None)
-        scenario = load_scenario(on, in_process=not controller_command, law=named, inner=inner)
+    with scenario_under(law, on, not controller_command, inner=inner) as scenario:
         found = measure_admittance(scenario, controller_command=controller_command, **how)
     return replace(found, name=law.name) if isinstance(law, Law) else found
 
@@ -288,10 +286,7 @@ def measure_unit(
         UserError: a mistake, a run that does not complete, or no swing equation fits.
         LawError: the law is none.
     """
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        scenario = load_scenario(on, in_process=True, **changes)
+    with scenario_under(law, on, **changes) as scenario:
         return unit_fit.measure_unit(scenario, degrees, seconds)
 
 

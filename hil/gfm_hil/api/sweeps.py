@@ -26,25 +26,29 @@ _MOST = 10_000  # loops
 
 
 @dataclass(frozen=True)
-class GainSweep:
+class _OverGain:
+    law: str
+    gain: str
+    own: float
+    values: Vector
+    title: str
+
+
+@dataclass(frozen=True)
+class GainSweep(_OverGain):
     """The loop of a law over one of its parameters, see ``sweep``.
 
     Attributes:
         law, gain: name of the law, and of its parameter.
         own: the parameter's value in the law.
         values: of the parameter, shape (n,).
+        title: of the scenario.
         poles: of the loop at each value, 1/s; none where it has no operating point.
         edges: values at which the loop becomes stable or unstable, ascending.
-        title: of the scenario.
     """
 
-    law: str
-    gain: str
-    own: float
-    values: Vector
     poles: tuple[NDArray[np.complex128], ...]
     edges: tuple[float, ...]
-    title: str = ""
 
     @property
     def sigma(self) -> Vector:
@@ -75,23 +79,17 @@ class GainSweep:
 
 
 @dataclass(frozen=True)
-class StabilityMap:
+class StabilityMap(_OverGain):
     """The loop of a law over one of its parameters and the short-circuit ratio of its grid.
 
     Attributes:
-        law, gain, own, values: as for ``GainSweep``.
+        law, gain, own, values, title: as for ``GainSweep``.
         scr: short-circuit ratios, shape (m,).
         sigma: largest real part of the poles, 1/s, shape (m, n); NaN without an operating point.
-        title: of the scenario.
     """
 
-    law: str
-    gain: str
-    own: float
-    values: Vector
     scr: Vector
     sigma: Vector
-    title: str = ""
 
 
 def sweep(
@@ -128,9 +126,10 @@ def sweep(
     for k, value in enumerate(values):
         poles.append(_poles(law, gain, loop, converter, value))
         watch.progress(k + 1, points, "")
-    one = GainSweep(law.name, gain, _own(law, gain), values, tuple(poles), ())
+    own = float(law.file.parameters[gain].value)
+    one = GainSweep(law.name, gain, own, values, loop.title, tuple(poles), ())
     largest = partial(_sigma, law, gain, loop, converter)
-    return replace(one, edges=_edges(values, one.sigma, largest), title=loop.title)
+    return replace(one, edges=_edges(values, one.sigma, largest))
 
 
 def stability_map(
@@ -166,15 +165,12 @@ def stability_map(
     for i, one in enumerate(at_short_circuit_ratios(scenario, ratios.tolist())):
         sigma[i] = [_sigma(law, gain, one, None, value) for value in values]
         watch.progress(i + 1, points, "")
-    return StabilityMap(law.name, gain, _own(law, gain), values, ratios, sigma, scenario.title)
+    own = float(law.file.parameters[gain].value)
+    return StabilityMap(law.name, gain, own, values, scenario.title, ratios, sigma)
 
 
 def _scenario(on: str | Path | Scenario) -> Scenario:
     return on if isinstance(on, Scenario) else load_scenario(on)
-
-
-def _own(law: Law, gain: str) -> float:
-    return float(law.file.parameters[gain].value)
 
 
 def _values(law: Law, gain: str, low: float | None, high: float | None, points: int) -> Vector:

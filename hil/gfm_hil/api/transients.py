@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.api.design import at_short_circuit_ratios
-from gfm_hil.api.law import Law, as_law, law_files
+from gfm_hil.api.law import Law, as_law, law_files, scenario_under
 from gfm_hil.core.errors import UserError, need
 from gfm_hil.engine.compiling import compiled_benches
 from gfm_hil.scenario import Scenario, load_scenario
@@ -99,8 +99,9 @@ def clearing_time(
         UserError: one line a mistake, or no operating point.
         LawError: the law is none.
     """
-    return _at_one(law, on, changes, partial(clearing.clearing_time, longest=longest, after=after,
-                                             within=within, watch=watch))  # fmt: skip
+    with scenario_under(law, on, **changes) as scenario:
+        found = clearing.clearing_time(scenario, longest, after, within, watch)
+    return _named(found, law)
 
 
 def clearing_map(
@@ -130,11 +131,10 @@ def clearing_map(
         LawError: the law is none, or a stage cannot have a value.
     """
 
-    def check(base: Scenario) -> None:
-        clearing.event_to_clear(base, longest, after, within)
-
+    base = load_scenario(on, in_process=True, **changes)
+    clearing.event_to_clear(base, longest, after, within)
     work = partial(clearing.clearing_time, longest=longest, after=after, within=within)
-    return _map(law, on, changes, over, check, work, ClearingTime.nowhere, workers, watch)
+    return _map(law, base, over, work, ClearingTime.nowhere, workers, watch)
 
 
 def attraction(
@@ -158,8 +158,9 @@ def attraction(
         UserError: one line a mistake, or no operating point.
         LawError: the law is none.
     """
-    work = partial(angles.attraction, after=after, within=within, watch=watch)
-    return _at_one(law, on, changes, work)
+    with scenario_under(law, on, **changes) as scenario:
+        found = angles.attraction(scenario, after, within, watch)
+    return _named(found, law)
 
 
 def attraction_map(
@@ -183,32 +184,21 @@ def attraction_map(
         UserError, LawError: as ``clearing_map``.
     """
 
-    def check(base: Scenario) -> None:
-        angles.check_attraction(base, after, within)
-
+    base = load_scenario(on, in_process=True, **changes)
+    angles.check_attraction(base, after, within)
     work = partial(angles.attraction, after=after, within=within)
-    return _map(law, on, changes, over, check, work, Attraction.nowhere, workers, watch)
+    return _map(law, base, over, work, Attraction.nowhere, workers, watch)
 
 
-def _at_one(
-    law: str | Path | Law | None,
-    on: str | Path | Scenario,
-    changes: dict[str, Any],
-    work: Callable[[Scenario], Found],
-) -> Found:
-    with law_files([] if law is None else [law]) as files:
-        for file in files.values():
-            changes = {**changes, "law": file}
-        found = work(load_scenario(on, in_process=True, **changes))
+def _named(found: Found, law: str | Path | Law | None) -> Found:
+    """With the name of a ``Law`` in place of that of its temporary file."""
     return replace(found, law=law.name) if isinstance(law, Law) else found
 
 
 def _map(
     law: str | Path | Law | None,
-    on: str | Path | Scenario,
-    changes: dict[str, Any],
+    base: Scenario,
     over: Over,
-    check: Callable[[Scenario], None],
     work: Callable[[Scenario], Found],
     nowhere: Callable[[Scenario], Found],
     workers: int,
@@ -216,8 +206,6 @@ def _map(
 ) -> TransientMap[Found]:
     """``work`` at every place of a map; ``nowhere`` is what it finds where none can begin."""
     axes = _axes(over)
-    base = load_scenario(on, in_process=True, **changes)
-    check(base)
     own = as_law(base.law if law is None else law)
     found: dict[int, Found] = {}
     with ExitStack() as stack:  # the law has files of its own while this lasts

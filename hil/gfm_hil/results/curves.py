@@ -114,19 +114,14 @@ class PackedCurves:
             for m in panel.marks
             if not m.lines and m.window[1] > m.window[0]
         ]
+        as_they_are = "colours", "bands", "events", "ends", "over", "log", "dots"
         self.plots.append(
             {
                 "x": self._abscissa(panel.x),
                 "curves": [[label, *self._pack(y)] for label, y in panel.curves.items()],
-                "colours": list(panel.colours),
                 "limits": limits,
                 "bars": bars,
-                "bands": panel.bands,
-                "events": panel.events,
-                "ends": panel.ends,
-                "over": panel.over,
-                "log": panel.log,
-                "dots": panel.dots,
+                **{name: getattr(panel, name) for name in as_they_are},
             }
         )
         return len(self.plots) - 1
