@@ -16,10 +16,11 @@ from gfm_design.model.closed_loop import T_S
 from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.synthesis import NotStabilised
 from gfm_hil.api.design import channels_as_json, law_text, problem_name
+from gfm_hil.cli.common import print_result
 from gfm_hil.cli.design.gains import (
     add_law_options,
+    channels_in_words,
     chosen_law,
-    print_channels,
     problem_title,
     read_gains,
 )
@@ -74,7 +75,7 @@ def call(options: argparse.Namespace) -> int:
     result = channels_as_json(channels) | {"seed": options.seed, "seconds": found.seconds}
     _write(Path(options.out), file, named, result | {"source": source}, box, demands)
     renamed = file.model_copy(update={"name": Path(options.out).stem})
-    print_channels(problem_title(renamed), channels)
+    print_result(options, result, channels_in_words(problem_title(renamed), channels))
     return 0
 
 

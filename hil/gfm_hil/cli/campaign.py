@@ -18,7 +18,6 @@ from gfm_hil.studies.workers import WorkerLost, processes
 
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", help="campaign file, or the name of a shipped one")
-    command.add_argument("-o", "--out", help="folder; runs/<campaign>-<time> by default")
     command.add_argument("--resume", action="store_true", help="run only what is missing in --out")
     command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
     command.add_argument("--dask", metavar="ADDRESS", help="run on a cluster, e.g. tcp://host:8786")
@@ -26,7 +25,7 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--y", metavar="PATH", help="the same; the first two drawn by default")
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
     common.add_open(command)
-    common.add_study_options(command, "campaign.json")
+    common.add_study_options(command, "campaign.json", "<campaign>")
 
 
 def call(options: argparse.Namespace) -> int:

@@ -62,7 +62,7 @@ def call(options: argparse.Namespace) -> int:
             raise UserError(f"--out: there is no certificate to draw; {found.unstable}")
         save_figure(options, lambda: draw(found))
     run = counter_run(scenario, found.unstable) if found.unstable else ""
-    print_result(options, _plain(found, networks, run), *_in_words(found, networks, run))
+    print_result(options, _plain(found, networks, run), _in_words(found, networks, run))
     return 0 if found.holds else 1 if found.unstable else 4
 
 

@@ -6,7 +6,7 @@ import re
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from gfm_runtime import law_file
 EXIT_OTHERWISE, EXIT_INTERRUPTED = 3, 130
 _ENDS = 3  # events shown from each end of a long run
 
-#: what the command line calls the overrides of ``load_scenario``
+#: what the command line calls the overrides of ``load_scenario``; argparse has each by its key
 OPTIONS = {
     "mode": "--mode",
     "link__type": "--link",
@@ -57,7 +57,10 @@ def add_scenario_options(command: argparse.ArgumentParser) -> None:
     """Options that override what a scenario says."""
     command.add_argument("scenario", help="scenario file, or the name of a shipped one")
     command.add_argument("--mode", choices=["lockstep", "realtime"], help="override mode")
-    command.add_argument("--link", help="override link.type: zmq, shm, serial, can or inproc")
+    command.add_argument(
+        "--link", dest="link__type", metavar="LINK",
+        help="override link.type: zmq, shm, serial, can or inproc",
+    )  # fmt: skip
     command.add_argument(
         "--endpoint", action="append", default=[],
         help="override link.endpoint, e.g. tcp://127.0.0.1:5555; of a network's plant repeat it for"
@@ -187,9 +190,8 @@ def endpoints(options: argparse.Namespace) -> dict[str, str]:
     return found
 
 
-def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Scenario:
-    """The scenario with its overrides; ``more`` goes to ``load_scenario``. Raises UserError: as
-    ``load_scenario``.
+def resolve(options: argparse.Namespace, named: bool = False, in_process: bool = False) -> Scenario:
+    """The scenario with its overrides. Raises UserError: as ``load_scenario``.
 
     Args:
         named: the command takes an endpoint for each converter, see ``endpoints``; the option
@@ -204,17 +206,10 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
                 f"--endpoint {name}={ends[name]}: for gfmhil plant; here a scenario names it, as"
                 f" network.converters.{name}.link.endpoint"
             )
-    own = {
-        "mode": options.mode,
-        "link__type": options.link,
-        "link__endpoint": None if named and options.converter is not None else ends.get(""),
-        "duration": options.duration,
-        "seed": options.seed,
-        "inner": options.inner,
-        "counts": options.counts,
-        **{f"link__options__{key}": value for key, value in options.option},
-        **more,
-    }
+    own = {key: getattr(options, key, None) for key in OPTIONS}
+    own |= {f"link__options__{key}": value for key, value in options.option}
+    if not named or options.converter is None:
+        own["link__endpoint"] = ends.get("")
     changed, names = settings(options)
     scenario = load_scenario(
         options.scenario,
@@ -224,7 +219,8 @@ def resolve(options: argparse.Namespace, named: bool = False, **more: Any) -> Sc
             **{f"link__options__{key}": f"--option {key}" for key, _ in options.option},
             **names,
         },
-        converter=options.converter if gets else None,
+        in_process,
+        options.converter if gets else None,
         **own | changed,
     )
     if options.inner is not None:
@@ -282,102 +278,101 @@ def watching(label: str, quiet: bool = False, stoppable: bool = False) -> Iterat
         yield Watch(tell, above(bar), lambda: interrupt.came)
 
 
-def add_study_options(command: argparse.ArgumentParser, printed: str) -> None:
-    """--json and --quiet; ``printed`` is what --json prints."""
+def add_study_options(command: argparse.ArgumentParser, printed: str, stem: str) -> None:
+    """--out, --json and --quiet: ``printed`` is what --json prints, ``stem`` begins the name of the
+    folder if none is given."""
+    said = f"folder; runs/{stem}-<time> by default"
+    command.add_argument("-o", "--out", metavar="DIR", help=said)
     command.add_argument("--json", action="store_true", help=f"print {printed}, nothing else")
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
 
 
-def print_result(options: argparse.Namespace, content: Any, *parts: str | Table) -> None:
-    """Print what a command computed: ``content`` as JSON if --json is given, else ``parts``, lines
-    with rich's markup and tables, and last the file of ``add_figure``'s option, if it is given."""
-    if options.json:
-        print(json.dumps(finite(content), indent=2))
-        return
+def print_parts(parts: Iterable[str | Table]) -> None:
+    """Print lines, which have rich's markup, and tables."""
     console = terminal(highlight=False)
     for part in parts:
         console.print(part, soft_wrap=isinstance(part, str))
+
+
+def print_result(options: argparse.Namespace, content: Any, parts: Iterable[str | Table]) -> None:
+    """Print what a command computed: ``content`` as JSON if --json is given, else ``parts``, and
+    the file of ``add_figure``'s option if it is given."""
+    if options.json:
+        print(json.dumps(finite(content), indent=2), flush=True)
+        return
+    print_parts(parts)
     if figure := getattr(options, "figure", None):
-        console.print(escape(f"figure: {figure}"), soft_wrap=True)
+        print_parts([escape(f"figure: {figure}")])
 
 
 @contextmanager
-def progress_bar(
-    scenario: Scenario, label: str, quiet: bool
-) -> Iterator[tuple[TellProgress, Notice]]:
+def progress_bar(scenario: Scenario, quiet: bool) -> Iterator[tuple[TellProgress, Notice]]:
     """A bar with simulated time and misses on stderr; yields (progress, notice)."""
-    columns = BarColumn(), TaskProgressColumn(), "{task.fields[sim]}", TimeRemainingColumn()
-    with progress("{task.description}", *columns, quiet=quiet) as bar:
-        task = bar.add_task(label, total=scenario.ticks, sim="")
+    with watching(scenario.title, quiet) as watch:
 
         def tell(ticks: int, misses: int) -> None:
-            sim = f"{ticks * scenario.T_s:.2f} s simulated"
-            bar.update(task, completed=ticks, sim=sim + (f", {misses} misses" if misses else ""))
+            late = f", {misses} misses" if misses else ""
+            words = f"{ticks * scenario.T_s:.2f} s simulated{late}"
+            watch.progress(ticks, scenario.ticks, words)
 
-        yield tell, above(bar)
+        yield tell, watch.notice
 
 
-def print_summary(summary: dict[str, Any], folder: Path, why: str = "") -> None:
+def _summary_in_words(
+    summary: dict[str, Any], folder: Path, why: str = ""
+) -> Iterator[str | Table]:
     """The short table that ends a run; ``why`` is a sentence more on its end."""
-    console = terminal()
     colour = "red" if summary["unmet"] else "green"
     reason = f" — {escape(summary['reason'])}" if summary["reason"] else ""
     expected = ", as expected" if as_expected(summary) else ""
-    console.print(f"[bold {colour}]{summary['status']}[/]{expected}{reason}", highlight=False)
+    yield f"[bold {colour}]{summary['status']}[/]{expected}{reason}"
     for part in summary["unmet"]:
-        console.print(f"[red]not as expected:[/] {escape(part)}", highlight=False)
+        yield f"[red]not as expected:[/] {escape(part)}"
     if why:
-        console.print(escape(why), highlight=False, soft_wrap=True)
+        yield escape(why)
     stage = f" · inner stage {inner_stages(summary)}" if has_stages(summary) else ""
-    console.print(escape(controlled_by(summary) + stage), highlight=False)
-    console.print(
+    yield escape(controlled_by(summary) + stage)
+    yield (
         f"{summary['link']}, {summary['mode']} · {summary['duration_s']:g} s in "
-        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {shown(summary['misses'])} misses",
-        highlight=False,
+        f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {shown(summary['misses'])} misses"
     )
     if "latency" in summary:
         console.print(escape(summary["latency"]), highlight=False, soft_wrap=True)
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
-        console.print(escape(f"round trip [µs]: {text}"), highlight=False)
+        yield escape(f"round trip [µs]: {text}")
     if "instructions" in summary:
         text = ", ".join(f"{k} {v}" for k, v in summary["instructions"].items())
-        console.print(f"instructions of a step: {text}", highlight=False)
+        yield f"instructions of a step: {text}"
     events = summary["events"]
     short = events if len(events) <= 2 * _ENDS else [*events[:_ENDS], *events[-_ENDS:]]
-    for table in events_table(short).fitting(console):
-        console.print(table)
+    yield from events_table(short).fitting(terminal())
     if left_out := len(events) - len(short):
-        console.print(
+        yield (
             f"{left_out} events between {short[_ENDS - 1]['t']:g} s and {short[_ENDS]['t']:g} s "
-            "are not shown; summary.json has all of them",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
-    console.print(escape(f"run folder: {folder}"), highlight=False, soft_wrap=True)
+            "are not shown; summary.json has all of them"
+        )
+    yield escape(f"run folder: {folder}")
 
 
-def _lasted(run: Run | NetworkRun) -> bool:
+def run_in_words(run: Run | NetworkRun, folder: Path, why: bool = False) -> Iterator[str | Table]:
+    """What ends a run; with ``why`` also what made it unstable, see ``why_it_ended``."""
     each = run.values() if isinstance(run, NetworkRun) else [run]
-    return all(one.status == "completed" for one in each)
-
-
-def print_run(run: Run | NetworkRun, folder: Path, why: bool = False) -> None:
-    """The tables that end a run; with ``why`` also what made it unstable, see ``why_it_ended``."""
-    reason = ""
+    lasted, reason = all(one.status == "completed" for one in each), ""
     if isinstance(run, Run) and "unstable_mode" in run.summary:
         reason = run.summary["unstable_mode"]
-    elif (why or isinstance(run, NetworkRun)) and not _lasted(run):
+    elif (why or isinstance(run, NetworkRun)) and not lasted:
         from gfm_hil.studies.linear_loop import why_it_ended  # a second of imports
 
         reason = why_it_ended(run)
     if isinstance(run, Run):
-        print_summary(run.summary, folder, reason)
+        yield from _summary_in_words(run.summary, folder, reason)
         return
     for name, one in run.items():
-        print(f"\n{name}")
-        print_summary(one.summary, folder / name)
+        yield f"\n{name}"
+        yield from _summary_in_words(one.summary, folder / name)
     if reason:
-        print(f"\n{reason}")
+        yield escape(f"\n{reason}")
 
 
 def exit_code(run: Run | NetworkRun) -> int:

@@ -1,12 +1,12 @@
 """gfmhil compare: one scenario under several laws, in one table and one figure."""
 
 import argparse
-import json
+from collections.abc import Iterator
 from typing import Any
 
 from rich.markup import escape
 
-from gfm_hil.api.runs import compare
+from gfm_hil.api.runs import Comparison, compare
 from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -31,14 +31,13 @@ def add(command: argparse.ArgumentParser) -> None:
         help="lay a recording of the same beside the runs: CSV, COMTRADE, Parquet, MF4 or MAT",
     )  # fmt: skip
     command.add_argument("--map", metavar="FILE", help="of --recording: what its channels are")
-    command.add_argument("-o", "--out", help="folder; runs/<scenario>-compare-<time> by default")
     common.add_open(command)
-    common.add_study_options(command, "comparison.json")
+    common.add_study_options(command, "comparison.json", "<scenario>-compare")
 
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; returns the worst exit code of its runs."""
-    asked = options.link or options.endpoint or options.option or options.mode == "realtime"
+    asked = options.link__type or options.endpoint or options.option or options.mode == "realtime"
     base = common.resolve(options, in_process=not asked)
     laws = common.split_laws(options.laws) if options.laws else base.compare
     if not laws:
@@ -49,20 +48,21 @@ def call(options: argparse.Namespace) -> int:
             base, laws, folder, converter=options.converter, recording=options.recording,
             map=options.map, watch=watch,
         )  # fmt: skip
-    if options.json:
-        print(json.dumps(found.summaries, indent=2))
-    else:
-        for converter, of in found.converters.items():
-            _print(of.summaries, of.events, converter)
-        for why in filter(None, (s.get("unstable_mode") for s in found.summaries.values())):
-            terminal().print(escape(why), highlight=False, soft_wrap=True)
+    common.print_result(options, found.summaries, _in_words(found))
     common.show_page(options, folder / PAGE)
     return max(common.exit_code(run) for run in found.values())
 
 
-def _print(
+def _in_words(found: Comparison) -> Iterator[str | Table]:
+    for converter, of in found.converters.items():
+        yield from _table(of.summaries, of.events, converter).fitting(terminal())
+    reasons = (summary.get("unstable_mode") for summary in found.summaries.values())
+    yield from map(escape, filter(None, reasons))
+
+
+def _table(
     summaries: dict[str, dict[str, Any]], events: list[dict[str, Any]], converter: str
-) -> None:
+) -> Table:
     rows: list[list[Any]] = [["status", *(s["status"] for s in summaries.values())]]
     for k, event in enumerate(events):
         rows.append([Cell(f"{event['label']} @ {event['t']:g} s", "head")])
@@ -70,6 +70,4 @@ def _print(
         for key, title in event_rows(same):
             if key not in ("label", "t"):
                 rows.append(["  " + title, *(e.get(key) for e in same)])
-    console = terminal()
-    for table in Table([converter, *summaries], rows).fitting(console):
-        console.print(table)
+    return Table([converter, *summaries], rows)

@@ -16,18 +16,10 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.realtime.priority import processors
 from gfm_hil.results.report import PAGE
 from gfm_hil.results.table import Cell, Table
-from gfm_hil.studies.conformity import verdict
+from gfm_hil.studies.conformity import sets, verdict
 from gfm_hil.studies.conformity.diff import SHARE, compare_results, read_results
 from gfm_hil.studies.conformity.execute import PartResult
 from gfm_hil.studies.conformity.result import Conformity
-from gfm_hil.studies.conformity.sets import (
-    ALL,
-    Case,
-    all_limits,
-    count_limits,
-    load_cases,
-    shipped_sets,
-)
 from gfm_runtime import law_names
 
 EXIT_FAILED = 1
@@ -85,7 +77,8 @@ def add(command: argparse.ArgumentParser) -> None:
     common.add_inner(command)
     command.add_argument(
         "--against", action="extend", nargs="+", metavar="SET",
-        help=f"{', '.join(shipped_sets())}, or paths of your own; all: the shipped ones (default)",
+        help=f"{', '.join(sets.shipped_sets())}, or paths of your own; all: the shipped ones "
+        "(default)",
     )  # fmt: skip
     command.add_argument(
         "--converter", metavar="FILE", help="the converter under test; the shipped one by default"
@@ -101,9 +94,6 @@ def add(command: argparse.ArgumentParser) -> None:
         "with its own law, if not given",
     )  # fmt: skip
     command.add_argument(
-        "-o", "--out", metavar="DIR", help="folder; runs/conform-<time> by default"
-    )
-    command.add_argument(
         "--workers", type=int, default=processors(), metavar="N",
         help="processes; all cores by default",
     )  # fmt: skip
@@ -114,17 +104,17 @@ def add(command: argparse.ArgumentParser) -> None:
         "run nothing",
     )  # fmt: skip
     common.add_open(command)
-    common.add_study_options(command, "results.json")
+    common.add_study_options(command, "results.json", "conform")
 
 
 def call(options: argparse.Namespace) -> int:
-    against = options.against or [ALL]
+    against = options.against or [sets.ALL]
     if options.list:
-        cases = load_cases(against)
-        rows = {"tests": _tests, "parts": _parts, "limits": all_limits}[options.list](cases)
+        cases = sets.load_cases(against)
+        rows = {"tests": _tests, "parts": _parts, "limits": sets.all_limits}[options.list](cases)
         table = Table([*rows[0]], [[*row.values()] for row in rows], text=None)
-        counts = [escape(count_limits(rows))] if options.list == "limits" else []
-        common.print_result(options, rows, table, *counts)
+        counts = [escape(sets.count_limits(rows))] if options.list == "limits" else []
+        common.print_result(options, rows, [table, *counts])
         return 0
     if options.recording is not None:
         return _recording(options)
@@ -132,7 +122,7 @@ def call(options: argparse.Namespace) -> int:
         raise UserError("--part: is of a --recording; name the test alone")
     if not options.law and options.controller is None and options.network is None:
         raise UserError("--law: missing; name a law, or all, or a --controller")
-    laws = [n for law in options.law or [] for n in (law_names() if law == ALL else [law])]
+    laws = [n for law in options.law or [] for n in (law_names() if law == sets.ALL else [law])]
     folder, began = common.new_folder(options.out, "conform"), time.monotonic()
     with common.watching("conform", options.quiet, stoppable=True) as watch:
         found = conform(
@@ -179,11 +169,11 @@ def _diff(options: argparse.Namespace) -> int:
     ]  # fmt: skip
     tables = [Table(heads, rows, text=None)] if rows else []
     notes = map(escape, found.notes)
-    common.print_result(options, found.plain(), *notes, *tables, escape(found.words))
+    common.print_result(options, found.plain(), [*notes, *tables, escape(found.words)])
     return EXIT_FAILED if found.worse else 0
 
 
-def _tests(cases: Sequence[Case]) -> list[dict[str, Any]]:
+def _tests(cases: Sequence[sets.Case]) -> list[dict[str, Any]]:
     return [
         {
             "test": case.id, "runs": len(case.test.runs()), "title": case.test.title,
@@ -193,7 +183,7 @@ def _tests(cases: Sequence[Case]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _parts(cases: Sequence[Case]) -> list[dict[str, Any]]:
+def _parts(cases: Sequence[sets.Case]) -> list[dict[str, Any]]:
     return [
         {"test": case.id, "part": part.name, "title": part.title or case.test.title}
         for case in cases
@@ -210,13 +200,13 @@ def _why(part: PartResult) -> list[tuple[str, ...]]:
 
 def _tell(options: argparse.Namespace, result: Conformity, wall_s: float, folder: Path) -> int:
     """What ends the command: a short table, the report; returns the exit code."""
-    parts = *map(escape, result.recordings.values()), *_in_words(result, wall_s)
-    common.print_result(options, result.plain(), *parts)
+    common.print_result(options, result.plain(), _in_words(result, wall_s))
     common.show_page(options, folder / PAGE)
     return _EXIT[result.verdict]
 
 
 def _in_words(result: Conformity, wall_s: float) -> Iterator[str | Table]:
+    yield from map(escape, result.recordings.values())
     rows: list[list[Any]] = []
     if len(result.laws) == 1:
         for case in result.cases:

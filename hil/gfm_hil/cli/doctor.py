@@ -25,5 +25,5 @@ def call(options: argparse.Namespace) -> int:
         rows.append((Cell(f.level, _STYLES[f.level]), f.what, f.found))
         if f.advice:
             rows.append(("", "", f"→ {f.advice}"))
-    print_result(options, content, Table((), rows, text=None, fold=2))
+    print_result(options, content, [Table((), rows, text=None, fold=2)])
     return EXIT_OTHERWISE if options.strict and level == "red" else 0

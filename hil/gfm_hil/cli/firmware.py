@@ -1,7 +1,6 @@
 """gfmhil firmware: laws as C99, their golden vectors, and the check on a processor."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -9,7 +8,10 @@ from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner
+from rich.markup import escape
+
+from gfm_hil.api.law import write_files
+from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner, print_result
 from gfm_hil.controllers.compile_model import compile_model
 from gfm_hil.controllers.dll import describe_model
 from gfm_hil.core.errors import UserError, need
@@ -18,7 +20,6 @@ from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_runtime import BuiltLaw, LawSet, firmware, law_file, law_names, load_law
 from gfm_runtime.firmware import CHECKED, EVA, FIXED, FMI, REALS, SHIPPED, STYLES, TARGETS
-from gfm_runtime.lawfile import LawFile
 
 ALL = "all"
 _SHOWN = 8  # files of laws that export names one by one
@@ -28,7 +29,7 @@ _MOST = 1_000_000  # golden rows of a law, which fill some hundred megabytes
 def add(command: argparse.ArgumentParser) -> None:
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
     out = kinds.add_parser("export", help="write laws as C99, with golden vectors and a self-test")
-    _add_laws(out, (*REALS, FIXED))
+    _add_laws(out)
     out.add_argument(
         "--style", choices=STYLES, default=STYLES[0],
         help="unrolled: constants in the code (default); tunable: gains in RAM, changed by a call; "
@@ -70,7 +71,7 @@ def add(command: argparse.ArgumentParser) -> None:
     a2l.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the .a2l")
     a2l.set_defaults(call=call_a2l)
     vectors = kinds.add_parser("golden", help="write golden vectors of laws as CSV")
-    _add_laws(vectors, (*REALS, FIXED))
+    _add_laws(vectors)
     vectors.add_argument(
         "--ticks", type=int, default=SHIPPED, metavar="N", help=f"rows of each law ({SHIPPED})"
     )
@@ -101,11 +102,11 @@ def add(command: argparse.ArgumentParser) -> None:
     proof.set_defaults(call=call_check)
 
 
-def _add_laws(command: argparse.ArgumentParser, reals: Sequence[str]) -> None:
+def _add_laws(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "laws", nargs="+", metavar="LAW", help=f"names, .toml files, or {ALL}: every law that ships"
     )
-    _add_how(command, reals)
+    _add_how(command, (*REALS, FIXED))
 
 
 def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> None:
@@ -122,7 +123,7 @@ def _add_how(command: argparse.ArgumentParser, reals: Sequence[str] = REALS) -> 
 
 
 def call_export(options: argparse.Namespace) -> int:
-    sets = _sets(options.laws, options.inner, options.counts)
+    sets = _sets(options)
     scheduled = [one for one in sets if one.schedule is not None]
     which = "fixed point" if options.real == FIXED else "--style tunable"
     if ALL in options.laws and scheduled and (options.real == FIXED or options.style == "tunable"):
@@ -130,15 +131,11 @@ def call_export(options: argparse.Namespace) -> int:
         names = ", ".join(one.name for one in scheduled)
         print(f"gfmhil: {names}: left out, since {which} does not cover schedules", file=sys.stderr)
         scheduled = []
-    laws, omega_b = _laws(sets), _omega_b(options.f_n)
-    files = firmware.export(
-        laws, options.T_s, options.real, options.style, omega_b, scheduled,
-        _files(options.laws) if options.style == "tunable" else None,
-    )  # fmt: skip
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, text in files.items():
-        (options.out / name).parent.mkdir(exist_ok=True)
-        write_text(options.out / name, text)
+    laws, omega_b, own = _laws(sets), _omega_b(options.f_n), None
+    if options.style == "tunable":
+        own = {file.name: file for file in map(law_file, _names(options.laws))}
+    files = firmware.export(laws, options.T_s, options.real, options.style, omega_b, scheduled, own)
+    write_files(options.out, files)
     modules = [name for name in files if Path(name).name.startswith("gfm_")]
     shown = [f"{len(modules)} files gfm_*"] if len(modules) > _SHOWN else modules
     print(f"{options.out}: {', '.join([*shown, *(n for n in files if n not in modules)])}")
@@ -154,9 +151,7 @@ def call_export(options: argparse.Namespace) -> int:
 def call_dll(options: argparse.Namespace) -> int:
     law = load_law(options.law, options.inner, options.counts)
     files = firmware.dll_sources(law, options.T_s, options.real, _omega_b(options.f_n))
-    options.out.mkdir(parents=True, exist_ok=True)
-    for file, text in files.items():
-        write_text(options.out / file, text)
+    write_files(options.out, files)
     print(firmware.build_dll(options.out, law.name, files))
     return 0
 
@@ -197,7 +192,7 @@ def call_a2l(options: argparse.Namespace) -> int:
 
 
 def call_golden(options: argparse.Namespace) -> int:
-    laws, omega_b = _laws(_sets(options.laws, options.inner, options.counts)), _omega_b(options.f_n)
+    laws, omega_b = _laws(_sets(options)), _omega_b(options.f_n)
     modules = firmware.make_modules(laws, options.T_s, options.real, omega_b)
     text = firmware.golden(modules, _ticks(options.ticks)).csv()
     if options.out is None:
@@ -216,44 +211,38 @@ def call_check(options: argparse.Namespace) -> int:
     """Check a folder and print a table; 3 if a bit differs, or Frama-C has an alarm."""
     if options.target == EVA:
         proofs = firmware.prove(options.folder)
-        if options.json:
-            print(json.dumps([asdict(proof) for proof in proofs], indent=2))
-        else:
-            _print_proofs(proofs)
+        rows = [(p.name, p.functions, p.alarms, f"{p.seconds:g}") for p in proofs]
+        table = Table(("law", "functions", "alarms", "seconds"), rows)
+        print_result(options, [asdict(proof) for proof in proofs], [table])
         return EXIT_OTHERWISE if any(proof.alarms for proof in proofs) else 0
     results = firmware.check(options.folder, options.target, options.flags, _ticks(options.ticks))
-    if options.json:
-        print(json.dumps([asdict(result) for result in results], indent=2))
-    else:
-        _print(results)
-        flags = TARGETS[options.target].optimised if options.flags is None else options.flags
-        differ = sum(result.differ for result in results)
-        words = f"words that differ: {differ}" if differ else "no word differs"
-        print(f"{options.target}, {flags}: {words}")
-        if differ:
-            print(
-                "gfmhil: words differ from the kernel's: look for a fused multiply-add, sums in a "
-                "wider type, numbers flushed to zero, or a changed source",
-                file=sys.stderr,
-            )
-    return EXIT_OTHERWISE if any(result.differ for result in results) else 0
+    flags = TARGETS[options.target].optimised if options.flags is None else options.flags
+    differ = sum(result.differ for result in results)
+    words = f"words that differ: {differ}" if differ else "no word differs"
+    said = escape(f"{options.target}, {flags}: {words}")
+    print_result(options, [asdict(result) for result in results], [_table(results), said])
+    if differ and not options.json:
+        print(
+            "gfmhil: words differ from the kernel's: look for a fused multiply-add, sums in a "
+            "wider type, numbers flushed to zero, or a changed source",
+            file=sys.stderr,
+        )
+    return EXIT_OTHERWISE if differ else 0
 
 
-def _sets(names: Sequence[str], inner: str | None, counts: str | None) -> list[LawSet]:
-    """The laws of these names, with an inner stage, and measurement and modulation, in place of
+def _names(given: Sequence[str]) -> list[str]:
+    """The names of laws, with those of all that ship in place of ``ALL``."""
+    return [name for one in given for name in (law_names() if one == ALL else [one])]
+
+
+def _sets(options: argparse.Namespace) -> list[LawSet]:
+    """The laws that are named, with an inner stage, and measurement and modulation, in place of
     their own."""
-    given = (name for one in names for name in (law_names() if one == ALL else [one]))
-    return [load_law(name, inner, counts) for name in given]
-
-
-def _files(names: Sequence[str]) -> dict[str, LawFile]:
-    """The files of the laws of these names, by their names."""
-    given = (name for one in names for name in (law_names() if one == ALL else [one]))
-    return {file.name: file for file in map(law_file, given)}
+    return [load_law(name, options.inner, options.counts) for name in _names(options.laws)]
 
 
 def _laws(sets: Sequence[LawSet]) -> dict[str, BuiltLaw]:
-    """Laws by name; a scheduled law in its stages."""
+    """Laws by name; a scheduled law in its stages. Raises UserError: two have one name."""
     laws: dict[str, BuiltLaw] = {}
     for found in sets:
         for label, law in zip(firmware.stage_names(found), found.laws, strict=True):
@@ -275,13 +264,7 @@ def _ticks(ticks: int) -> int:
     return ticks
 
 
-def _print_proofs(proofs: Sequence[firmware.ProofResult]) -> None:
-    rows = [(p.name, p.functions, p.alarms, f"{p.seconds:g}") for p in proofs]
-    table = Table(("law", "functions", "alarms", "seconds"), rows)
-    terminal().print(table, highlight=False)
-
-
-def _print(results: Sequence[firmware.CheckResult]) -> None:
+def _table(results: Sequence[firmware.CheckResult]) -> Table:
     heads = ("law", "rows", "words that differ", "instructions", "of these checks", "code [B]",
              "constants [B]", "state [B]", "stack [B]")  # fmt: skip
     rows = [
@@ -293,4 +276,4 @@ def _print(results: Sequence[firmware.CheckResult]) -> None:
         for r in results
     ]  # fmt: skip
     about = "constants: read-only data; state: one instance; report.md counts the law's numbers"
-    terminal().print(Table(heads, rows, caption=about), highlight=False)
+    return Table(heads, rows, caption=about)

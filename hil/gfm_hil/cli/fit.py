@@ -40,10 +40,12 @@ def call(options: argparse.Namespace) -> int:
         [name, f"{getattr(found, name):.4g}", f"{low:.4g} to {high:.4g}", _UNITS[name]]
         for name, (low, high) in ((name, found.interval[name]) for name in _UNITS)
     ]
-    print_result(
-        options, content, *about, Table(["", "", "95 %", ""], rows, text=None),
+    said: list[str | Table] = [
+        *about,
+        Table(["", "", "95 %", ""], rows, text=None),
         "REGFM_A1: mp, TPf and X_L = X_eff; REGFM_B1: X_L = X_eff, 1/mp + D1 = D and",
         "H + D2/(2 omega_D) + TPf D/2 = H, which one jump does not part",
         f"left after the jump: {found.left:.2g} p.u. RMS; before it p has {found.noise:.2g}",
-    )  # fmt: skip
+    ]
+    print_result(options, content, said)
     return 0

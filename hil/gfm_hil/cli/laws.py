@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from gfm_hil.api.dyr import MODELS, read_dyr
 from gfm_hil.api.dyr_nearest import nearest_record
-from gfm_hil.api.law import Law, cell_text
+from gfm_hil.api.law import Law, cell_text, table_ii
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_new
 from gfm_hil.core.terminal import terminal
@@ -29,24 +29,24 @@ from gfm_runtime import (
 from gfm_runtime.inner_file import acting, inner_names, named_inner
 from gfm_runtime.law import HomeGrid
 from gfm_runtime.lawfile import LawFile
-from gfm_runtime.signals import U_NAMES, Y_NAMES
+from gfm_runtime.signals import Y_NAMES
 
+#: options that list other laws than the paper's: their names, and what they are
+_GROUPS = {
+    "tuned": (tuned_names, "those with the gains of the law comparison"),
+    "grid": (grid_names, "those for grid codes, with a droop of 5 %%"),
+    "industry": (
+        industry_names,
+        "those of the industry: REGFM_A1, REGFM_B1, grid-following, grid-following-pv",
+    ),
+}
 MATRICES = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0")
 
 
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="as JSON")
-    command.add_argument(
-        "--tuned", action="store_true", help="those with the gains of the law comparison"
-    )
-    command.add_argument(
-        "--grid", action="store_true", help="those for grid codes, with a droop of 5 %%"
-    )
-    command.add_argument(
-        "--industry",
-        action="store_true",
-        help="those of the industry: REGFM_A1, REGFM_B1, grid-following, grid-following-pv",
-    )
+    for group, (_, text) in _GROUPS.items():
+        command.add_argument(f"--{group}", action="store_true", help=text)
     kinds = command.add_subparsers(metavar="show|import|export")
     show = kinds.add_parser("show", help="one law, with its transfer functions")
     show.add_argument("name", help="catalogue name or law file")
@@ -73,36 +73,30 @@ def add(command: argparse.ArgumentParser) -> None:
 
 
 def call(options: argparse.Namespace) -> int:
-    rows = []
-    groups = [
-        (options.tuned, tuned_names),
-        (options.grid, grid_names),
-        (options.industry, industry_names),
-    ]
-    chosen = [names for asked, names in groups if asked] or [law_names]
-    for name in (name for names in chosen for name in names()):
+    rows, lines = [], []
+    chosen = [names for group, (names, _) in _GROUPS.items() if getattr(options, group)]
+    for name in (name for names in chosen or [law_names] for name in names()):
         laws, file = load_law(name), law_file(name)
-        first = laws.first
+        first, order = laws.first, discretise(laws.first, 1e-4).order
+        elements = {k: cell_text(file, k) for k in sorted({*file.phi, *file.psi})}
         rows.append(
             {
                 "name": name,
                 "title": first.title,
-                "order": discretise(first, 1e-4).order,
+                "order": order,
                 "error_map": first.error_map,
-                "elements": {k: cell_text(file, k) for k in sorted({*file.phi, *file.psi})},
+                "elements": elements,
                 "stages": len(laws.laws),
                 "home_grid": first.home_grid.model_dump(),
                 "source": " ".join(first.source.split()),
             }
         )
+        cells = "  ".join(f"φ{k} {v}" for k, v in elements.items())
+        weak = "" if first.home_grid.L_g == 1 else " (weak grid)"
+        lines.append((name, order, cells, f"{first.title}{weak}"))
     if options.json:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
         return 0
-    lines = []
-    for row in rows:
-        cells = "  ".join(f"φ{k} {v}" for k, v in row["elements"].items())  # type: ignore[attr-defined]
-        weak = "" if row["home_grid"]["L_g"] == 1 else " (weak grid)"  # type: ignore[index]
-        lines.append((row["name"], row["order"], cells, f"{row['title']}{weak}"))
     console = terminal()
     heads = ("law", "states", "elements of Φ(s)", "title")
     console.print(Table(heads, lines, text=None))
@@ -151,10 +145,7 @@ def call_show(options: argparse.Namespace) -> int:
     console.print(f"errors: {first.error_map} · grid: {first.home_grid.note}")
     if why := _unstable(options, first.home_grid):
         console.print(f"[red]on this grid {escape(why)}[/]", soft_wrap=True)
-    elements = [
-        (u, *(cell_text(file, f"{i + 1}{j + 1}") for j in range(5))) for i, u in enumerate(U_NAMES)
-    ]
-    console.print(Table(("Φ(s)", *Y_NAMES), elements, text=None))
+    console.print(Table(("Φ(s)", *Y_NAMES), table_ii(file), text=None))
     values = [(n, f"{p.value:g}", p.unit, p.source) for n, p in first.parameters.items()]
     console.print(Table(("parameter", "value", "unit", "source"), values, text=None))
     if first.inner is not None:
@@ -194,7 +185,7 @@ def _as_json(file: LawFile, discrete: list[DiscreteLaw]) -> dict[str, Any]:
         "title": law.title,
         "source": " ".join(law.source.split()),
         "error_map": law.error_map,
-        "phi": [[cell_text(file, f"{i + 1}{j + 1}") for j in range(5)] for i in range(3)],
+        "phi": [cells for _, *cells in table_ii(file)],
         "parameters": {
             n: {"value": p.value, "unit": p.unit, "source": p.source}
             for n, p in law.parameters.items()

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from gfm_hil.api.runs import merge
-from gfm_hil.cli.common import add_open, exit_code, new_folder, print_run, show_page
+from gfm_hil.cli import common
 from gfm_hil.results.report import PAGE
 
 
@@ -20,12 +20,12 @@ def add(command: argparse.ArgumentParser) -> None:
         help="folder of the other side, or of each controller",
     )  # fmt: skip
     command.add_argument("-o", "--out", help="run folder; runs/merged-<time> by default")
-    add_open(command)
+    common.add_open(command)
 
 
 def call(options: argparse.Namespace) -> int:
-    folder = new_folder(options.out, "merged")
+    folder = common.new_folder(options.out, "merged")
     run = merge(options.first, options.others, folder)
-    print_run(run, folder)
-    show_page(options, folder / PAGE)
-    return exit_code(run)
+    common.print_parts(common.run_in_words(run, folder))
+    common.show_page(options, folder / PAGE)
+    return common.exit_code(run)

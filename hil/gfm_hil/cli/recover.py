@@ -1,11 +1,10 @@
 """gfmhil recover: complete the folder of a run that was cut off."""
 
 import argparse
-import json
 from pathlib import Path
 
 from gfm_hil.api.runs import recover
-from gfm_hil.cli.common import add_open, print_run, show_page
+from gfm_hil.cli.common import add_open, print_result, run_in_words, show_page
 from gfm_hil.results.report import PAGE
 
 
@@ -22,9 +21,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     run = recover(options.folder)
-    if options.json:
-        print(json.dumps(run.summary, indent=2))
-    else:
-        print_run(run, options.folder)
+    print_result(options, run.summary, run_in_words(run, options.folder))
     show_page(options, options.folder / PAGE)
     return 0

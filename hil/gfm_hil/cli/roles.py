@@ -31,9 +31,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     role: Role = options.command
-    scenario = _of_one(
-        role, common.resolve(options, named=True, law=options.law), options.converter
-    )
+    scenario = _of_one(role, common.resolve(options, named=True), options.converter)
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")
     given = _match_endpoints(scenario, common.endpoints(options))
@@ -55,7 +53,7 @@ def call(options: argparse.Namespace) -> int:
 
     run = run_side(role, scenario, folder, given, notice, write_report, external)
     if not options.quiet:
-        common.print_run(run, folder)
+        common.print_parts(common.run_in_words(run, folder))
     return common.exit_code(run)
 
 

@@ -2,10 +2,10 @@
 
 import argparse
 import contextlib
-import json
+import os
 import subprocess
 import sys
-from pathlib import Path
+from typing import Any
 
 from gfm_hil.api.runs import run as run_one
 from gfm_hil.api.runs import run_network
@@ -46,7 +46,7 @@ def add(command: argparse.ArgumentParser) -> None:
         help="keep the state of both sides at this time in the run folder, s; lockstep",
     )  # fmt: skip
     command.add_argument(
-        "--from", dest="start_from", metavar="RUN",
+        "--from", dest="start_from", metavar="RUN", type=os.path.abspath,
         help="start where the snapshot in this run folder was taken",
     )  # fmt: skip
     command.add_argument("-o", "--out", help="run folder; runs/<scenario>-<time> by default")
@@ -69,11 +69,7 @@ def call(options: argparse.Namespace) -> int:
     pil = any(text.rpartition("=")[2].startswith(PIL) for text in options.controller)
     if pil and not options.mode:
         options.mode = "lockstep"  # QEMU keeps no time
-    scenario = common.resolve(
-        options, law=options.law, waveforms=options.waveforms, snapshot=options.snapshot,
-        cores=options.cores,
-        start_from=options.start_from and str(Path(options.start_from).absolute()),
-    )  # fmt: skip
+    scenario = common.resolve(options)
     folder = common.new_folder(options.out, find_scenario(options.scenario).stem)
     figures = not options.no_figures
     controllers = common.by_converter("--controller", options.controller, scenario.parts)
@@ -85,22 +81,14 @@ def call(options: argparse.Namespace) -> int:
             beside = companion(name, folder, number, scenario.in_process)
             if (process := stack.enter_context(beside)) is not None:
                 stay[name] = process
-        if scenario.network is not None:
-            with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-                run = run_network(
-                    scenario, folder, controllers=controllers, ports=maps,
-                    figures=figures, progress=progress, notice=notice,
-                )  # fmt: skip
-        else:
-            with common.progress_bar(scenario, scenario.title, options.quiet) as (progress, notice):
-                run = run_one(
-                    scenario, folder=folder, controller=controllers.get(""), ports=maps.get(""),
-                    figures=figures, progress=progress, notice=notice,
-                )  # fmt: skip
-        if options.json:
-            print(json.dumps(run.summary, indent=2), flush=True)
-        else:
-            common.print_run(run, folder, why=True)
+        with common.progress_bar(scenario, options.quiet) as (progress, notice):
+            how: dict[str, Any] = {"figures": figures, "progress": progress, "notice": notice}
+            if scenario.network is not None:
+                run = run_network(scenario, folder, controllers=controllers, ports=maps, **how)
+            else:
+                how |= {"controller": controllers.get(""), "ports": maps.get("")}
+                run = run_one(scenario, folder=folder, **how)
+        common.print_result(options, run.summary, common.run_in_words(run, folder, why=True))
         common.show_page(options, folder / PAGE)
         for name, process in stay.items():
             if process.poll() is None and not _was_stopped(run):

@@ -55,9 +55,7 @@ def add(command: argparse.ArgumentParser) -> None:
         "--controller", metavar="COMMAND",
         help="measure another controller: a program with its arguments, {endpoint} and {scenario}",
     )  # fmt: skip
-    command.add_argument("-o", "--out", metavar="DIR",
-                         help="folder; runs/scan-<name>-<time> by default")  # fmt: skip
-    add_study_options(command, "identification.json")
+    add_study_options(command, "identification.json", "scan-<name>")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -73,7 +71,7 @@ def call(options: argparse.Namespace) -> int:
         )  # fmt: skip
     found.save(folder, options.grid)
     content = json.loads((folder / "identification.json").read_text(encoding="utf-8"))
-    print_result(options, content, *_in_words(found, content), escape(f"folder: {folder}"))
+    print_result(options, content, _in_words(found, content, folder))
     return 0
 
 
@@ -113,7 +111,7 @@ def _which(what: str, scenario: str | None) -> tuple[str | None, str]:
     return None, what
 
 
-def _in_words(found: FrequencyScan, content: dict[str, Any]) -> Iterator[str | Table]:
+def _in_words(found: FrequencyScan, content: dict[str, Any], folder: Path) -> Iterator[str | Table]:
     yield f"[bold]{escape(found.name)}[/] · {escape(found.scenario.title)}"
     dev = found.deviation
     heads = ["f [Hz]", "|Y_dd|", "|Y_qq|", "λ_min(Y+Yᴴ)", "|Δp/Δω_g|"]
@@ -145,3 +143,4 @@ def _in_words(found: FrequencyScan, content: dict[str, Any]) -> Iterator[str | T
             f"SCR {grid['scr']:g}, X/R {grid['x_over_r']:g}: {verdict}{why}, margin "
             f"{shown(grid['margin'])} at {grid['margin_at_hz']:.4g} Hz"
         )
+    yield escape(f"folder: {folder}")

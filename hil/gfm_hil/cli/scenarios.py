@@ -21,5 +21,5 @@ def call(options: argparse.Namespace) -> int:
         for name, s in found.items()
     ]
     heads = ("scenario", "mode", "laws", "s", "title")
-    print_result(options, content, Table(heads, lines, text=None, fold=2))
+    print_result(options, content, [Table(heads, lines, text=None, fold=2)])
     return 0

@@ -58,7 +58,7 @@ def call(options: argparse.Namespace) -> int:
         for name, values in results.items()
         for part, value in (values.items() if isinstance(values, dict) else [("", values)])
     ]
-    common.print_result(options, results, Table(("", "value"), rows, text=None))
+    common.print_result(options, results, [Table(("", "value"), rows, text=None)])
     for file in options.out:
         _write(file, between, run.scenario.title)
     return 0

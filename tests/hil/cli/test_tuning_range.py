@@ -30,7 +30,6 @@ def test_gamma_is_the_largest_of_all_grids_and_none_of_them_is_left_out():
     ("options", "says"),
     [
         (["--scr", "3"], "scr: are those of a scenario's grid"),
-        (["--scr", "3,x", "--scenario", "pref_step"], "--scr '3,x': must be numbers"),
         (["--scr", "-3", "--scenario", "pref_step"], "scr"),
     ],
 )
@@ -38,3 +37,10 @@ def test_a_wrong_range_is_told_in_a_line(capsys, options, says):
     assert main(["design", "tune", "--law", "vsg-2", "--quiet", *options]) == 2
     err = capsys.readouterr().err
     assert says in err and err.count("\n") == 1
+
+
+def test_ratios_that_are_no_numbers_are_told_in_a_line(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["design", "tune", "--law", "vsg-2", "--scr", "3,x"])
+    err = capsys.readouterr().err
+    assert "--scr: '3,x': must be numbers" in err and err.count("\n") == 1

@@ -3,7 +3,7 @@
 import argparse
 import functools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from gfm_design.norms.performance import WeightedChannel
 from gfm_design.tuning.paper import EVALUATIONS
 from gfm_hil.api import design
 from gfm_hil.api.law import Law
-from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, add_settings, numbers, watching
+from gfm_hil.cli import common
 from gfm_hil.cli.design.common import add_converter_option, chosen_scenario
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -51,7 +51,7 @@ def add_judged_on(command: argparse.ArgumentParser) -> None:
         help="scenario file or shipped name: its sampled loop in place of the paper's problem",
     )
     add_converter_option(command)
-    add_settings(command)
+    common.add_settings(command)
 
 
 def judged_on(options: argparse.Namespace) -> Scenario | None:
@@ -71,7 +71,7 @@ def judged_on(options: argparse.Namespace) -> Scenario | None:
 def add_law_options(command: argparse.ArgumentParser) -> None:
     """The law, its inner stage, its gains, the weights, and JSON."""
     command.add_argument("--law", required=True, help="catalogue name or law file")
-    add_inner(command)
+    common.add_inner(command)
     command.add_argument("--gains", help="k=v,…: other values (tune: other starts)")
     command.add_argument("--weights", help="TOML file of weights; the paper's six by default")
     command.add_argument("--json", action="store_true", help="as JSON")
@@ -118,21 +118,21 @@ _W = {1: "P_ref", 2: "ω_g"}
 _Z = {1: "P_ref − p", 2: "p", 3: "ω_u", 4: "q + V/D_q"}
 
 
-def print_channels(name: str, channels: Sequence[WeightedChannel], more: str = "") -> None:
+def channels_in_words(
+    name: str, channels: Sequence[WeightedChannel], more: str = ""
+) -> Iterator[str | Table]:
     """gamma, with ``more`` behind it, and its channels as a table."""
     rows = [
         [f"W_{c.i}{c.j} T_{c.i}{c.j}", f"{c.norm:.6g}", "∞" if np.isinf(c.omega) else c.omega]
         for c in channels
     ]
-    console = terminal(highlight=False)
-    console.print(f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}{more}")
-    console.print(Table(("channel", "‖W T‖∞", "at [rad/s]"), rows, text=None))
+    yield f"[bold]{name}[/]: γ = {max(c.norm for c in channels):.6g}{more}"
+    yield Table(("channel", "‖W T‖∞", "at [rad/s]"), rows, text=None)
     for c in channels:
         if np.isinf(c.omega):
-            console.print(
+            yield (
                 f"W_{c.i}{c.j} T_{c.i}{c.j} is largest at infinite frequency: {_W[c.j]} acts on "
-                f"{_Z[c.i]} at once, and W_{c.i}{c.j} does not fall there",
-                soft_wrap=True,
+                f"{_Z[c.i]} at once, and W_{c.i}{c.j} does not fall there"
             )
 
 
@@ -160,15 +160,12 @@ def _gamma(options: argparse.Namespace) -> int:
         T_s = T_S if options.discrete else None
         channels = design.gamma(law, options.weights, T_s, on=on, converter=converter).channels
     except Unstable as found:
-        if options.json:
-            print(json.dumps({"law": law.name, "gamma": None, "reason": str(found)}))
-        else:
-            terminal().print(f"{law.name}: no gamma, {found}", highlight=False)
-        return EXIT_OTHERWISE
-    if options.json:
-        print(json.dumps({"law": law.name, **design.channels_as_json(channels)}, indent=2))
-    else:
-        print_channels(problem_title(law.file, on, converter), channels)
+        none = {"law": law.name, "gamma": None, "reason": str(found)}
+        common.print_result(options, none, [f"{law.name}: no gamma, {found}"])
+        return common.EXIT_OTHERWISE
+    content = {"law": law.name, **design.channels_as_json(channels)}
+    title = problem_title(law.file, on, converter)
+    common.print_result(options, content, channels_in_words(title, channels))
     return 0
 
 
@@ -191,7 +188,7 @@ def _add_tune(kinds: Any) -> None:
         help="every mode of the loop must decay at least this fast, 1/s",
     )  # fmt: skip
     command.add_argument(
-        "--scr", metavar="A,B,…", type=numbers, default=[],
+        "--scr", metavar="A,B,…", type=common.numbers, default=[],
         help="short-circuit ratios of the scenario's grid, in all of which the law is judged",
     )  # fmt: skip
     command.add_argument("--full-order", action="store_true", help="also compute a lower bound")
@@ -211,7 +208,7 @@ def _tune(options: argparse.Namespace) -> int:
     if options.full_order and law.file.inner is not None:
         raise UserError("--full-order: the bound is that of a law on the bridge; use --inner none")
     try:
-        with watching(f"tuning {law.name}", options.quiet) as watch:
+        with common.watching(f"tuning {law.name}", options.quiet) as watch:
             found = design.tune(
                 law, start=read_gains(options.gains),
                 only=None if options.only is None else options.only.split(","),
@@ -224,7 +221,7 @@ def _tune(options: argparse.Namespace) -> int:
             print(json.dumps({"law": law.name, "gamma": None, "reason": str(none)}))
         else:
             terminal(stderr=True).print(f"{law.name}: {none}", highlight=False, soft_wrap=True)
-        return EXIT_OTHERWISE
+        return common.EXIT_OTHERWISE
     named, channels = found.gains, found.gamma.channels
     result = {
         "law": law.name,
@@ -243,12 +240,10 @@ def _tune(options: argparse.Namespace) -> int:
     if options.out:
         problem = None if on is None else design.problem_name(law.file, on, *more)
         design.write_law(Path(options.out), law.file, named, result, problem=problem)
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return 0
     began = "unstable" if found.before is None else f"{found.before.value:.6g}"
-    print_channels(problem_title(law.file, on, *more), channels, f", before the search {began}")
-    lines = [
+    title = problem_title(law.file, on, *more)
+    lines: list[str | Table] = [
+        *channels_in_words(title, channels, f", before the search {began}"),
         *(f"no free gain moves W_{c.i}{c.j} T_{c.i}{c.j}, the largest" for c in found.unmoved),
         ", ".join(f"{n} = {v:.6g}" for n, v in named.items()),
         f"{found.evaluations} evaluations in {found.seconds:.1f} s, seed {found.seed}"
@@ -256,7 +251,7 @@ def _tune(options: argparse.Namespace) -> int:
         *(f"{n} is at its bound {x:g}: γ may fall beyond it" for n, x in found.at_bounds.items()),
         said,
     ]
-    terminal(highlight=False, soft_wrap=True).print("\n".join(line for line in lines if line))
+    common.print_result(options, result, [line for line in lines if line])
     return 0
 
 

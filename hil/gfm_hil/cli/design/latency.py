@@ -13,6 +13,7 @@ from gfm_hil.api.law import laws
 from gfm_hil.cli.common import EXIT_OTHERWISE, add_inner, print_result, watching
 from gfm_hil.cli.design.common import add_converter_option
 from gfm_hil.core.errors import UserError
+from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.latency import as_json, tolerance_table, used_table
 
@@ -89,7 +90,7 @@ def call(options: argparse.Namespace) -> int:
         ],
     }
     tables = (used_table(one.name, one.misses, of) for one, of in both)
-    title = f"[bold]{scenario.title}[/]"
-    print_result(options, content, title, tolerance_table(found), *tables)
+    said: list[str | Table] = [f"[bold]{scenario.title}[/]", tolerance_table(found), *tables]
+    print_result(options, content, said)
     red = any(u.light == "red" for of in used for u in of.values())
     return EXIT_OTHERWISE if red or not stable else 0

@@ -78,7 +78,7 @@ def call(options: argparse.Namespace) -> int:
     except UnstableLoop as problem:
         return no_margins(options, label, scenario.title, problem)
     content = {"law": label, "scenario": scenario.title} | content
-    print_result(options, content, common.heading(label, scenario, options), table)
+    print_result(options, content, [common.heading(label, scenario, options), table])
     return 0
 
 

@@ -85,7 +85,7 @@ def call(options: argparse.Namespace) -> int:
     if region is not None:
         content["region"] = {n: getattr(region, n).tolist() for n in ("L_g", "R_g", "sigma")}
         said.append(f"figures: {options.figures}")
-    print_result(options, content, *said)
+    print_result(options, content, said)
     return 0
 
 
@@ -133,7 +133,7 @@ def no_margins(
     """Say that an unstable loop has none, and ``more``; returns the exit code."""
     content = {"law": law, "scenario": scenario, "stable": False}
     content |= {"mode": problem.mode.plain(), "reason": str(problem)}
-    print_result(options, content, escape(f"{law}: no margins, {problem}{more}"))
+    print_result(options, content, [escape(f"{law}: no margins, {problem}{more}")])
     return EXIT_OTHERWISE
 
 

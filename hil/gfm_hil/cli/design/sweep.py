@@ -67,10 +67,12 @@ def _sweep(options: argparse.Namespace) -> int:
         "slowest": [mode and mode.plain() for mode in found.slowest()],
     }
     ranges = " and ".join(f"{low:.6g} to {high:.6g}" for low, high in found.stable())
-    print_result(
-        options, content, common.heading(found.law, scenario, options), _sweep_table(found),
+    said: list[str | Table] = [
+        common.heading(found.law, scenario, options),
+        _sweep_table(found),
         f"stable for {found.gain} of {ranges or 'no value here'}; the law has {found.own:g}",
-    )  # fmt: skip
+    ]
+    print_result(options, content, said)
     return 0
 
 
@@ -107,9 +109,11 @@ def _map(options: argparse.Namespace) -> int:
         )  # fmt: skip
     common.save_figure(options, lambda: stability_map(found))
     rows = {name: getattr(found, name).tolist() for name in ("values", "scr", "sigma")}
-    said = [
+    said: list[str | Table] = [
+        common.heading(found.law, scenario, options),
+        _map_table(found),
         f"{min(_ROWS, len(found.scr))} of {len(found.scr)} grids, for each of which "
-        f"{len(found.values)} values were tried"
+        f"{len(found.values)} values were tried",
     ]
     if own := common.grid_of(scenario):
         low, high = (float(found.scr[k]) for k in (0, -1))
@@ -118,8 +122,7 @@ def _map(options: argparse.Namespace) -> int:
             f"all have X/R {own[1]:.3g}; SCR {low:g} to {high:g} {inside} the scenario's "
             f"{own[0]:.3g}"
         )
-    heading = common.heading(found.law, scenario, options)
-    print_result(options, _about(found, scenario) | rows, heading, _map_table(found), *said)
+    print_result(options, _about(found, scenario) | rows, said)
     return 0
 
 

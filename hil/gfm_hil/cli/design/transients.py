@@ -138,5 +138,5 @@ def _tell(
         for row in rows
     ]
     table = Table([*heads, *columns, "runs"], cells, text=0)
-    print_result(options, content, f"[bold]{scenario.law}[/] · {scenario.title}", table)
+    print_result(options, content, [f"[bold]{scenario.law}[/] · {scenario.title}", table])
     return 0
