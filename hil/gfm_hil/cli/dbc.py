@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_or_print
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 
@@ -16,7 +17,9 @@ _RATES = {
 
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--classic", action="store_true", help="classic CAN instead of CAN FD")
-    command.add_argument("-o", "--out", metavar="FILE", help="where to write; else to the screen")
+    command.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help="where to write; else to the screen"
+    )
     command.add_argument("--budget", action="store_true", help="frame times at common bit rates")
     command.add_argument(
         "--inner", action="store_true", help="with --budget: of a run with an inner stage"
@@ -32,14 +35,7 @@ def call(options: argparse.Namespace) -> int:
         return 0
     from gfm_hil.links.can.dbc import write_dbc
 
-    text = write_dbc(not options.classic)
-    if options.out is None:
-        print(text, end="")
-        return 0
-    try:
-        Path(options.out).write_text(text, encoding="utf-8")
-    except OSError as problem:
-        raise UserError(f"--out {options.out}: {problem.strerror}") from None
+    write_or_print(options.out, write_dbc(not options.classic))
     return 0
 
 

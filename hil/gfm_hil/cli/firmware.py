@@ -15,7 +15,7 @@ from gfm_hil.cli.common import EXIT_OTHERWISE, add_counts, add_inner, print_resu
 from gfm_hil.controllers.compile_model import compile_model
 from gfm_hil.controllers.dll import describe_model
 from gfm_hil.core.errors import UserError, need
-from gfm_hil.core.files import replacing, write_text
+from gfm_hil.core.files import replacing, write_or_print, write_text
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_runtime import BuiltLaw, LawSet, firmware, law_file, law_names, load_law
@@ -194,11 +194,7 @@ def call_a2l(options: argparse.Namespace) -> int:
 def call_golden(options: argparse.Namespace) -> int:
     laws, omega_b = _laws(_sets(options)), _omega_b(options.f_n)
     modules = firmware.make_modules(laws, options.T_s, options.real, omega_b)
-    text = firmware.golden(modules, _ticks(options.ticks)).csv()
-    if options.out is None:
-        print(text, end="")
-    else:
-        write_text(options.out, text)
+    write_or_print(options.out, firmware.golden(modules, _ticks(options.ticks)).csv())
     return 0
 
 

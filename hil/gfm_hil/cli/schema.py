@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from gfm_hil.core.files import write_text
+from gfm_hil.core.files import write_or_print
 from gfm_hil.scenario import Scenario
 from gfm_hil.studies.campaign.spec import CampaignFile
 from gfm_hil.studies.conformity.criteria.base import UnderTest
@@ -48,9 +48,5 @@ def call(options: argparse.Namespace) -> int:
         **MODELS[options.kind].json_schema(),
         "title": f"gfmhil {_NAMES.get(options.kind, options.kind)} file",
     }
-    text = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
-    if options.out is None:
-        print(text, end="")
-    else:
-        write_text(options.out, text)
+    write_or_print(options.out, json.dumps(schema, indent=2, ensure_ascii=False) + "\n")
     return 0

@@ -139,6 +139,14 @@ def write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def write_or_print(path: Path | None, text: str) -> None:
+    """Write a text file, see ``write_text``, or print the text if it has no path."""
+    if path is None:
+        print(text, end="")
+    else:
+        write_text(path, text)
+
+
 def write_new(path: Path, text: str, overwrite: bool = False) -> Path:
     """Write a text file; returns its path. Raises UserError: it is there already and not to
     ``overwrite``, or cannot be written."""
