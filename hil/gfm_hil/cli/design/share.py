@@ -1,15 +1,13 @@
 """gfmhil design share: stability of a network against the share of its grid-forming converters."""
 
 import argparse
-import json
 from typing import Any
 
 from rich.markup import escape
 
 from gfm_hil.api.plot import forming_shares as draw
-from gfm_hil.cli.common import watching
+from gfm_hil.cli.common import print_result, watching
 from gfm_hil.cli.design.common import add_figure, save_figure
-from gfm_hil.core.terminal import terminal
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.forming_share import BEST, FOLLOWING, FormingShare, forming_shares
@@ -43,17 +41,12 @@ def call(options: argparse.Namespace) -> int:
     order = BEST if options.best else [name for name in options.order.split(",") if name]
     with watching("share of grid-forming") as watch:
         each = forming_shares(scenario, options.law, order, watch)
-    if options.out:
-        save_figure(options.out, lambda: draw(each, scenario.title))
-    if options.json:
-        content = {"scenario": scenario.title, "law": options.law}
-        print(json.dumps(content | {"shares": [one.plain() for one in each]}, indent=2))
-        return 0
-    console = terminal(highlight=False)
-    console.print(f"[bold]{escape(options.law)}[/] · {escape(scenario.title)}", soft_wrap=True)
-    console.print(_table(each))
-    if options.out:
-        console.print(f"figure: {options.out}", soft_wrap=True)
+    save_figure(options, lambda: draw(each, scenario.title))
+    content = {
+        "scenario": scenario.title, "law": options.law, "shares": [one.plain() for one in each]
+    }  # fmt: skip
+    title = f"[bold]{escape(options.law)}[/] · {escape(scenario.title)}"
+    print_result(options, content, [title, _table(each)])
     return 0
 
 
