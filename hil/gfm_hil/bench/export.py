@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench.histogram import SHARES, dense, lower_ends
-from gfm_hil.core.errors import UserError
+from gfm_hil.bench.histogram import SHARES, bars
+from gfm_hil.core.errors import UserError, need
 
 Row = dict[str, Any]
 #: by name what reads them
@@ -38,20 +38,12 @@ def _name(row: Row) -> str:
     return f"{row['name']}, {row['mode']}, {row['load']}"
 
 
-def _middles(row: Row) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of each bucket that is not empty, ns, and its count."""
-    counts, ends = dense(row["histogram"]), lower_ends()
-    at = np.flatnonzero(counts)
-    return (ends[at] + ends[at + 1] - 1) / 2, counts[at]
-
-
 def _hdr(content: Row, rows: list[Row]) -> str:
     """A line for each row, with its name as the tag."""
-    try:
-        from hdrh.histogram import HdrHistogram
-        from hdrh.log import HistogramLogWriter
-    except ImportError:
-        raise UserError("hdr: needs hdrhistogram: pip install 'gfmhil[bench]'") from None
+    need("hdrh", "hdrhistogram", "hdr:", "bench")
+    from hdrh.histogram import HdrHistogram
+    from hdrh.log import HistogramLogWriter
+
     out = io.StringIO()
     log = HistogramLogWriter(out)
     log.output_log_format_version()
@@ -59,7 +51,7 @@ def _hdr(content: Row, rows: list[Row]) -> str:
     log.output_legend()
     for row in rows:
         histogram = HdrHistogram(1, _MOST_NS, _DIGITS)
-        for value, count in zip(*_middles(row), strict=True):
+        for value, count in zip(*bars(row["histogram"]), strict=True):
             histogram.record_value(max(1, int(value)), int(count))
         histogram.set_tag(_name(row).replace(", ", "-").replace(" ", "_"))
         log.output_interval_histogram(histogram, 0, content["seconds"], 1e6)
@@ -96,7 +88,7 @@ def _pytest(content: Row, rows: list[Row]) -> str:
 
 def _statistics(row: Row) -> dict[str, Any]:
     """In s, from the histogram."""
-    at, counts = _middles(row)
+    at, counts = bars(row["histogram"])
     at = at * 1e-9
     mean = float(np.average(at, weights=counts))
     share = np.cumsum(counts) / counts.sum()
@@ -121,7 +113,7 @@ def _prometheus(content: Row, rows: list[Row]) -> str:
         )
         for key, share in SHARES.items():
             lines.append(f'{name}{{{labels},quantile="{share:g}"}} {row[f"{key}_us"] * 1e-6:.9g}')
-        at, counts = _middles(row)
+        at, counts = bars(row["histogram"])
         lines.append(f"{name}_sum{{{labels}}} {float(at @ counts) * 1e-9:.9g}")
         lines.append(f"{name}_count{{{labels}}} {row['n']}")
     return "\n".join(lines) + "\n"

@@ -17,7 +17,7 @@ BUCKETS = (_OCTAVES + 2) * _HALF
 RESOLUTION = 1 / _HALF  # largest width of a bucket relative to its lower end
 
 SHARES = {"p50": 0.5, "p90": 0.9, "p99": 0.99, "p99_9": 0.999, "p99_99": 0.9999, "max": 1.0}
-_BY_ROUND = ("p50", "p90", "p99")
+_BY_ROUND = [*SHARES.values()][:3]  # p50, p90, p99
 
 Counts = NDArray[np.int64]
 
@@ -50,7 +50,8 @@ def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
 
 def sparse(counts: Counts) -> list[list[int]]:
     """[bucket, count] of all that are not empty, for JSON."""
-    return [[int(k), int(counts[k])] for k in np.flatnonzero(counts)]
+    at = np.flatnonzero(counts)
+    return np.column_stack([at, counts[at]]).tolist()
 
 
 def dense(pairs: Sequence[Sequence[int]]) -> Counts:
@@ -60,28 +61,43 @@ def dense(pairs: Sequence[Sequence[int]]) -> Counts:
     return counts
 
 
+def bars(pairs: Sequence[Sequence[int]]) -> tuple[NDArray[np.float64], Counts]:
+    """The middle of each bucket that is not empty, ns, and its count, from the output of
+    ``sparse``; at least one."""
+    (at, counts), ends = np.transpose(pairs), lower_ends()
+    return (ends[at] + ends[at + 1] - 1) / 2, counts
+
+
 def summary(rounds: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
     """``summary_of_counts`` of rounds of times in ns; rounds without times are ignored."""
     return summary_of_counts([histogram(times) for times in rounds if len(times)])
 
 
 def summary_of_counts(counts: Sequence[Counts]) -> dict[str, Any]:
-    """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of the histograms of rounds.
+    """``summarised`` of the histograms of rounds."""
+    whole: Counts = np.sum(counts, axis=0, dtype=np.int64)
+    return summarised(whole, [of_round(some) for some in counts])
+
+
+def of_round(counts: Counts) -> list[float]:
+    """What ``summarised`` needs of a round: p50, p90 and p99, ns."""
+    return quantiles(counts, _BY_ROUND)
+
+
+def summarised(whole: Counts, rounds: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """``n``, ``<percentile>_us``, ``rounds_p50_us`` and ``histogram`` of ``whole``, the histogram
+    of all rounds, and of each ``of_round``.
 
     p50, p90 and p99 are medians over the rounds; from p99.9 on a round has too few times, so these
     percentiles and the histogram are of all rounds together. None stands for an unknown value.
     """
-    found: dict[str, Any] = {f"{name}_us": None for name in SHARES}
-    found |= {"n": 0, "rounds_p50_us": [], "histogram": []}
-    if not counts:
-        return found
-    each = np.array([quantiles(some, list(SHARES.values())) for some in counts]) / 1e3
-    whole: Counts = np.sum(counts, axis=0)
-    over_all = np.array(quantiles(whole, list(SHARES.values()))) / 1e3
-    for k, name in enumerate(SHARES):
-        value = np.median(each[:, k]) if name in _BY_ROUND else over_all[k]
-        found[f"{name}_us"] = round(float(value), 3)
-    found["n"] = int(whole.sum())
-    found["rounds_p50_us"] = [round(float(x), 4) for x in each[:, 0]]
-    found["histogram"] = sparse(whole)
-    return found
+    if not rounds:
+        unknown: dict[str, Any] = {f"{name}_us": None for name in SHARES}
+        return unknown | {"n": 0, "rounds_p50_us": [], "histogram": []}
+    values = [*np.median(rounds, axis=0), *quantiles(whole, [*SHARES.values()])[len(_BY_ROUND) :]]
+    return {
+        **{f"{key}_us": round(float(ns) / 1e3, 3) for key, ns in zip(SHARES, values, strict=True)},
+        "n": int(whole.sum()),
+        "rounds_p50_us": [round(p50 / 1e3, 4) for p50, *_ in rounds],
+        "histogram": sparse(whole),
+    }

@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.bench.histogram import BUCKETS, SHARES, Counts, dense, histogram, quantiles, sparse
+from gfm_hil.bench.histogram import BUCKETS, Counts, dense, histogram, of_round, sparse, summarised
+from gfm_hil.bench.result import FORMAT
 from gfm_hil.bench.tail import beyond, confidence
 from gfm_hil.core.errors import UserError
+from gfm_hil.run.attribution import bursts
 
 WORST = 10
 COLUMNS = 360  # of the heat map, at most
@@ -51,18 +53,16 @@ class Block:
         late = np.flatnonzero(times_ns > self.limit_ns) if self.limit_ns else times_ns[:0]
         events = times_ns
         if len(late):
-            last = np.flatnonzero(np.diff(late, append=-1) != 1)
-            self.bursts.update(np.diff(last, prepend=-1).tolist())
+            self.bursts.update(dict(bursts([late])))
             # a burst is one event, as bad as its worst
-            starts = np.concatenate([[0], last[:-1] + 1])
+            starts = np.flatnonzero(np.diff(late, prepend=-2) != 1)
             events = times_ns.copy()
             events[late] = 0
             events[late[starts]] = np.maximum.reduceat(times_ns[late], starts)
         top = np.argpartition(events, -min(WORST, len(events)))[-WORST:]
         since = self.limit_ns * top if self.limit_ns else np.cumsum(times_ns)[top]
-        found = zip((at + 1e-9 * since).tolist(), (events[top] / 1e3).tolist(), strict=True)
-        self.worst += [(place, us, cause) for place, us in found]
-        self.worst = sorted(self.worst, key=lambda one: -one[1])[:WORST]
+        each = zip((at + 1e-9 * since).tolist(), (events[top] / 1e3).tolist(), strict=True)
+        self.worst = _worst([*self.worst, *((place, us, cause) for place, us in each)])
 
     def line(self, cell: Cell) -> str:
         """For the file."""
@@ -72,6 +72,10 @@ class Block:
             "worst": [(round(at, 4), round(us, 3), cause) for at, us, cause in self.worst],
         }  # fmt: skip
         return json.dumps(content, separators=(",", ":")) + "\n"
+
+
+def _worst(events: list[Any]) -> list[Any]:
+    return sorted(events, key=lambda event: -event[1])[:WORST]
 
 
 class Blocks:
@@ -88,29 +92,26 @@ class Blocks:
     def __init__(
         self, folder: Path, settings: dict[str, Any], about: dict[str, Any], resume: bool
     ) -> None:
-        self._path, place = folder / _FILE, folder / _SETTINGS
+        path = folder / _FILE
         if resume:
             known = settings_of(folder)
             for key, value in settings.items():
                 if known.get(key) != value:
                     raise UserError(f"--resume: {key} was {known.get(key)!r}, and is {value!r} now")
+            os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
         else:
             folder.mkdir(parents=True, exist_ok=True)
-            place.write_text(json.dumps(settings | about, indent=1) + "\n", encoding="utf-8")
-            self._path.touch()
-        whole = _whole(self._path)
-        self._file = self._path.open("r+b")
-        self._file.truncate(whole)
-        self._file.seek(whole)
+            text = json.dumps(settings | about, indent=1) + "\n"
+            (folder / _SETTINGS).write_text(text, encoding="utf-8")
+            path.write_bytes(b"")
+        self._file = path.open("ab")
+        self.close = self._file.close
 
     def append(self, cell: Cell, block: Block) -> None:
         """Write a block; it is on the disk when this returns."""
         self._file.write(block.line(cell).encode())
         self._file.flush()
         os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        self._file.close()
 
 
 def settings_of(folder: Path) -> dict[str, Any]:
@@ -126,28 +127,12 @@ def holds_night(folder: Path) -> bool:
     return (folder / _SETTINGS).exists()
 
 
-def _whole(path: Path) -> int:
-    """Bytes up to the last whole line."""
-    with path.open("rb") as file:
-        end = file.seek(0, os.SEEK_END)
-        while end:
-            begin = max(0, end - (1 << 16))
-            file.seek(begin)
-            at = file.read(end - begin).rfind(b"\n")
-            if at >= 0:
-                return begin + at + 1
-            end = begin
-    return 0
-
-
 def lines_of(folder: Path) -> Iterator[dict[str, Any]]:
     """The blocks of a night, one after the other. Raises UserError: the file is damaged."""
     path = folder / _FILE
     with path.open("rb") as file:
-        left = _whole(path)
         for number, line in enumerate(file, 1):
-            left -= len(line)
-            if left < 0:
+            if not line.endswith(b"\n"):  # it is being written, or was cut off
                 return
             try:
                 yield json.loads(line)
@@ -160,7 +145,7 @@ class CellNight:
 
     def __init__(self) -> None:
         self.counts = np.zeros(BUCKETS, np.int64)
-        self.each: list[list[float]] = []  # p50, p90, p99 of each block, µs
+        self.each: list[list[float]] = []  # ``of_round`` of each block
         self.worst: list[list[Any]] = []
         self.bursts: Counter[int] = Counter()
         self.measured_s = 0.0
@@ -169,12 +154,14 @@ class CellNight:
 
     def add(self, block: dict[str, Any]) -> None:
         """Take a block in, as ``lines_of`` gives it."""
+        self.measured_s += block["s"]
+        if not block["histogram"]:  # nobody answered
+            return
         counts = dense(block["histogram"])
         self.counts += counts
-        self.each.append([x / 1e3 for x in quantiles(counts, [0.5, 0.9, 0.99])])
-        self.worst = sorted([*self.worst, *block["worst"]], key=lambda one: -one[1])[:WORST]
+        self.each.append(of_round(counts))
+        self.worst = _worst([*self.worst, *block["worst"]])
         self.bursts.update({int(k): int(n) for k, n in block["bursts"]})
-        self.measured_s += block["s"]
         column = counts.reshape(ROWS, PER_ROW).sum(axis=1)
         if (len(self.each) - 1) % self._together:
             self._heat[-1][1][:] += column
@@ -188,14 +175,9 @@ class CellNight:
     def row(self, cell: Cell) -> dict[str, Any]:
         """The row of a result, with ``night``: what a short measurement has not."""
         name, mode, load = cell
-        whole = np.array(quantiles(self.counts, list(SHARES.values()))) / 1e3
-        values = {f"{key}_us": round(float(x), 3) for key, x in zip(SHARES, whole, strict=True)}
-        for key, x in zip(("p50", "p90", "p99"), np.median(self.each, axis=0), strict=True):
-            values[f"{key}_us"] = round(float(x), 3)
         return {
-            "name": name, "mode": mode, "load": load, **values, **confidence(self.counts),
-            "n": int(self.counts.sum()), "histogram": sparse(self.counts),
-            "rounds_p50_us": [round(one[0], 4) for one in self.each],
+            "name": name, "mode": mode, "load": load,
+            **summarised(self.counts, self.each), **confidence(self.counts),
             "night": {
                 "worst": self.worst, "bursts": sorted(self.bursts.items()),
                 "beyond": beyond(self.counts), "measured_s": round(self.measured_s, 1),
@@ -215,17 +197,16 @@ def night_of(folder: Path) -> dict[str, Any]:
     for block in lines_of(folder):
         name, mode, load = block["cell"]
         cells.setdefault((name, mode, load), CellNight()).add(block)
-    about = settings.pop("contenders", {})
     rows = [
         {
             "policy": settings["policy"], "payload": settings["payload"], "baseline": None,
             "ratio_to_baseline_p50": None, "rounds_ratio": [], "silent_rounds": 0,
-            **about[cell[0]], **one.row(cell),
+            **settings["contenders"][cell[0]], **one.row(cell),
         }
         for cell, one in cells.items()
     ]  # fmt: skip
     return {
-        "format": 1, "bench": "latency", "results": rows, "remarks": [],
+        "format": FORMAT, "bench": "latency", "results": rows, "remarks": [],
         "environment": settings["environment"], "caveats": settings["caveats"],
         "seconds": round(sum(one.measured_s for one in cells.values()), 1),
     }  # fmt: skip

@@ -9,15 +9,14 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from gfm_hil.bench.histogram import dense, lower_ends
+from gfm_hil.bench.histogram import bars, lower_ends
 from gfm_hil.bench.night import PER_ROW
 from gfm_hil.bench.tables import lockstep_name, micro
 from gfm_hil.links import link_names
-from gfm_hil.results.figures import COLOURS, dress
+from gfm_hil.results.figures import COLOURS, GREY, dress
 from gfm_hil.run.attribution import CAUSES
 
-_GREY = "#888888"
-_BLUE, _RED, _GREEN, _PINK, _ORANGE, _SKY, _BLACK = COLOURS
+_BLUE, _, _, _, _ORANGE, _SKY, _BLACK = COLOURS
 _CAUSE_COLOURS = dict(zip(CAUSES, (_BLUE, _ORANGE, _SKY, "#b8b8b8"), strict=True))
 
 Row = dict[str, Any]
@@ -31,13 +30,10 @@ def _colours(names: list[str]) -> dict[str, str]:
 
 def _curve(row: Row) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """1/(1 - q) and the µs that a share q does not exceed, one point per bucket."""
-    counts = dense(row["histogram"])
-    at = np.flatnonzero(counts)
-    share = np.cumsum(counts)[at] / counts.sum()
-    ends = lower_ends()
-    us = (ends[at] + ends[at + 1]) / 2e3
+    middles, counts = bars(row["histogram"])
+    share = np.cumsum(counts) / counts.sum()
     beyond = np.maximum(1 - share, 0.5 / counts.sum())  # last point: as if half a time exceeds it
-    return 1 / beyond, us
+    return 1 / beyond, middles / 1e3
 
 
 def _percentile_axis(axes: Axes, nines: int) -> None:
@@ -88,7 +84,7 @@ def latency(content: Row) -> Figure | None:
 
     def draw(axes: Axes, row: Row) -> None:
         limit = row["peer"] == "C"
-        colour, alpha = (limits if limit else look).get(row["name"], (_GREY, 1.0))
+        colour, alpha = (limits if limit else look).get(row["name"], (GREY, 1.0))
         axes.plot(
             *_curve(row), color=colour, alpha=alpha, label=row["name"],
             lw=1.1 if limit else 1.7, ls=(0, (3, 2)) if limit else "-",
@@ -106,9 +102,9 @@ def night(content: Row) -> Figure | None:
     ends = lower_ends()[::PER_ROW] / 1e3
     for axes, row in zip(figure.subplots(len(rows), squeeze=False)[:, 0], rows, strict=True):
         heat = row["night"]["heat"]
-        at = np.array([*heat["at"], 2 * heat["at"][-1] - heat["at"][0] if len(heat["at"]) < 2 else
-                       2 * heat["at"][-1] - heat["at"][-2]])  # fmt: skip
-        hours = (at - at[0]) / 3600 if len(heat["at"]) > 1 else np.array([0.0, 1 / 360])
+        hours = np.subtract(heat["at"], heat["at"][0]) / 3600
+        last = hours[-1] - hours[-2] if len(hours) > 1 else 1 / 360
+        hours = np.append(hours, hours[-1] + last)
         counts = np.zeros((len(ends) - 1, len(heat["counts"])))
         for column, pairs in enumerate(heat["counts"]):
             for k, n in pairs:
@@ -138,7 +134,7 @@ def jitter(content: Row) -> Figure | None:
 
     def draw(axes: Axes, row: Row) -> None:
         axes.plot(*_curve(row), color=colours[row["wait"]], lw=1.5, label=row["wait"])
-        axes.axhline(row["period_us"], color=_GREY, lw=0.8, ls=(0, (4, 3)))
+        axes.axhline(row["period_us"], color=GREY, lw=0.8, ls=(0, (4, 3)))
 
     return _panels(rows, ["policy", "load"], "later than its deadline [µs]", draw)
 
@@ -192,14 +188,15 @@ def lockstep(content: Row) -> Figure | None:
     colours = _colours([])
     rates = [r["times_real_time"]["median"] for r in rows]
     y = np.arange(len(rows))[::-1]
-    axes.barh(y, rates, 0.6, color=[colours.get(r["link"], _GREY) for r in rows])
+    drawn = axes.barh(y, rates, 0.6, color=[colours.get(r["link"], GREY) for r in rows])
     axes.set_yticks(y, [lockstep_name(r) for r in rows])
-    for at, rate, row in zip(y, rates, rows, strict=True):
-        axes.annotate(
-            f"{rate:.3g} × ({row['share_of_plant_alone']['median']:.0%} of the plant alone)",
-            (rate, at), (4, 0), textcoords="offset points", va="center", fontsize=8,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
-        )  # fmt: skip
+    shares = [r["share_of_plant_alone"]["median"] for r in rows]
+    texts = [
+        f"{rate:.3g} × ({share:.0%} of the plant alone)"
+        for rate, share in zip(rates, shares, strict=True)
+    ]
+    white = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+    axes.bar_label(drawn, texts, padding=4, fontsize=8, bbox=white)
     axes.axvline(1.0, color=_BLACK, lw=0.9, ls=(0, (4, 3)))
     axes.set_xscale("log")
     axes.set_xlim(min(0.5, min(rates) / 2), max(rates) * 12)
@@ -215,8 +212,7 @@ def kernel(content: Row) -> Figure | None:
     real = rows[0]["real"]
     rows = sorted((r for r in rows if r["real"] == real), key=lambda r: r["numba_ns"]["median"])
     figure = Figure(figsize=(8.2, 1.0 + 0.19 * len(rows)), layout="constrained")
-    axes = figure.subplots()
-    y = np.arange(len(rows))
+    axes, y = figure.subplots(), np.arange(len(rows))
     dress(axes, f"one step of the kernel [ns], {real}")
     axes.scatter([r["numba_ns"]["median"] for r in rows], y, s=26, color=_BLUE, label="numba")
     if rows[0]["c_ns"]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import write_text
 from gfm_hil.realtime.environment import StealTime, caveats, environment
 
 FORMAT = 1
@@ -20,8 +21,7 @@ FORMAT = 1
 @contextmanager
 def new_result(kind: str) -> Iterator[dict[str, Any]]:
     """A result without measurements; it is complete when the context ends."""
-    begin, steal = time.monotonic(), StealTime()
-    badge = environment()
+    begin, steal, badge = time.monotonic(), StealTime(), environment()
     content: dict[str, Any] = {"format": FORMAT, "bench": kind, "results": [], "remarks": []}
     content["environment"] = badge
     yield content
@@ -33,7 +33,7 @@ def new_result(kind: str) -> Iterator[dict[str, Any]]:
 def write_result(content: dict[str, Any], path: Path) -> None:
     """Write a result as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def read_result(path: Path) -> dict[str, Any]:

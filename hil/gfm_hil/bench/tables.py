@@ -40,8 +40,16 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def _of(key: str, show: Callable[[Any], str]) -> Column:
-    return lambda row: show(row[key])
+def _of(show: Callable[[Any], str], *keys: str) -> Column:
+    """What a row has under a key, or under one within another: None if it is not there."""
+
+    def cell(row: Row) -> str:
+        value: Any = row
+        for key in keys:
+            value = (value or {}).get(key)
+        return show(value)
+
+    return cell
 
 
 def _number(key: str, form: str = ",") -> Column:
@@ -53,49 +61,44 @@ def _median(key: str, form: str, unit: str = "") -> Column:
     return lambda row: format(row[key]["median"], form) + unit if row[key] else "–"
 
 
-_PERCENTILES = {name.replace("_", "."): _of(f"{name}_us", micro) for name in SHARES}
+def _longest(bursts: list[tuple[int, int]]) -> str:
+    return str(max((length for length, _ in bursts), default=0))
+
+
+_CELL: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
+_PERCENTILES = {name.replace("_", "."): _of(micro, f"{name}_us") for name in SHARES}
 
 
 def latency_tables(content: Row) -> Iterator[Table]:
-    """Round trips, one table per mode and load."""
+    """Round trips, one table per mode and load, and both ways to who answers elsewhere."""
     rows = content["results"]
+    columns = {
+        "": "name", "code": "code", **_PERCENTILES, "n": _number("n"),
+        "of it the bench": _of(micro, "bench_us"), "p50 : limit": _limit,
+    }  # fmt: skip
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
         some = [r for r in rows if (r["mode"], r["load"]) == (mode, load)]
-        yield _table(
-            f"Round trip, {mode}, {load} [µs] ({some[0]['policy']}, {some[0]['payload']} B)",
-            some,
-            {
-                "": "name",
-                "code": "code",
-                **_PERCENTILES,
-                "n": _number("n"),
-                "of it the bench": lambda row: micro(row.get("bench_us")),
-                "p50 : limit": _limit,
-            },
-        )
-    yield from _way_tables(content)
-
-
-def _way_tables(content: Row) -> Iterator[Table]:
-    """Both ways to who answers elsewhere, and what was lost."""
-    rows = [row for row in content["results"] if "sent" in row]
-    if rows:
-        columns: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
-        for way, words in (("there", "there"), ("between", "its own"), ("back", "back")):
-            columns |= {f"{words} {name}": _of_way(way, f"{name}_us") for name in ("p50", "p99")}
-        columns["± "] = lambda r: micro(r.get("within_us"))
-        columns["clock"] = lambda r: r.get("clock", "not read")
-        columns["lost"] = lambda r: percent(r["lost_pct"])
-        columns["95 %"] = lambda r: "{:.3g}–{:.3g} %".format(*r["lost_pct_95"])
-        yield _table("Both ways [µs]", rows, columns)
-
-
-def _of_way(way: str, key: str) -> Column:
-    return lambda row: micro(row[way][key])
+        conditions = f"{some[0]['policy']}, {some[0]['payload']} B"
+        yield _table(f"Round trip, {mode}, {load} [µs] ({conditions})", some, columns)
+    far = [row for row in rows if "sent" in row]
+    if far:
+        yield _table("Both ways [µs]", far, _CELL | _WAYS)
 
 
 def _limit(row: Row) -> str:
     return "limit" if row["peer"] == "C" else times(row["ratio_to_baseline_p50"])
+
+
+_WAYS: dict[str, Column] = {
+    f"{words} {name}": _of(micro, way, f"{name}_us")
+    for way, words in (("there", "there"), ("between", "its own"), ("back", "back"))
+    for name in ("p50", "p99")
+} | {
+    "± ": _of(micro, "within_us"),
+    "clock": lambda row: row.get("clock", "not read"),
+    "lost": _of(percent, "lost_pct"),
+    "95 %": lambda row: "{:.3g}–{:.3g} %".format(*row["lost_pct_95"]),
+}
 
 
 _QUICK, _NEAR = 1.3, 2.0  # times the limit
@@ -131,29 +134,21 @@ def night_tables(content: Row) -> Iterator[Table]:
     rows = [row for row in content["results"] if "night" in row]
     if not rows:
         return
-    named: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
     sure = {
-        name.replace("_", "."): _of(f"{name}_us_95", _interval) for name in SHARES if name != "max"
+        name.replace("_", "."): _of(_interval, f"{name}_us_95") for name in SHARES if name != "max"
     }
-    yield _table("Percentiles of all times, with 95 % between [µs]", rows, named | sure)
-    yield _table(
-        "Beyond the data: estimates by a generalised Pareto distribution [µs]",
-        rows,
-        named
-        | {
-            "above": lambda row: micro((row["night"]["beyond"] or {}).get("threshold_us")),
-            "shape": lambda row: shown((row["night"]["beyond"] or {}).get("shape")),
-            "fitted to": lambda row: shown((row["night"]["beyond"] or {}).get("fitted")),
-            "one in …: longer than": _estimates,
-            "longest burst": lambda row: shown(
-                max((n for n, _ in row["night"]["bursts"]), default=0)
-            ),
-        },
-    )
-    worst = sorted(
-        ([us, at, row, why] for row in rows for at, us, why in row["night"]["worst"]),
-        key=lambda one: -one[0],
-    )[:_WORST]
+    yield _table("Percentiles of all times, with 95 % between [µs]", rows, _CELL | sure)
+    beyond = {
+        "above": _of(micro, "night", "beyond", "threshold_us"),
+        "shape": _of(shown, "night", "beyond", "shape"),
+        "fitted to": _of(shown, "night", "beyond", "fitted"),
+        "one in …: longer than": _of(_estimates, "night", "beyond", "estimates"),
+        "longest burst": _of(_longest, "night", "bursts"),
+    }
+    heading = "Beyond the data: estimates by a generalised Pareto distribution [µs]"
+    yield _table(heading, rows, _CELL | beyond)
+    worst = [[us, at, row, why] for row in rows for at, us, why in row["night"]["worst"]]
+    worst = sorted(worst, key=lambda one: -one[0])[:_WORST]
     cells = [
         [row["name"], row["mode"], row["load"], _clock_time(at), micro(us), why]
         for us, at, row, why in worst
@@ -165,15 +160,12 @@ def night_tables(content: Row) -> Iterator[Table]:
 _WORST = 10
 
 
-def _interval(ends: list[float | None]) -> str:
-    return "–".join("?" if end is None else micro(end) for end in ends)
+def _interval(ends: list[float | None] | None) -> str:
+    return "–".join("?" if end is None else micro(end) for end in ends or ())
 
 
-def _estimates(row: Row) -> str:
-    return "; ".join(
-        f"{times:,}: {micro(us)}"
-        for times, us in (row["night"]["beyond"] or {"estimates": []})["estimates"]
-    )
+def _estimates(estimates: list[tuple[int, float]] | None) -> str:
+    return "; ".join(f"{times:,}: {micro(us)}" for times, us in estimates or ())
 
 
 def _clock_time(at: float) -> str:
@@ -183,12 +175,14 @@ def _clock_time(at: float) -> str:
 def jitter_tables(content: Row) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
     if "jitter" in content:
-        columns = {"": "policy", "load": "load", "wait": "wait", **_PERCENTILES}
+        columns: dict[str, Column] = {
+            "": "policy", "load": "load", "wait": "wait", **_PERCENTILES,
+            "ticks lost": _of(percent, "lost_pct"), "p50, p99 : nanosleep": _agrees,
+        }  # fmt: skip
         heading = "A loop that only paces, every 100 µs: late by [µs]"
-        columns |= {"ticks lost": _of("lost_pct", percent), "p50, p99 : nanosleep": _agrees}
         yield _table(heading, content["jitter"], columns)
         heading = "Who had the processor in ticks that were late by more than 100 µs"
-        yield from named_tables(heading, content["jitter"], ("policy", "load", "wait"))
+        yield from _named_tables(heading, content["jitter"], ("policy", "load", "wait"))
 
 
 _NEARLY = 0.1  # relative difference to another program's p50 and p99 that is agreement
@@ -217,31 +211,27 @@ def realtime_tables(content: Row) -> Iterator[Table]:
     rows = content.get("loop", {}).get("realtime")
     if rows is None:
         return
-    columns: dict[str, Column] = {"": "link", "load": "load"}
-    yield _table(
-        "The product in real time, 10 kHz",
-        rows,
-        columns
-        | {
-            "ticks": _number("ticks"),
-            "missed": _of("missed_pct", percent),
-            "the host's own": _of("host_pct", percent),
-            "beyond it, median": _of("beyond_host_pct", percent),
-            "by work or link": _of("by_work_or_link_pct", percent),
-            "trip p50 [µs]": _PERCENTILES["p50"],
-            "p99 [µs]": _PERCENTILES["p99"],
-        },
-    )
-    columns |= {c: _cause(c) for c in (rows[0]["causes"] if rows else ())}
-    columns["longest burst"] = lambda row: str(max((n for n, _ in row["bursts"]), default=0))
-    yield _table("Missed ticks by cause", rows, columns)
-    yield from named_tables("Who had the processor in missed ticks", rows, ("link", "load"))
+    named: dict[str, Column] = {"": "link", "load": "load"}
+    shares = {
+        "ticks": _number("ticks"),
+        "missed": _of(percent, "missed_pct"),
+        "the host's own": _of(percent, "host_pct"),
+        "beyond it, median": _of(percent, "beyond_host_pct"),
+        "by work or link": _of(percent, "by_work_or_link_pct"),
+        "trip p50 [µs]": _PERCENTILES["p50"],
+        "p99 [µs]": _PERCENTILES["p99"],
+    }
+    yield _table("The product in real time, 10 kHz", rows, named | shares)
+    causes = {cause: _of("{:,}".format, "causes", cause) for row in rows for cause in row["causes"]}
+    burst = {"longest burst": _of(_longest, "bursts")}
+    yield _table("Missed ticks by cause", rows, named | causes | burst)
+    yield from _named_tables("Who had the processor in missed ticks", rows, ("link", "load"))
 
 
 _NAMES = 8  # of a row, in a table
 
 
-def named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Iterator[Table]:
+def _named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Iterator[Table]:
     """Who took the time of ticks, the most frequent ones of each row."""
     named = [
         {**row, "name": name, "count": count}
@@ -249,14 +239,10 @@ def named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Iterat
         for name, count in list(row.get("names", {}).items())[:_NAMES]
     ]
     if named:
-        columns: dict[str, Column] = {keys[0]: keys[0], **{key: key for key in keys[1:]}}
+        columns: dict[str, Column] = {key: key for key in keys}
         columns |= {"who": "name", "ticks": _number("count")}
         by = dict.fromkeys(METHODS[row["method"]] for row in named)
         yield _table(f"{heading}, {' and '.join(by)}", named, columns)
-
-
-def _cause(cause: str) -> Column:
-    return lambda row: format(row["causes"][cause], ",")
 
 
 def lockstep_name(row: Row) -> str:
@@ -269,71 +255,55 @@ def lockstep_tables(content: Row) -> Iterator[Table]:
     loop = content.get("loop", {})
     if "lockstep" not in loop:
         return
-    yield _table(
-        "The product in lockstep",
-        loop["lockstep"],
-        {
-            "": lockstep_name,
-            "ticks a second": _median("ticks_per_s", ",.0f"),
-            "× real time": _median("times_real_time", ".1f"),
-            "of what the plant alone allows": _median("share_of_plant_alone", ".0%"),
-        },
-    )
+    rates: dict[str, Column] = {
+        "": lockstep_name,
+        "ticks a second": _median("ticks_per_s", ",.0f"),
+        "× real time": _median("times_real_time", ".1f"),
+        "of what the plant alone allows": _median("share_of_plant_alone", ".0%"),
+    }
+    yield _table("The product in lockstep", loop["lockstep"], rates)
     parts = ("whole", "plant", "controller", "recording")
-    yield _table(
-        "The loop in one process: ns a tick",
-        loop["laws"],
-        {
-            "": "law",
-            **{part: _median(f"{part}_ns", ".0f") for part in parts},
-            "× real time": _median("times_real_time", ".0f"),
-            "allocations": _number("allocations_per_tick", "g"),
-        },
-    )
+    by_law: dict[str, Column] = {
+        "": "law",
+        **{part: _median(f"{part}_ns", ".0f") for part in parts},
+        "× real time": _median("times_real_time", ".0f"),
+        "allocations": _number("allocations_per_tick", "g"),
+    }
+    yield _table("The loop in one process: ns a tick", loop["laws"], by_law)
 
 
 def kernel_tables(content: Row) -> Iterator[Table]:
     """ns per step of every law."""
     by_law: dict[str, Row] = {}
-    reals = list(dict.fromkeys(r["real"] for r in content.get("kernel", ())))
-    for r in content.get("kernel", ()):
-        law = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]})
-        law |= {f"{key} {r['real']}": r[key] for key in ("numba_ns", "c_ns", "ratio")}
     columns: dict[str, Column] = {"": "law", "states": "states"}
-    for real in reals:
+    for r in content.get("kernel", ()):
+        law, real = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]}), r["real"]
+        law |= {f"{key} {real}": r[key] for key in ("numba_ns", "c_ns", "ratio")}
         columns |= {
             f"numba, {real}": _median(f"numba_ns {real}", ".1f"),
             f"C, {real}": _median(f"c_ns {real}", ".1f"),
             f"ratio, {real}": _median(f"ratio {real}", ".2f", " ×"),
         }
     if by_law:
-        yield _table("One step of the kernel [ns]", list(by_law.values()), columns)
+        yield _table("One step of the kernel [ns]", [*by_law.values()], columns)
 
 
 def sweep_tables(content: Row) -> Iterator[Table]:
     """Round trips of a sweep with their cost, and the highest rates."""
-    columns: dict[str, Column] = {
-        "": "name", "load": "load", "policy": "policy", "wait": "wait",
-        "B": _number("payload"),
-    }  # fmt: skip
     if "sweep" not in content:
         return
-    yield _table(
-        "Round trips from the deadline, by payload and rate [µs]",
-        content["sweep"],
-        columns
-        | {
-            "kHz": _number("khz", "g"),
-            "p50": _PERCENTILES["p50"],
-            "p99": _PERCENTILES["p99"],
-            "missed": _of("missed_pct", percent),
-            "processors": _of("processor_pct", percent),
-            "opened, kB": _number("opened_kb"),
-        },
-    )
+    named: dict[str, Column] = {"": "name", "load": "load", "policy": "policy", "wait": "wait"}
+    named |= {"B": _number("payload")}
+    figures = {
+        "kHz": _number("khz", "g"),
+        "p50": _PERCENTILES["p50"],
+        "p99": _PERCENTILES["p99"],
+        "missed": _of(percent, "missed_pct"),
+        "processors": _of(percent, "processor_pct"),
+        "opened, kB": _number("opened_kb"),
+    }
+    heading = "Round trips from the deadline, by payload and rate [µs]"
+    yield _table(heading, content["sweep"], named | figures)
     most = percent(content["highest"][0]["most_missed_pct"]) if content["highest"] else ""
-    yield _table(
-        f"Highest rate at which at most {most} miss",
-        content["highest"],
-        columns | {"kHz": lambda row: f"{row['highest_khz']:g}" if row["highest_khz"] else "none"},
-    )
+    rate = {"kHz": lambda row: f"{row['highest_khz']:g}" if row["highest_khz"] else "none"}
+    yield _table(f"Highest rate at which at most {most} miss", content["highest"], named | rate)
