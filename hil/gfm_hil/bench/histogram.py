@@ -37,15 +37,19 @@ def lower_ends() -> NDArray[np.float64]:
     return np.ldexp((k - octave * _HALF).astype(float), octave)
 
 
+def middles() -> NDArray[np.float64]:
+    """The time that stands for every bucket: its middle, ns, or the only whole number in it; shape
+    (BUCKETS,)."""
+    low, high = lower_ends()[:-1], lower_ends()[1:]
+    return np.where(high - low == 1, low, (low + high) / 2)
+
+
 def quantiles(counts: Counts, shares: Sequence[float]) -> list[float]:
-    """Quantiles in ns for these shares (0 to 1), each the middle of a bucket: the smallest time of
-    rank ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``."""
+    """Quantiles in ns for these shares (0 to 1), each of ``middles``: the smallest time of rank
+    ceil(share n), as ``numpy.quantile`` with ``inverted_cdf``."""
     total = np.cumsum(counts)
     ranks = np.maximum(np.ceil(np.round(np.asarray(shares) * total[-1], 6)), 1)
-    ends = lower_ends()
-    at = np.searchsorted(total, ranks)
-    whole = ends[at + 1] - ends[at] == 1  # a bucket of one nanosecond holds one value
-    return [float(x) for x in np.where(whole, ends[at], (ends[at] + ends[at + 1]) / 2)]
+    return [float(x) for x in middles()[np.searchsorted(total, ranks)]]
 
 
 def sparse(counts: Counts) -> list[list[int]]:
@@ -62,10 +66,10 @@ def dense(pairs: Sequence[Sequence[int]]) -> Counts:
 
 
 def bars(pairs: Sequence[Sequence[int]]) -> tuple[NDArray[np.float64], Counts]:
-    """The middle of each bucket that is not empty, ns, and its count, from the output of
+    """Those of ``middles`` whose buckets are not empty, and their counts, from the output of
     ``sparse``; at least one."""
-    (at, counts), ends = np.transpose(pairs), lower_ends()
-    return (ends[at] + ends[at + 1] - 1) / 2, counts
+    at, counts = np.transpose(pairs)
+    return middles()[at], counts
 
 
 def summary(rounds: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
