@@ -5,11 +5,9 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
 from gfm_hil.bench.cpu_load import Load, cpu_load
@@ -19,9 +17,11 @@ from gfm_hil.bench.one_way import ways
 from gfm_hil.bench.options import BenchOptions, Mode
 from gfm_hil.bench.pair import Pair, pair, waited_ns
 from gfm_hil.bench.rounds import REST, ShowProgress, in_turn
+from gfm_hil.bench.share import own_share_us
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.realtime.environment import caveats
+from gfm_hil.run.attribution import Times
 
 PERIOD_NS = 100_000
 _FIRST_S = 0.02  # length of the warm-up round
@@ -35,9 +35,8 @@ class _RoundTrips:
     contender: Contender
     mode: Mode
     load: Load
-    compiled: bool
-    bench_us: float | None  # of a round trip, the bench's own share; None for a limit
-    rounds: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+    about: dict[str, Any]  # columns of the row that say what it is
+    rounds: dict[int, Times] = field(default_factory=dict)
     silent: int = 0
     sides: list[dict[str, Any]] = field(default_factory=list)  # see ``one_way.delays``
 
@@ -50,7 +49,11 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
     cells: list[_RoundTrips] = []
     with ExitStack() as stack:
         place = memory_folder(stack)
-        elsewhere = [_peer(options, place)] if options.to else []
+        elsewhere = []
+        if options.to:
+            from gfm_hil.bench.peer import peer_of  # with it comes the plant
+
+            elsewhere = [peer_of(options, place)]
         contenders, remarks = contenders_of([*options.links, *options.peers], place, elsewhere)
         two = stack.enter_context(pair(options.policies[0], place))
         load = stack.enter_context(cpu_load())
@@ -63,15 +66,12 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
                     raise
                 remarks.append(f"{c.name}: not measured: {problem}")
                 continue
-            code = "compiled" if compiled else "Python"
-            bench_us = None if c.source else two.share_us(code, c in elsewhere)
-            cells += [
-                _RoundTrips(c, m, w, compiled, bench_us)
-                for w in options.loads
-                for m in options.modes
-            ]
+            code = "C" if c.source else ("compiled" if compiled else "Python")
+            share = None if c.source else two.here("plant", own_share_us, code, c in elsewhere)
+            about = {"link": c.link, "peer": c.peer, "code": code, "bench_us": share}
+            cells += [_RoundTrips(c, m, w, about) for w in options.loads for m in options.modes]
 
-        def one_round(cell: _RoundTrips, seconds: float, share: float) -> NDArray[np.int64]:
+        def one_round(cell: _RoundTrips, seconds: float, share: float) -> Times:
             show(f"{cell.contender.name}, {cell.mode}, {cell.load}", share)
             with load(cell.load):
                 period = PERIOD_NS if cell.mode == "realtime" else 0
@@ -90,75 +90,56 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             times = one_round(cell, options.seconds, share)
             if len(times):
                 cell.rounds[number] = times
-            if sides := two.sides(cell.contender):
-                cell.sides.append(sides)
+            if two.sides:
+                cell.sides.append(two.sides)
     by_key = {(c.contender.name, c.mode, c.load): c for c in cells}
     content["results"] += [
         _row(c, by_key.get((c.contender.limit, c.mode, c.load)), options) for c in cells
     ]
 
 
-OneRound = Callable[[_RoundTrips, float, float], NDArray[np.int64]]
-
-
 def _measure_night(
-    options: BenchOptions, cells: list[_RoundTrips], one_round: OneRound, two: Pair,
-    content: dict[str, Any],
+    options: BenchOptions, cells: list[_RoundTrips],
+    one_round: Callable[[_RoundTrips, float, float], Times], two: Pair, content: dict[str, Any],
 ) -> None:  # fmt: skip
     """Measure block after block, in turn, and put what the folder then holds into the content."""
-    folder, done_s = options.folder, 0.0
+    folder = options.folder
     by_name = {cell.contender.name: cell for cell in cells}
     settings = {
         "names": [*by_name], "modes": [*options.modes], "loads": [*options.loads],
         "policy": options.policies[0], "payload": options.payload,
     }  # fmt: skip
     about = {
-        "contenders": {name: _about(cell) for name, cell in by_name.items()},
+        "contenders": {name: cell.about for name, cell in by_name.items()},
         "environment": content["environment"], "caveats": caveats(content["environment"]),
     }  # fmt: skip
     blocks = Blocks(folder, settings, about, options.resume)
-    if options.resume:
-        done_s = sum(block["s"] for block in lines_of(folder))
-    cell_after_cell = itertools.cycle(cells)
-    while done_s < options.for_s:
-        cell = next(cell_after_cell)
+    done_s = sum(block["s"] for block in lines_of(folder))
+    for cell in itertools.cycle(cells):
+        if done_s >= options.for_s:
+            break
         block = Block(time.time(), PERIOD_NS if cell.mode == "realtime" else 0)
         while block.seconds < options.block_s:
             before, at = two.both(waited_ns), time.time()
             times = one_round(cell, options.seconds, done_s / options.for_s)
             after = two.both(waited_ns)
             if len(times):
-                cause = _cause(times, {role: after[role] - before[role] for role in after})
-                block.add(times, at, options.seconds, cause)
-            else:
-                block.seconds += options.seconds
+                waited = {role: after[role] - before[role] for role in after}
+                block.add(times, at, _cause(times, waited))
+            block.seconds += options.seconds
         blocks.append((cell.contender.name, cell.mode, cell.load), block)
         done_s += block.seconds
     blocks.close()
     content["results"] += night_of(folder)["results"]
 
 
-def _cause(times: NDArray[np.int64], waited: dict[Role, int]) -> str:
+def _cause(times: Times, waited: dict[Role, int]) -> str:
     """What may have cost the longest time of a round, as far as the kernel counts it."""
     excess = int(times.max()) - float(np.median(times))
     role = max(waited, key=lambda one: waited[one])
     if waited[role] < excess / 2:
         return "link, or a processor that the host took: the kernel counted no wait"
     return f"another thread had the processor of the {role} for {waited[role] / 1e3:.0f} µs"
-
-
-def _peer(options: BenchOptions, place: Path) -> Contender:
-    from gfm_hil.bench.peer import peer_of  # with it comes the plant
-
-    assert options.to is not None
-    to, name = options.to
-    return peer_of(to, name, dict(options.option), options.ports, options.ptp_us, place)
-
-
-def _about(cell: _RoundTrips) -> dict[str, Any]:
-    c = cell.contender
-    code = "C" if c.peer == "C" else ("compiled" if cell.compiled else "Python")
-    return {"link": c.link, "peer": c.peer, "code": code, "bench_us": cell.bench_us}
 
 
 def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) -> dict[str, Any]:
@@ -168,7 +149,7 @@ def _row(cell: _RoundTrips, limit: _RoundTrips | None, options: BenchOptions) ->
         for k in sorted(cell.rounds.keys() & of_limit.keys())
     ]
     return {
-        "name": c.name, **_about(cell),
+        "name": c.name, **cell.about,
         "mode": cell.mode, "load": cell.load, "policy": options.policies[0],
         "payload": options.payload,
         **summary(list(cell.rounds.values())),

@@ -37,6 +37,7 @@ class Block:
     Attributes:
         at: when it began, s since 1970.
         limit_ns: a time that counts as late: of real time the period; 0: none does.
+        seconds: how long it lasted.
     """
 
     at: float
@@ -46,10 +47,9 @@ class Block:
     bursts: Counter[int] = field(default_factory=Counter)
     seconds: float = 0.0
 
-    def add(self, times_ns: NDArray[np.int64], at: float, seconds: float, cause: str) -> None:
-        """Take a round in: its times, when it began, how long it was, and what cost its worst."""
+    def add(self, times_ns: NDArray[np.int64], at: float, cause: str) -> None:
+        """Take the times of a round in, when it began, and what cost its worst."""
         self.counts += histogram(times_ns)
-        self.seconds += seconds
         late = np.flatnonzero(times_ns > self.limit_ns) if self.limit_ns else times_ns[:0]
         events = times_ns
         if len(late):

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from gfm_hil.bench.contenders import Contender
 from gfm_hil.bench.pingpong import HYBRID, PingPong
-from gfm_hil.bench.share import own_share_us
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.realtime.priority import ask_for_real_time, no_collector_pauses, own_processor
 
@@ -46,6 +45,11 @@ class Pair:
 
     def __init__(self, pools: dict[Role, ProcessPoolExecutor], stop: NDArray[np.int64]) -> None:
         self._pools, self._stop = pools, stop
+        self.sides: dict[str, Any] = {}
+
+    def here(self, role: Role, work: Any, *arguments: Any) -> Any:
+        """Call a function in one of them."""
+        return _wait(self._pools[role].submit(work, *arguments))
 
     def both(self, work: Any, *arguments: Any) -> dict[Role, Any]:
         """Call a function in both at the same time."""
@@ -55,30 +59,23 @@ class Pair:
     def open(self, contender: Contender, payload: int) -> bool:
         """Open a contender's ends; returns whether its loops are compiled. Raises UserError: it
         cannot be opened."""
-        for role in ROLES:
-            compiled = _wait(self._pools[role].submit(_open, contender, payload))
-        return bool(compiled)
+        return bool([self.here(role, _open, contender, payload) for role in ROLES][-1])
 
     def round(
         self, contender: Contender, period_ns: int, seconds: float, how: int = HYBRID
     ) -> NDArray[np.int64]:
-        """Times of the round trips of one round in ns; none if the peer stopped answering."""
+        """Times of the round trips of one round in ns; none if the peer stopped answering. What the
+        round says of both ways is in ``sides``, see ``PingPong``."""
         self._stop[:] = 0, how, period_ns
         answers = self._pools["controller"].submit(_pong, contender.name)
-        name, duration_ns = contender.name, int(seconds * 1e9)
         try:
-            return _wait(self._pools["plant"].submit(_ping, name, period_ns, duration_ns))
+            took, self.sides = self.here(
+                "plant", _ping, contender.name, period_ns, int(seconds * 1e9)
+            )
+            return took
         finally:
             self._stop[0] = 1
             _wait(answers)
-
-    def sides(self, contender: Contender) -> dict[str, Any]:
-        """What the last round says of both ways, see ``PingPong``."""
-        return dict(_wait(self._pools["plant"].submit(_sides, contender.name)))
-
-    def share_us(self, code: str, of_frames: bool) -> float:
-        """The bench's own share of a round trip, see ``gfm_hil.bench.share``."""
-        return float(_wait(self._pools["plant"].submit(own_share_us, code, of_frames)))
 
 
 def _wait(future: Future[Any]) -> Any:
@@ -156,11 +153,12 @@ def _pong(name: str) -> None:
     _ends[name].pong(_stop)
 
 
-def _ping(name: str, period_ns: int, duration_ns: int) -> NDArray[np.int64]:
+def _ping(name: str, period_ns: int, duration_ns: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    end = _ends[name]
     for duration in (_WARM_NS, duration_ns):
-        if (n := _ends[name].ping(_stop, period_ns, duration, _took)) < 0:
-            return _took[:0]
-    return _took[:n]
+        if (n := end.ping(_stop, period_ns, duration, _took)) < 0:
+            return _took[:0], {}
+    return _took[:n], end.sides()
 
 
 def waited_ns() -> int:
@@ -169,10 +167,6 @@ def waited_ns() -> int:
     with suppress(OSError):
         return int(Path("/proc/thread-self/schedstat").read_text("ascii").split()[1])
     return 0
-
-
-def _sides(name: str) -> dict[str, Any]:
-    return _ends[name].sides()
 
 
 def _close() -> None:

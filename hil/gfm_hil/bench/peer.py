@@ -20,7 +20,8 @@ import numpy as np
 from gfm_hil.bench import datagram
 from gfm_hil.bench.contenders import Contender, shm, udp, zmq
 from gfm_hil.bench.exchange import GONE, LEFT, OTHER, SILENT, answer_all, frames, send_all
-from gfm_hil.bench.one_way import DUE, RECEIVED, SENT, delays
+from gfm_hil.bench.one_way import ANSWERED, DUE, HEARD, RECEIVED, SENT, delays
+from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.pingpong import Messages, Numbers, PingPong
 from gfm_hil.controllers import FORMS
 from gfm_hil.core.errors import PeerLost, UserError
@@ -48,7 +49,7 @@ _TICKS = 600_000  # exchanges at most with a controller that the bench starts: i
 _MOST = 1 << 20  # exchanges of a round
 _LOST_NS = 100_000_000  # after which an answer counts as lost
 _SILENCE_NS = 20_000_000_000
-_START_S, _POLL_S = 30.0, 0.1
+_START_S, _WEEK_S, _POLL_S = 30.0, 604800.0, 0.1
 _LIMITS = {"shm": shm.LIMIT, "zmq": zmq.TCP, "udp": udp.LIMIT, "can": udp.LIMIT}
 _CLOCK_TAI = 11
 _UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
@@ -64,41 +65,37 @@ def kind_of(endpoint: str) -> LinkKind:
     raise UserError(f"{endpoint}: must be {forms}, or a controller: {FORMS}")
 
 
-def scenario_of(inner: bool = False, ticks: int = _TICKS) -> Scenario:
-    """What both sides compare at the start: the scenario of the bench's exchanges."""
+def scenario_of(inner: bool = False, **link: Any) -> Scenario:
+    """What both sides compare at the start: the scenario of the bench's exchanges; ``link``: what
+    this side has otherwise in its link, which they do not compare."""
     content: dict[str, Any] = {
-        "title": "gfmhil bench latency", "duration": ticks * 1e-4, "T_s": 1e-4, "law": _LAW,
+        "title": "gfmhil bench latency", "duration": _TICKS * 1e-4, "T_s": 1e-4, "law": _LAW,
         "mode": "lockstep", "link": {"type": "shm", "start_timeout_s": _START_S,
                                      "peer_timeout_s": 60.0},
     }  # fmt: skip
-    return check_scenario(content | ({"inner": _STAGE} if inner else {}), "bench")
+    scenario = check_scenario(content | ({"inner": _STAGE} if inner else {}), "bench")
+    return scenario.model_copy(update={"link": scenario.link.model_copy(update=link)})
 
 
-def peer_of(
-    to: str, name: str | None, options: dict[str, Any], ports: Path | None, ptp_us: float,
-    place: Path,
-) -> Contender:  # fmt: skip
-    """The contender that answers at an endpoint, or is the controller ``KIND:NAME``. Raises
-    UserError: neither, or nothing can be reached there.
-
-    Args:
-        to: endpoint, or controller.
-        name: in the tables.
-        options: of the link.
-        ports: map of the controller's ports.
-        ptp_us: how far CLOCK_TAI of this machine may be off, 0: nobody says.
-        place: folder for an endpoint of our own.
-    """
-    more: dict[str, Any] = {"link": options, "ptp_us": ptp_us, "program": None, "inner": False}
-    if ptp_us:
-        tai_offset(ptp_us)
+def peer_of(bench: BenchOptions, place: Path) -> Contender:
+    """The contender that answers at the endpoint ``bench.to``, or is the controller ``KIND:NAME``;
+    ``place`` is for an endpoint of our own. Raises UserError: neither, or nothing can be reached
+    there."""
+    assert bench.to is not None
+    (to, name), link, ports = bench.to, dict(bench.option), bench.ports
+    more: dict[str, Any] = {"link": link, "ptp_us": bench.ptp_us, "program": None, "inner": False}
+    if bench.ptp_us:
+        tai_offset(bench.ptp_us)
     if to.partition(":")[0] in ("dll", "fmu", "c", "pil"):
-        return _controller(to, name or to, ports, place, more)
+        folder = place / "controller"
+        folder.mkdir()
+        more |= _controller(to, ports, folder)
+        return Contender(name or to, "shm", more["endpoint"], _open, PEER, more, shm.LIMIT)
     kind = kind_of(to)
     if ports is not None:
         raise UserError(f"--map {ports}: is for a controller {FORMS}; {to} is an endpoint")
     try:
-        kind.checked(to, options)
+        kind.checked(to, link)
     except ValueError as problem:
         raise UserError(f"--to: {problem}") from None
     _check_route(to)
@@ -106,12 +103,11 @@ def peer_of(
     return Contender(name or to, kind.name, to, _open, PEER, more, limit)
 
 
-def _controller(
-    model: str, name: str, ports: Path | None, place: Path, more: dict[str, Any]
-) -> Contender:
-    """The contender of a controller that the bench starts. Raises UserError: there is none such."""
-    folder, inner = place / "controller", model.startswith("c:")
-    folder.mkdir()
+def _controller(model: str, ports: Path | None, folder: Path) -> dict[str, Any]:
+    """What is to be known of a controller that the bench starts: its ``program``, whether its laws
+    have an ``inner`` stage, its ``endpoint`` and its ``log``. Raises UserError: there is none such.
+    """
+    inner = model.startswith("c:")
     scenario = scenario_of(inner)
     words = controller_program(scenario, model, ports, lambda text: None)
     write_scenario(folder, scenario)
@@ -120,8 +116,7 @@ def _controller(
         ("{scenario}", folder / "scenario.toml"), ("{endpoint}", endpoint), ("{folder}", folder),
     ):  # fmt: skip
         words = [word.replace(mark, str(value)) for word in words]
-    more |= {"program": words, "inner": inner, "log": folder / "log"}
-    return Contender(name, "shm", endpoint, _open, PEER, more, shm.LIMIT)
+    return {"program": words, "inner": inner, "endpoint": endpoint, "log": folder / "log"}
 
 
 def _check_route(endpoint: str) -> None:
@@ -162,32 +157,27 @@ def tai_offset(ptp_us: float) -> int:
 
 
 def _tai_now() -> int:
-    best, found = 10**9, 0
+    readings = []
     for _ in range(20):
         before = time.monotonic_ns()
         tai = time.clock_gettime_ns(_CLOCK_TAI)
         after = time.monotonic_ns()
-        if after - before < best:
-            best, found = after - before, tai - (before + after) // 2
-    return found
+        readings.append((after - before, tai - (before + after) // 2))
+    return min(readings)[1]  # of the quickest pair
 
 
 class _Caller:
     """The side that sends y; ``ping`` of a ``PingPong``."""
 
     def __init__(self, c: Contender) -> None:
-        more = c.options
-        inner = more["inner"]
-        scenario = scenario_of(inner)
+        more, inner = c.options, c.options["inner"]
+        scenario = scenario_of(inner, endpoint=c.endpoint)
         bench = make_bench(scenario)
         plant_sample(bench.plant.records, 0, bench.y)
         self._name, self._values = c.name, bench.y
         self._good = open_end("plant", c.endpoint, more["link"])
         try:
-            named = scenario.model_copy(
-                update={"link": scenario.link.model_copy(update={"endpoint": c.endpoint})}
-            )
-            start = shake_hands("plant", self._good, named, lambda: False, lambda text: None)
+            start = shake_hands("plant", self._good, scenario, lambda: False, lambda text: None)
         except PeerLost as problem:
             self._good.close()
             said = Path(more["log"]).read_text("utf-8").split("gfmhil: ") if "log" in more else [""]
@@ -198,7 +188,7 @@ class _Caller:
         self._stamps = np.zeros((_MOST, 5), np.int64)
         self._most = _TICKS if more["program"] else 2**62
         self.link = with_port(self._good)
-        getattr(self.link, "start", lambda: None)()
+        getattr(self.link, "start", _nothing)()
         self.sides: dict[str, Any] = {}
 
     def ping(self, stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
@@ -214,28 +204,25 @@ class _Caller:
             why = "it is in its safe state, or has left" if n == LEFT else "the link is gone"
             raise UserError(f"{self._name}: answers no more: {why}")
         self._tick += n
-        stamps = stamps[:n]
-        self.sides = self._delays(stamps)
-        done = stamps[stamps[:, RECEIVED] >= 0]
+        done = stamps[:n][stamps[:n, RECEIVED] >= 0]
         took[: len(done)] = done[:, RECEIVED] - done[:, DUE]
+        self.sides = self._delays(stamps[:n])
         return len(done)
 
     def _delays(self, stamps: Numbers) -> dict[str, Any]:
         if not self._reads_clocks:
-            stamps = stamps.copy()
-            stamps[:, 2:4] = -1
-            return delays(stamps, False)
+            stamps[:, HEARD : ANSWERED + 1] = -1
         error_ns = float(self._u.record["values"][0, 2])  # in its newest answer
-        if not (error_ns and self._ptp_us):
+        if not (self._reads_clocks and error_ns and self._ptp_us):
             return delays(stamps, self._one_clock)
-        ours = stamps.copy()
+        offset = tai_offset(self._ptp_us)
         for column in (SENT, RECEIVED):
-            ours[:, column] += np.where(ours[:, column] >= 0, tai_offset(self._ptp_us), 0)
-        return delays(ours, False, 1e3 * self._ptp_us + error_ns)
+            stamps[:, column] += np.where(stamps[:, column] >= 0, offset, 0)
+        return delays(stamps, False, 1e3 * self._ptp_us + error_ns)
 
     def close(self) -> None:
         """Say goodbye, and wait for the other side's."""
-        getattr(self.link, "stop", lambda: None)()
+        getattr(self.link, "stop", _nothing)()
         writer = FrameWriter("y", len(self._values) > NY)
         writer.sequence[:] = self._y.sequence
         reader = FrameReader("u", len(self._values) > NY)
@@ -245,13 +232,16 @@ class _Caller:
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     """The plant's end calls; the controller's end is elsewhere, or is started here."""
-    nothing: Callable[..., Any] = lambda *_: None  # noqa: E731
     if role == "controller":
-        close = _start(c) if c.options["program"] else nothing
-        return PingPong(nothing, nothing, close, True)
+        close = _start(c) if c.options["program"] else _nothing
+        return PingPong(_nothing, _nothing, close, True)
     caller = _Caller(c)
     compiled = caller.link is caller._good
-    return PingPong(caller.ping, nothing, caller.close, compiled, lambda: caller.sides)
+    return PingPong(caller.ping, _nothing, caller.close, compiled, lambda: caller.sides)
+
+
+def _nothing(*_: Any) -> Any:
+    """What an end without loops of its own does."""
 
 
 def _start(c: Contender) -> Callable[[], None]:
@@ -287,9 +277,7 @@ def answer(
         _answer_all(nobody, 0, 0.0, np.ones(1, np.int64))  # compiles: no bench would wait for it
     open_end("controller", endpoint, options).close()
     say(f"answering at {endpoint}; Ctrl-C ends it")
-    scenario = scenario_of()
-    patient = {"start_timeout_s": 604800.0, "endpoint": endpoint}
-    scenario = scenario.model_copy(update={"link": scenario.link.model_copy(update=patient)})
+    scenario = scenario_of(start_timeout_s=_WEEK_S, endpoint=endpoint)
     with Interrupt() as interrupt:
         while not interrupt.came:
             (priority.ask_for_real_time if fifo else priority.own_processor)("controller")
@@ -326,14 +314,14 @@ def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) 
     def work() -> None:
         why[0] = _answer_all(link, tai_ns, error_ns, stop)
 
-    getattr(link, "start", lambda: None)()
+    getattr(link, "start", _nothing)()
     thread = threading.Thread(target=work)
     thread.start()
     priority.restore_priority()
     while thread.is_alive():
         thread.join(_POLL_S)
         stop[0] = interrupt.came
-    getattr(link, "stop", lambda: None)()
+    getattr(link, "stop", _nothing)()
     if why[0] == LEFT:  # the bench waits for our last frame
         send_last(link, FrameWriter("u"), 0, STOPPED, 0, np.zeros(NU))
     return {

@@ -13,7 +13,7 @@ from gfm_hil.bench.pingpong import over_link
 from gfm_hil.links.crc import crc32
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port, port_function
-from gfm_runtime.signals import NY
+from gfm_runtime.signals import NU, NY
 
 _TIMES, _ROUND_NS = 2000, 100_000_000
 # words of the handle: whether a message is under way, and frames are; bytes of the answer; a CRC
@@ -47,41 +47,38 @@ def _receive(handle, message):
     return size
 
 
+def _mirror(of_frames: bool) -> Port:
+    """The port of a link whose answer is back at once."""
+    answer = FrameWriter("u").pack(0, 1, 0, np.ones(NU))
+    handle = np.zeros(_ANSWER + 8, np.int64)
+    handle[_FRAMES], handle[_SIZE] = of_frames, len(answer)
+    handle[_ANSWER:].view(np.uint8)[: len(answer)] = np.frombuffer(answer, np.uint8)
+    return Port(handle, _send, _receive, 1000)
+
+
 class _Mirror:
-    """A link whose answer is back at once; with a port, or with Python methods alone."""
+    """The same link, without a port unless there is one to give."""
 
-    def __init__(self, ported: bool, of_frames: bool) -> None:
-        answer = FrameWriter("u").pack(0, 1, 0, np.ones(3))
-        handle = np.zeros(_ANSWER + 8, np.int64)
-        handle[_FRAMES], handle[_SIZE] = of_frames, len(answer)
-        handle[_ANSWER:].view(np.uint8)[: len(answer)] = np.frombuffer(answer, np.uint8)
-        self.port = Port(handle, _send, _receive, 1000) if ported else None
-        self._answer, self._here = answer, False
-
-    def send(self, message: bytes) -> bool:
-        self._here = True
-        return True
+    def __init__(self, port: Port | None = None) -> None:
+        self.port, self._came = port, list[bytes]()
+        self.send, self.close = self._came.append, self._came.clear
 
     def receive(self) -> bytes | None:
-        here, self._here = self._here, False
-        return self._answer if here else None
-
-    def close(self) -> None:
-        """Nothing to free."""
+        return self._came.pop() if self._came else None
 
 
 def own_share_us(code: str, of_frames: bool) -> float:
     """The median over exchanges in one process, µs; ``code`` as in the tables, ``compiled`` or
     ``Python``; ``of_frames``: with those that ``exchange`` checks."""
-    if not of_frames:
+    if of_frames:
+        port, stamps = _mirror(True), np.zeros((_TIMES, 5), np.int64)
+        n = send_all(
+            port.handle, port.send, port.receive, port.spins, frames("y"),
+            frames("u", clocks=True), np.ones(NY), 0, _ROUND_NS, _ROUND_NS, 0, stamps,
+        )  # fmt: skip
+        took = stamps[:, RECEIVED] - stamps[:, SENT]
+    else:
         took = np.zeros(_TIMES, np.int64)
-        end = over_link(_Mirror(code == "compiled", False), messages("y"))
+        end = over_link(_Mirror(_mirror(False) if code == "compiled" else None), messages("y"))
         n = end.ping(np.zeros(3, np.int64), 0, _ROUND_NS, took)
-        return round(float(np.median(took[:n])) / 1e3, 4)
-    port, stamps = _Mirror(True, True).port, np.zeros((_TIMES, 5), np.int64)
-    assert port is not None
-    n = send_all(
-        port.handle, port.send, port.receive, port.spins, frames("y"), frames("u", clocks=True),
-        np.ones(NY), 0, _ROUND_NS, _ROUND_NS, 0, stamps,
-    )  # fmt: skip
-    return round(float(np.median((stamps[:, RECEIVED] - stamps[:, SENT])[:n])) / 1e3, 4)
+    return round(float(np.median(took[:n])) / 1e3, 4)
