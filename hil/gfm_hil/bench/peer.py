@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.bench import datagram
-from gfm_hil.bench.contenders import Contender, shm, udp, zmq
+from gfm_hil.bench.contenders import Contender
+from gfm_hil.bench.contenders.ours import SHM, UDP, ZMQ_IPC, ZMQ_TCP
 from gfm_hil.bench.exchange import GONE, LEFT, OTHER, SILENT, answer_all, frames, send_all
 from gfm_hil.bench.one_way import ANSWERED, DUE, HEARD, RECEIVED, SENT, delays
 from gfm_hil.bench.options import BenchOptions
@@ -50,7 +51,7 @@ _MOST = 1 << 20  # exchanges of a round
 _LOST_NS = 100_000_000  # after which an answer counts as lost
 _SILENCE_NS = 20_000_000_000
 _START_S, _WEEK_S, _POLL_S = 30.0, 604800.0, 0.1
-_LIMITS = {"shm": shm.LIMIT, "zmq": zmq.TCP, "udp": udp.LIMIT, "can": udp.LIMIT}
+_LIMITS = {"shm": SHM, "zmq": ZMQ_TCP, "udp": UDP, "can": UDP}
 _CLOCK_TAI = 11
 _UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
 
@@ -90,7 +91,7 @@ def peer_of(bench: BenchOptions, place: Path) -> Contender:
         folder = place / "controller"
         folder.mkdir()
         more |= _controller(to, ports, folder)
-        return Contender(name or to, "shm", more["endpoint"], _open, PEER, more, shm.LIMIT)
+        return Contender(name or to, "shm", more["endpoint"], _open, PEER, more, SHM)
     kind = kind_of(to)
     if ports is not None:
         raise UserError(f"--map {ports}: is for a controller {FORMS}; {to} is an endpoint")
@@ -99,7 +100,7 @@ def peer_of(bench: BenchOptions, place: Path) -> Contender:
     except ValueError as problem:
         raise UserError(f"--to: {problem}") from None
     _check_route(to)
-    limit = zmq.IPC if to.startswith("ipc:") else _LIMITS.get(kind.name, "")
+    limit = ZMQ_IPC if to.startswith("ipc:") else _LIMITS.get(kind.name, "")
     return Contender(name or to, kind.name, to, _open, PEER, more, limit)
 
 

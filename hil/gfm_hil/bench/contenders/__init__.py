@@ -1,7 +1,8 @@
 """Contenders of ``gfmhil bench latency``: links of the bench, their limits in C, other packages.
 
-A contender is one file of this folder and its name in ``FILES``. It is plain data that goes to the
-two processes, each of which opens its end.
+A contender of another package is one file of this folder and its name in ``PEERS``. It has a
+function ``contenders(folder)``, which yields what it adds; folder is a ``memory_folder``. All are
+plain data that goes to the two processes, each of which opens its end.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from gfm_hil.bench.c_code import NoCompiler, compile_c
 from gfm_hil.bench.pingpong import Messages, PingPong, frames, over_link, plain
@@ -29,11 +30,7 @@ from gfm_runtime.children import GRACE_S
 from gfm_runtime.signals import NY
 
 FRAME = wire_dtype(NY).itemsize  # bytes of the frame with y; the reply is the one with u
-#: files of this folder with links and limits, in the order of the tables. Each has a function
-#: ``contenders(names, folder)`` that yields what it adds to the links and peers of these names;
-#: folder is a ``memory_folder``.
-FILES = ("udp", "shm", "zmq", "serial")
-#: files of other packages' transports, and the packages that each needs
+#: files of other packages' transports, in the order of the tables, and the packages that each needs
 PEERS = {
     "cyclonedds": ("cyclonedds",),
     "grpc": ("grpc",),
@@ -81,8 +78,12 @@ def contenders_of(
 ) -> tuple[list[Contender], list[str]]:
     """The contenders of links and peers, ``more`` of them, and their limits; and remarks: without a
     C compiler there are no limits. ``folder`` is an empty ``memory_folder``."""
-    files = [import_module(f"{__name__}.{name}") for name in (*FILES, *PEERS)]
-    each: list[Contender] = [one for file in files for one in file.contenders(names, folder)]
+    from gfm_hil.bench.contenders import ours
+
+    each = [*ours.contenders(names, folder)]
+    for peer in PEERS:
+        if peer in names:
+            each += import_module(f"{__name__}.{peer}").contenders(folder)
     each += more
     limits = {one.limit for one in each if one.source is None}
     every = [one for one in each if one.source is None or one.name in limits]
@@ -116,35 +117,29 @@ def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
 
 
 class PackageEnd:
-    """Base of one end of another package's transport; Python drives it like a link."""
+    """Base of one end of another package's transport; Python drives it like a link.
+
+    A class of it is made of a role and an endpoint. ``WAYS``: of a role, the names of what it sends
+    and of what it receives.
+    """
 
     port = None
-
-    def __init__(self, role: Role, endpoint: str) -> None:
-        raise NotImplementedError
+    WAYS: ClassVar = {"controller": ("u", "y"), "plant": ("y", "u")}
 
 
 def of_package(
-    name: str, link: str, endpoint: str, kind: type[PackageEnd], peer: str, limit: str
+    name: str, endpoint: str, kind: Callable[[Role, str], PackageEnd], peer: str, limit: str
 ) -> Contender:
-    """A transport of the package ``peer``, whose ends are of the class ``kind``."""
+    """A transport of the package ``peer``, whose ends are of the class ``kind``; the first word of
+    its name is that of its file."""
+    link = name.split()[0]
     return Contender(name, link, endpoint, partial(_open_package, kind), peer, limit=limit)
 
 
-def _open_package(kind: type[PackageEnd], c: Contender, role: Role, own: Messages) -> PingPong:
+def _open_package(
+    kind: Callable[[Role, str], PackageEnd], c: Contender, role: Role, own: Messages
+) -> PingPong:
     return over_link(kind(role, c.endpoint), own)
-
-
-def limit(
-    name: str, file: str, endpoint: str, end: Callable[[Contender, Role, Messages], PingPong],
-    longest: int = 65507,
-) -> Contender:  # fmt: skip
-    """A limit in C, whose source stands beside a Python file; ``end`` opens an end of it by
-    ``pingpong.in_c``."""
-    source = Path(file).with_suffix(".c")
-    return Contender(
-        name, source.stem, endpoint, end, "C", limit=name, source=source, longest=longest
-    )
 
 
 def fresh_endpoint(link: str, folder: Path) -> str:

@@ -1,11 +1,12 @@
 """Eclipse Cyclone DDS, by the package cyclonedds."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, udp
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package
+from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.core.roles import Role
 
 #: on the loopback interface without multicast; its receiving thread hands a sample on by itself
@@ -17,10 +18,9 @@ _SETTINGS = """<CycloneDDS><Domain><General>
 _DOMAINS = 230  # numbers that a domain may have
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "cyclonedds" in names:
-        domain = str(1 + os.getpid() % _DOMAINS)
-        yield of_package("cyclonedds", "cyclonedds", domain, Dds, "cyclonedds", udp.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    domain = str(1 + os.getpid() % _DOMAINS)
+    yield of_package("cyclonedds", domain, Dds, "cyclonedds", UDP)
 
 
 class Dds(PackageEnd):
@@ -41,7 +41,7 @@ class Dds(PackageEnd):
         number = int(domain)
         settings = Domain(number, _SETTINGS)
         participant = DomainParticipant(number)
-        out, into = ("u", "y") if role == "controller" else ("y", "u")
+        out, into = self.WAYS[role]
         self._writer = DataWriter(participant, Topic(participant, out, message), qos)
         self._reader = DataReader(participant, Topic(participant, into, message), qos)
         self._message = message

@@ -1,11 +1,12 @@
 """gRPC, by the package grpcio: unary calls of plain bytes over a Unix socket."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, udp
+from gfm_hil.bench.contenders import Contender, PackageEnd
+from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.bench.pingpong import Messages, PingPong, over_link
 from gfm_hil.core.roles import Role
 
@@ -13,9 +14,8 @@ _SERVICE, _METHOD = "gfmhil", "exchange"
 _START_S = 10.0
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "grpc" in names:
-        yield Contender("grpc", "grpc", f"unix:{folder}/grpc", _open, "grpcio", limit=udp.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    yield Contender("grpc", "grpc", f"unix:{folder}/grpc", _open, "grpcio", limit=UDP)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

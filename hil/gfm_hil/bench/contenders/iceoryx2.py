@@ -2,21 +2,21 @@
 
 import ctypes
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, shm
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package
+from gfm_hil.bench.contenders.ours import SHM
 from gfm_hil.bench.pingpong import LONGEST
 from gfm_hil.core.roles import Role
 
 _ROOM = 64  # messages, as in the links
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "iceoryx2" in names:
-        name = f"gfmhil-{secrets.token_hex(8)}"
-        yield of_package("iceoryx2", "iceoryx2", name, Iceoryx2, "iceoryx2", shm.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    name = f"gfmhil-{secrets.token_hex(8)}"
+    yield of_package("iceoryx2", name, Iceoryx2, "iceoryx2", SHM)
 
 
 class Iceoryx2(PackageEnd):
@@ -36,8 +36,7 @@ class Iceoryx2(PackageEnd):
                 .open_or_create()
             )
 
-        ways = ("u", "y") if role == "controller" else ("y", "u")
-        out, into = (service(way) for way in ways)
+        out, into = map(service, self.WAYS[role])
         self._publisher = out.publisher_builder().initial_max_slice_len(LONGEST).create()
         self._subscriber = into.subscriber_builder().create()
         self._keep: list[Any] = [node, out, into]

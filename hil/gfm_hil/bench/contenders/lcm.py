@@ -1,19 +1,19 @@
 """LCM, by the package lcm."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, of_package, udp
+from gfm_hil.bench.contenders import Contender, PackageEnd, of_package
+from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "lcm" in names:
-        port = 10_000 + os.getpid() % 20_000
-        group = f"udpm://239.255.76.67:{port}?ttl=0"  # ttl 0: the packets stay on this machine
-        yield of_package("lcm", "lcm", group, Lcm, "lcm", udp.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    port = 10_000 + os.getpid() % 20_000
+    group = f"udpm://239.255.76.67:{port}?ttl=0"  # ttl 0: the packets stay on this machine
+    yield of_package("lcm", group, Lcm, "lcm", UDP)
 
 
 class Lcm(PackageEnd):
@@ -26,7 +26,7 @@ class Lcm(PackageEnd):
             self._lcm = LCM(group)
         except RuntimeError:
             raise UserError("LCM has no multicast here: ip link set lo multicast on") from None
-        self._out, into = ("u", "y") if role == "controller" else ("y", "u")
+        self._out, into = self.WAYS[role]
         self._came: list[bytes] = []
         self._lcm.subscribe(into, lambda _, message: self._came.append(message))
 

@@ -3,13 +3,14 @@
 import asyncio
 import struct
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench.contenders import Contender, free_port, udp
+from gfm_hil.bench.contenders import Contender, free_port
+from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.bench.pingpong import Messages, PingPong, over_link
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
@@ -18,10 +19,9 @@ from gfm_hil.links.port import Port
 _MOST = 121  # registers that function 23 may write
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "modbus" in names:
-        port = str(free_port())
-        yield Contender("modbus tcp", "modbus", port, _open, "pymodbus", limit=udp.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    port = str(free_port())
+    yield Contender("modbus tcp", "modbus", port, _open, "pymodbus", limit=UDP)
 
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:

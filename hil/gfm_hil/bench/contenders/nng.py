@@ -1,17 +1,17 @@
 """NNG, by the package pynng."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package, zmq
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package
+from gfm_hil.bench.contenders.ours import ZMQ_IPC, ZMQ_TCP
 from gfm_hil.core.roles import Role
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "nng" in names:
-        ipc, tcp = f"ipc://{folder}/nng", f"tcp://127.0.0.1:{free_port()}"
-        yield of_package("nng ipc", "nng", ipc, Nng, "pynng", zmq.IPC)
-        yield of_package("nng tcp", "nng", tcp, Nng, "pynng", zmq.TCP)
+def contenders(folder: Path) -> Iterator[Contender]:
+    ipc, tcp = f"ipc://{folder}/nng", f"tcp://127.0.0.1:{free_port()}"
+    yield of_package("nng ipc", ipc, Nng, "pynng", ZMQ_IPC)
+    yield of_package("nng tcp", tcp, Nng, "pynng", ZMQ_TCP)
 
 
 class Nng(PackageEnd):

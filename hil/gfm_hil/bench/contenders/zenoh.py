@@ -1,20 +1,20 @@
 """Eclipse Zenoh, by the package eclipse-zenoh."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package, udp
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package
+from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.core.roles import Role
 
 _ROOM = 64  # messages, as in the links
 
 
-def contenders(names: Sequence[str], folder: Path) -> Iterator[Contender]:
-    if "zenoh" in names:
-        tcp = f"tcp/127.0.0.1:{free_port()}"
-        yield of_package("zenoh tcp", "zenoh", tcp, Zenoh, "zenoh", udp.LIMIT)
+def contenders(folder: Path) -> Iterator[Contender]:
+    tcp = f"tcp/127.0.0.1:{free_port()}"
+    yield of_package("zenoh tcp", tcp, Zenoh, "zenoh", UDP)
 
 
 class Zenoh(PackageEnd):
@@ -33,7 +33,7 @@ class Zenoh(PackageEnd):
         if way == "connect":
             config.insert_json5("listen/endpoints", "[]")
         self._session = zenoh.open(config)
-        out, into = ("u", "y") if role == "controller" else ("y", "u")
+        out, into = self.WAYS[role]
         self._publisher = self._session.declare_publisher(
             f"gfmhil/{out}",
             express=True,
