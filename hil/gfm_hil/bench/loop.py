@@ -97,10 +97,10 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
 def _works(link: str, remarks: list[str]) -> bool:
     """Whether a link works here at ``T_S``; a remark if it does not."""
     try:
-        scenario = _scenario(link, "lockstep", T_S)
+        options = _scenario(link, "lockstep", T_S).link.options
         with ExitStack() as stack:
             endpoint = link_kind(link).fresh(memory_folder(stack))
-            open_link(link, "controller", endpoint, scenario.link.options).close()
+            open_link(link, "controller", endpoint, options).close()
     except UserError as problem:
         remarks.append(f"{link}, closed loop: not measured: {problem}")
         return False
@@ -140,16 +140,13 @@ def _lockstep(
             shares[link, delay].append(min(before_ns, half()) / min(stretches))
     return [
         {
-            "link": link,
-            "delay_samples": delay,
-            "mode": "lockstep",
-            "ticks_per_s": spread(rate),
+            "link": link, "delay_samples": delay, "mode": "lockstep", "ticks_per_s": spread(rate),
             "times_real_time": spread([each * T_S for each in rate]),
             "share_of_plant_alone": spread(shares[link, delay]),
         }
         for (link, delay), rate in rates.items()
         if rate
-    ]
+    ]  # fmt: skip
 
 
 def _pace(sent: Times) -> tuple[float, list[float]]:
@@ -193,42 +190,35 @@ def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
     causes, names = Counter[str](), Counter[str]()
     for run in runs:
         assert run.late is not None
-        timing = run.timing
-        there = timing["plant_received"] >= 0
-        trip = (timing["plant_received"] - timing["plant_sent"])[there]
+        sent, received = run.timing["plant_sent"], run.timing["plant_received"]
+        trip = (received - sent)[received >= 0]
         trips.append(trip)
-        missed.append(missed_ticks(timing))
-        ticks += len(there)
-        why = attribute(timing, _T_NS, (), run.taken, run.processors)
+        missed.append(missed_ticks(run.timing))
+        ticks += len(sent)
+        why = attribute(run.timing, _T_NS, (), run.taken, run.processors)
         causes.update(counts(why.causes))
         names.update(filter(None, why.names))
-        allowed = _T_NS - (float(np.median(trip)) if len(trip) else 0.0)
-        alone = len(lost(run.late, allowed))
+        alone = len(lost(run.late, _T_NS - (float(np.median(trip)) if len(trip) else 0.0)))
         host += alone
         host_ticks += run.late.shape[1]
-        if len(there):
-            beyond.append(100 * (len(missed[-1]) / len(there) - alone / run.late.shape[1]))
+        if len(sent):
+            beyond.append(100 * (len(missed[-1]) / len(sent) - alone / run.late.shape[1]))
     count, ours = sum(map(len, missed)), sum(causes[cause] for cause in OURS)
     return {
-        "link": link,
-        "mode": "realtime",
-        "load": load,
-        "policy": runs[0].scheduling,
-        "T_s_us": T_S * 1e6,
-        "ticks": ticks,
-        "missed": count,
-        "missed_pct": round(100 * count / ticks, 4) if ticks else None,
-        "host_pct": round(100 * host / host_ticks, 4),
+        "link": link, "mode": "realtime", "load": load, "policy": runs[0].scheduling,
+        "T_s_us": T_S * 1e6, "ticks": ticks, "missed": count, "missed_pct": _percent(count, ticks),
+        "host_pct": _percent(host, host_ticks),
         # the median: one long stop of the machine in a run, or in the pacing, is an outlier
         "beyond_host_pct": round(median(beyond), 4) if beyond else None,
         "rounds_beyond_host_pct": [round(value, 4) for value in beyond],
-        "by_work_or_link_pct": round(100 * ours / ticks, 4) if ticks else None,
-        "causes": dict(causes),
-        "names": dict(names.most_common()),
-        "method": runs[0].taken.method if runs[0].taken else None,
-        "bursts": bursts(missed),
-        **summary(trips),
-    }
+        "by_work_or_link_pct": _percent(ours, ticks), "causes": dict(causes),
+        "names": dict(names.most_common()), "bursts": bursts(missed),
+        "method": runs[0].taken.method if runs[0].taken else None, **summary(trips),
+    }  # fmt: skip
+
+
+def _percent(count: int, of: int) -> float | None:
+    return round(100 * count / of, 4) if of else None
 
 
 def _scenario(link: str, mode: str, duration: float, delay: int = 0) -> Scenario:
@@ -319,38 +309,35 @@ class InprocLoop:
         b.controller.set("P_ref", 0.8)
         b.controller.find_inner_tick()
         self.bench, self.ticks, self.T_s = b, ticks, b.scenario.T_s
-        plant, controller = (
+        plant, controller = self._rows = [
             RolePart.create(folder, role, ticks).signals for role in ("plant", "controller")
-        )
-        self._rows = plant, controller
-        step = b.controller.ctl, b.controller.laws, b.controller.states, b.controller.est
-        records, out = b.plant.records, (b.y, b.u)  # first: its memory has what it calls
-        self._kept = [*b.plant.memory, *step, *out]
-        self._start = [a.copy() for a in self._kept]
-        self.whole()
-        y, u = np.split(plant[:, : NY + NU].copy(), [NY], axis=1)
-        self._parts: dict[str, tuple[Callable[..., object], tuple[Any, ...]]] = {
-            "plant": (plant_alone, (records, *out, u)),
-            "controller": (controller_alone, (*step, *out, y)),
-            "recording": (
-                recording_alone, (records, step[0], *step[2:], *out, plant, controller)
-            ),
-            "plant's half": (plants_half, (records, *out, u)),
-        }  # fmt: skip
+        ]
         # as in a run, rows that were not written lately
         fresh = RolePart.create(folder / "long", "plant", RUNS * ticks).signals
         self._fresh = itertools.cycle(np.split(fresh, RUNS))
+        ctl, *more = b.controller.ctl, b.controller.laws, b.controller.states, b.controller.est
+        records, out = b.plant.records, (b.y, b.u)  # first: its memory has what it calls
+        self._kept = [*b.plant.memory, ctl, *more, *out]
+        self._start = [a.copy() for a in self._kept]
+        self.whole()
+        y, u = np.split(plant[:, : NY + NU].copy(), [NY], axis=1)
+        self._parts: dict[str, Callable[[], object]] = {
+            "plant": lambda: plant_alone(records, *out, u),
+            "controller": lambda: controller_alone(ctl, *more, *out, y),
+            "recording": lambda: recording_alone(records, ctl, *more[1:], *out, plant, controller),
+            "plant's half": lambda: plants_half(records, *out, u, self._row),
+        }
 
     def _reset(self) -> None:
         for array, start in zip(self._kept, self._start, strict=True):
             array[:] = start
+        self._row = next(self._fresh)
 
     def whole(self, ticks: int | None = None) -> float:
         """The closed loop. Raises UserError: the run ended early, so that there is nothing to
         time."""
         self._reset()
-        b, n = self.bench, ticks or self.ticks
-        done, controllers = 0, stack([b])
+        b, n, controllers, done = self.bench, ticks or self.ticks, stack([self.bench]), 0
         plant, controller = self._rows
 
         def run() -> None:
@@ -366,9 +353,7 @@ class InprocLoop:
         """The plant, the controller or the recording alone, or the plant's half: the plant and its
         recording."""
         self._reset()
-        work, arguments = self._parts[name]
-        more = [next(self._fresh)] if work is plants_half else []
-        return seconds(lambda: work(*arguments, *more)) / self.ticks * 1e9
+        return seconds(self._parts[name]) / self.ticks * 1e9
 
     def allocations_per_tick(self) -> float:
         """Allocations of numba's runtime per tick; those per call cancel."""
