@@ -5,11 +5,9 @@ no step can be computed ahead or skipped. Before the timing, both process inputs
 output into its limits, and their outputs and states are compared bit by bit.
 """
 
-from __future__ import annotations
-
+import ctypes
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,14 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from gfm_hil.bench.c_code import T_S, NoCompiler, Twin, compile_twin
+from gfm_hil.bench.c_code import FLAGS, NoCompiler, compile_c
 from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.rounds import ShowProgress, quickest, ratios, seconds, spread, take_turns
 from gfm_runtime import discretise, get_law, law_names
 from gfm_runtime.compiled import compiled
+from gfm_runtime.firmware import Module, make_modules, sources
 from gfm_runtime.kernel import pack_law, state_dtype, step
 from gfm_runtime.signals import NU, NY, group
 
+T_S = 1e-4  # s, of the laws
 ROWS = 256  # different measurements, used in turn
 FEEDBACK = 1e-6  # p.u. of y per p.u. of u
 REALS = ("float64", "float32")
@@ -51,36 +51,69 @@ def drive(law, state, io, inputs, outputs, steps, feedback):
         m = 0 if m + 1 == len(inputs) else m + 1
 
 
-@dataclass
+class Twin:
+    """The generic step that ``gfmhil firmware export`` writes, compiled, with its laws; ``state``
+    is the type of a ``gfm_t``."""
+
+    def __init__(self, library: Path, modules: Sequence[Module]) -> None:
+        self._library, self._prefixes = (
+            ctypes.CDLL(str(library)),
+            {m.name: m.prefix for m in modules},
+        )
+        real, states = modules[0].real, max(1, *(m.n for m in modules))
+        self._scalar = ctypes.c_double if real == np.float64 else ctypes.c_float
+        fields = [("x", real, (states,)), *((f, real, (NU,)) for f in ("offset", "u", "trend"))]
+        self.state = np.dtype([*fields, ("reason", "i4"), ("channel", "i4")], align=True)
+
+    def drive(self, name: str) -> Callable[..., None]:
+        """As ``drive`` for a law of the library. Arrays are passed by address, without a copy."""
+        law = ctypes.addressof(ctypes.c_char.in_dll(self._library, f"{self._prefixes[name]}_law"))
+        function = self._library.drive
+        function.argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int64] * 2 + [self._scalar]
+        function.restype = None
+
+        def drive(*arguments: Any) -> None:
+            _, *arrays, steps, feedback = arguments
+            addresses = (array.ctypes.data for array in arrays)
+            function(law, *addresses, len(arrays[2]), steps, feedback)
+
+        return drive
+
+
+def compile_twin(folder: Path, names: Sequence[str], real: DTypeLike, flags: str = FLAGS) -> Twin:
+    """Export laws of the catalogue for float64 or float32, and compile them. Raises NoCompiler:
+    there is none, or it fails."""
+    modules = make_modules({name: get_law(name) for name in names}, T_S, real)
+    files = sources(modules, T_S, "records")
+    for file, text in files.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    laws = [folder / file for file in files if file.endswith(".c") and file != "gfm.c"]
+    of_c = Path(__file__).with_name("kernel_drive.c")
+    return Twin(compile_c(of_c, folder, f"twin_{np.dtype(real)}", flags, laws), modules)
+
+
 class Chain:
-    """One law at its reference, with measurements that scatter around it, and its outputs; ``how``
-    is numba's or C's ``drive``, and ``state`` is the kernel's record or C's."""
+    """One law at its reference, with measurements that scatter around it, and its outputs; in
+    numba, or in C with a twin. ``scatter``: the standard deviation of the measurements, p.u."""
 
-    how: Callable[..., None]
-    law: NDArray[Any]
-    state: NDArray[Any]
-    io: NDArray[Any]
-    inputs: NDArray[Any]
-    outputs: NDArray[Any]
-
-    @staticmethod
-    def make(name: str, real: DTypeLike, scatter: float, twin: Twin | None = None) -> Chain:
-        """A new chain in numba, or in C with a twin; ``scatter``: the standard deviation of the
-        measurements, p.u."""
+    def __init__(
+        self, name: str, real: DTypeLike, scatter: float, twin: Twin | None = None
+    ) -> None:
         ref = np.array([s.default for s in group("ref")])
         y = ref + scatter * np.random.default_rng(1).standard_normal((ROWS, NY))
-        law = pack_law(discretise(get_law(name), T_S), real)
-        state = twin.instance() if twin else np.zeros(1, state_dtype(real))
-        how = twin.drive(name) if twin else drive
+        self.law = pack_law(discretise(get_law(name), T_S), real)
+        self.state = np.zeros(1, twin.state if twin else state_dtype(real))
         fields = [("ref", real, (NY,)), ("y", real, (NY,)), ("u", real, (NU,))]
         io = np.zeros(1, np.dtype(fields, align=True))
         io["ref"], io["u"] = ref, 1.0
-        return Chain(how, law, state, io, y.astype(real), np.zeros((ROWS, NU), real))
+        self.outputs = np.zeros((ROWS, NU), real)
+        self._drive: Callable[..., None] = twin.drive(name) if twin else drive
+        self._arrays = self.law, self.state, io, y.astype(real), self.outputs
+        self._feedback = self.outputs.dtype.type(FEEDBACK)
 
     def run(self, steps: int) -> None:
         """Advance by ``steps`` steps."""
-        feedback = self.inputs.dtype.type(FEEDBACK)
-        self.how(self.law, self.state, self.io, self.inputs, self.outputs, steps, feedback)
+        self._drive(*self._arrays, steps, self._feedback)
 
     def limited(self) -> NDArray[np.bool_]:
         """Which of the outputs (rows, 3) are at a limit."""
@@ -90,13 +123,7 @@ class Chain:
 
 def ulps(a: NDArray[Any], b: NDArray[Any]) -> int:
     """Largest distance of two arrays in units of the last place; 0: equal bit by bit."""
-    whole = np.dtype(f"i{a.dtype.itemsize}")
-
-    def ordered(x: NDArray[Any]) -> NDArray[Any]:
-        bits = np.ascontiguousarray(x).view(whole)
-        return np.where(bits < 0, np.iinfo(whole).min - bits, bits)
-
-    return int(np.max(np.abs(ordered(a) - ordered(b)), initial=0))
+    return int(np.max(np.testing.assert_array_max_ulp(a, b, np.iinfo(np.int64).max), initial=0))
 
 
 def compare(name: str, real: DTypeLike, twin: Twin, rounds: int) -> tuple[int, list[int]]:
@@ -105,7 +132,7 @@ def compare(name: str, real: DTypeLike, twin: Twin, rounds: int) -> tuple[int, l
     Returns the largest distance of their outputs and states, ``ulps``, and how often the outputs
     i_u, omega_u, E_u were limited.
     """
-    ours, theirs = (Chain.make(name, real, 0.5, of) for of in (None, twin))
+    ours, theirs = (Chain(name, real, 0.5, of) for of in (None, twin))
     n = int(ours.law["n"][0])
     worst, limited = 0, np.zeros(NU, int)
     for _ in range(rounds):
@@ -140,7 +167,7 @@ def _rows(
     agreement = {n: compare(n, real, twin, _COMPARED) for n in names} if twin else {}
 
     def ns_per_step(name: str, of: Twin | None) -> float:
-        chain = Chain.make(name, real, 1e-3, of)
+        chain = Chain(name, real, 1e-3, of)
         chain.run(ROWS)  # warm up
         return quickest(lambda: seconds(lambda: chain.run(_STEPS))) / _STEPS * 1e9
 
@@ -151,7 +178,7 @@ def _rows(
         numba, c = times[f"{n} numba"], times.get(f"{n} C")
         worst, limited = agreement.get(n, (None, None))
         yield {
-            "law": n, "real": real, "states": int(Chain.make(n, real, 0.0).law["n"][0]),
+            "law": n, "real": real, "states": int(Chain(n, real, 0.0).law["n"][0]),
             "numba_ns": spread(numba), "c_ns": spread(c) if c else None,
             "ratio": spread(ratios(numba, c)) if c else None, "ulps": worst, "limited": limited,
         }  # fmt: skip

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 from gfm_hil.bench import outside
-from gfm_hil.bench.c_code import compile_twin
 from gfm_hil.bench.contenders import FRAME, PEERS, messages, missing_packages
 from gfm_hil.bench.jitter import PERIOD_NS, WAITS, WATCHED, at_awaited
-from gfm_hil.bench.kernel import compare
+from gfm_hil.bench.kernel import compare, compile_twin
 from gfm_hil.bench.sweep import highest
 from gfm_hil.bench.tables import _agrees
 from gfm_hil.bench.tail import median_interval
