@@ -24,15 +24,13 @@ from scipy.stats import mannwhitneyu, rankdata
 from gfm_hil.bench.options import KINDS
 from gfm_hil.bench.result import check_result, write_result
 from gfm_hil.bench.rounds import ShowProgress, in_turn
-from gfm_hil.bench.tables import lockstep_name, times
+from gfm_hil.bench.tables import lockstep_name
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.table import Table
 
 BELIEVED = 0.05  # limit of a corrected p value
 _EXACT = 200_000  # most orders counted one by one; beyond, use the normal approximation
 _LISTS = ("rounds_p50_us", "rounds_ratio", "turns")  # lists that every round extends
-
-Sample = tuple[str, list[float]]
 
 
 def rank_test(a: Sequence[float], b: Sequence[float]) -> float:
@@ -52,79 +50,66 @@ def rank_test(a: Sequence[float], b: Sequence[float]) -> float:
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """The p values corrected for their number."""
-    corrected, greatest = [0.0] * len(p_values), 0.0
-    for k, at in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
-        greatest = max(greatest, min(1.0, (len(p_values) - k) * p_values[at]))
-        corrected[at] = greatest
-    return corrected
+    order, corrected = np.argsort(p_values), np.empty(len(p_values))
+    by_rank = np.arange(len(p_values), 0, -1) * np.take(p_values, order)
+    corrected[order] = np.minimum(np.maximum.accumulate(by_rank), 1.0)
+    return [float(p) for p in corrected]
 
 
 def compare(a: dict[str, Any], b: dict[str, Any], by_limit: bool) -> list[dict[str, Any]]:
     """One row per quantity that both results have, B over A; with ``by_limit`` ratios to the limit
     in C instead of times, where both have them. Raises UserError: they have nothing in common."""
     in_a, in_b = (dict(_samples(content, by_limit)) for content in (a, b))
-    rows = [name for name in in_a if name in in_b and in_a[name][0] == in_b[name][0]]
-    if not rows:
+    both = {row: values for row, values in in_a.items() if row in in_b}
+    if not both:
         raise UserError("A and B have no row in common: the same `gfmhil bench` must be run twice")
-    corrected = holm([rank_test(in_a[name][1], in_b[name][1]) for name in rows])
-    return [
-        _row(name, *in_a[name], in_b[name][1], p, len(rows))
-        for name, p in zip(rows, corrected, strict=True)
-    ]
-
-
-def _row(
-    name: str, unit: str, x: list[float], y: list[float], p: float, rows: int
-) -> dict[str, Any]:
-    # the smallest p possible with this number of rounds, corrected as the smallest of all rows
-    reach = 2 / math.comb(len(x) + len(y), len(x)) * rows
-    undecided = "noise" if reach < BELIEVED else "too few rounds to tell"
-    return {
-        "row": name, "unit": unit,
-        "a": median(x), "b": median(y), "ratio": median(y) / median(x),
-        "rounds": [len(x), len(y)], "p": p,
-        "verdict": "real change" if p < BELIEVED else undecided,
-    }  # fmt: skip
+    corrected = holm([rank_test(x, in_b[row]) for row, x in both.items()])
+    rows = []
+    for ((name, unit), x), p in zip(both.items(), corrected, strict=True):
+        y = in_b[name, unit]
+        # the smallest p possible with this number of rounds, corrected as the smallest of all rows
+        reach = 2 / math.comb(len(x) + len(y), len(x)) * len(both)
+        undecided = "noise" if reach < BELIEVED else "too few rounds to tell"
+        rows.append({
+            "row": name, "unit": unit,
+            "a": median(x), "b": median(y), "ratio": median(y) / median(x),
+            "rounds": [len(x), len(y)], "p": p,
+            "verdict": "real change" if p < BELIEVED else undecided,
+        })  # fmt: skip
+    return rows
 
 
 def comparison_table(rows: list[dict[str, Any]]) -> Table:
     """The rows as a table for display."""
-    return Table(
-        ("", "A", "B", "unit", "B : A", "p", "verdict"),
-        [
-            (
-                r["row"], f"{r['a']:.4g}", f"{r['b']:.4g}", r["unit"], times(r["ratio"], ""),
-                f"{r['p']:.2g}", r["verdict"],
-            )
-            for r in rows
-        ],
-        "B and A: medians of rounds, p of the rank test corrected for the number of rows",
-    )  # fmt: skip
+    forms = ("{row}", "{a:.4g}", "{b:.4g}", "{unit}", "{ratio:.2f}", "{p:.2g}", "{verdict}")
+    title = "B and A: medians of rounds, p of the rank test corrected for the number of rows"
+    heads = ("", "A", "B", "unit", "B : A", "p", "verdict")
+    return Table(heads, [[form.format(**row) for form in forms] for row in rows], title)
 
 
-def _samples(content: dict[str, Any], by_limit: bool) -> Iterator[tuple[str, Sample]]:
-    """(row, (unit, value of each round))."""
+def _samples(
+    content: dict[str, Any], by_limit: bool
+) -> Iterator[tuple[tuple[str, str], list[float]]]:
+    """((row, unit), value of each round) of rows that have any."""
     for r in content["results"]:
-        name = f"{r['name']}, {r['mode']}, {r['load']}, {r['policy']}, {r['payload']} B"
+        name = f"latency: {r['name']}, {r['mode']}, {r['load']}, {r['policy']}, {r['payload']} B"
         if by_limit and r["peer"] != "C" and r["rounds_ratio"]:
-            yield f"latency: {name}", ("× limit", r["rounds_ratio"])
+            yield (name, "× limit"), r["rounds_ratio"]
         elif r["rounds_p50_us"]:
-            yield f"latency: {name}", ("µs", r["rounds_p50_us"])
+            yield (name, "µs"), r["rounds_p50_us"]
     for r in content.get("jitter", ()):
-        yield f"jitter: {r['wait']}, {r['load']}, {r['policy']}", ("µs", r["rounds_p50_us"])
+        yield (f"jitter: {r['wait']}, {r['load']}, {r['policy']}", "µs"), r["rounds_p50_us"]
     loop = content.get("loop", {})
     for r in loop.get("lockstep", ()):
-        yield f"lockstep: {lockstep_name(r)}", ("ticks/s", r["ticks_per_s"]["turns"])
+        yield (f"lockstep: {lockstep_name(r)}", "ticks/s"), r["ticks_per_s"]["turns"]
     for r in loop.get("laws", ()):
-        yield f"loop in process: {r['law']}", ("ns", r["whole_ns"]["turns"])
+        yield (f"loop in process: {r['law']}", "ns"), r["whole_ns"]["turns"]
     for r in loop.get("realtime", ()):
         if r["rounds_p50_us"]:
-            yield f"real time: {r['link']}, {r['load']}", ("µs", r["rounds_p50_us"])
+            yield (f"real time: {r['link']}, {r['load']}", "µs"), r["rounds_p50_us"]
     for r in content.get("kernel", ()):
-        if by_limit and r["ratio"]:
-            yield f"kernel: {r['law']}, {r['real']}", ("× C", r["ratio"]["turns"])
-        else:
-            yield f"kernel: {r['law']}, {r['real']}", ("ns", r["numba_ns"]["turns"])
+        unit, times = ("× C", r["ratio"]) if by_limit and r["ratio"] else ("ns", r["numba_ns"])
+        yield (f"kernel: {r['law']}, {r['real']}", unit), times["turns"]
 
 
 def interleave(

@@ -60,13 +60,13 @@ def cpu_load(
     kinds: Sequence[Load] = LOADS,
 ) -> Iterator[Callable[[Load], AbstractContextManager[None]]]:
     """Start the processes of these loads, stopped; yields a context in which those of one run."""
-    started: dict[Load, list[subprocess.Popen[bytes]]] = {}
+    started: list[tuple[Load, subprocess.Popen[bytes]]] = []
 
-    def send(kind: Load, number: signal.Signals) -> None:
-        for process in started.get(kind, ()):
+    def send(wanted: Load, number: signal.Signals) -> None:
+        for process in (process for kind, process in started if kind == wanted):
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, number)
-        if started.get(kind):
+        if wanted != "idle":
             time.sleep(_SETTLE_S)
 
     @contextmanager
@@ -82,12 +82,12 @@ def cpu_load(
             for kind in kinds:
                 if kind != "idle":
                     cpus = sorted(os.sched_getaffinity(0))
-                    started[kind] = [_start(kind, cpu, place) for cpu in cpus]
-            for process in (one for some in started.values() for one in some):
+                    started += [(kind, _start(kind, cpu, place)) for cpu in cpus]
+            for _, process in started:
                 os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
             yield load
         finally:
-            for process in (one for some in started.values() for one in some):
+            for _, process in started:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
 

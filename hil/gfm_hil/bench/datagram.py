@@ -46,8 +46,7 @@ class UdpLink:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _PATIENCE)
         self._serves = role == "controller"
         try:
-            place = self._socket.bind if self._serves else self._socket.connect
-            place((host, int(port)))
+            (self._socket.bind if self._serves else self._socket.connect)((host, int(port)))
         except OSError as problem:
             self.close()
             raise UserError(f"{endpoint}: cannot be used: {problem.strerror}") from None

@@ -86,23 +86,18 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compile before timing
         for _, share, cell in in_turn(cells, options.rounds, options.until):
-            policy, load, wait = cell
+            (policy, load, wait), seconds = cell, options.seconds
             show(", ".join(cell), share)
-            with load_is(load):
+            with load_is(load), ProcessorWatch() as watch:
+                if wait == WATCHED:
+                    watch.begin(loops[policy])
+                first = time.monotonic_ns() + _LEAD_NS
                 if wait in others:
-                    cpus = loops[policy]
-                    late = outside.measure(wait, cpus, policy, PERIOD_NS, options.seconds)
-                    rows[cell].rounds.append(late[None])
+                    late = outside.measure(wait, loops[policy], policy, PERIOD_NS, seconds)[None]
                 else:
-                    with ProcessorWatch() as watch:
-                        if wait == WATCHED:
-                            watch.begin(loops[policy])
-                        first = time.monotonic_ns() + _LEAD_NS
-                        late = pace_both(
-                            two[policy], PERIOD_NS, WAITS[wait], options.seconds, first
-                        )
-                    rows[cell].add(first, late, watch)
-            time.sleep(REST * options.seconds)
+                    late = pace_both(two[policy], PERIOD_NS, WAITS[wait], seconds, first)
+            rows[cell].add(first, late, watch)
+            time.sleep(REST * seconds)
     content["jitter"] = [_row(*cell, rows) for cell in cells]
     content["remarks"] += absent.values()
 
@@ -117,7 +112,7 @@ class _Late:
     method: str | None = None
 
     def add(self, first_ns: int, late: Times, watch: ProcessorWatch) -> None:
-        """A round of our own."""
+        """Take a round in, whose first tick was due at ``first_ns``."""
         self.rounds.append(late)
         if watch.taken is None:
             return
@@ -133,8 +128,7 @@ class _Late:
 def _row(
     policy: Policy, load: Load, wait: str, every: Mapping[tuple[Policy, Load, str], _Late]
 ) -> dict[str, Any]:
-    late = every[policy, load, wait]
-    ours = wait in WAITS
+    late, ours = every[policy, load, wait], wait in WAITS
     ticks = sum(each.shape[1] for each in late.rounds)
     gone = [lost(each, PERIOD_NS) for each in late.rounds] if ours else []
     count = sum(map(len, gone))

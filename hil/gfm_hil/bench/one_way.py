@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from gfm_hil.bench.histogram import histogram, summary_of_counts
 
@@ -83,12 +83,9 @@ def ways(rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     interval in which that is with 95 % (Clopper and Pearson); ``clock`` and ``within_us``; and
     ``there``, ``back`` and ``between``, each as ``summary_of_counts``."""
     sent, lost = (sum(one[key] for one in rounds) for key in ("sent", "lost"))
-    low = beta.ppf(0.025, lost, sent - lost + 1) if lost else 0.0
-    high = beta.ppf(0.975, lost + 1, sent - lost) if lost < sent else 1.0
-    row: dict[str, Any] = {
-        "sent": sent, "lost": lost, "lost_pct": _percent(lost / max(sent, 1)),
-        "lost_pct_95": [_percent(low), _percent(high)],
-    }  # fmt: skip
+    share = [lost / max(sent, 1), *(binomtest(lost, sent).proportion_ci() if sent else (0.0, 1.0))]
+    lost_pct, *ends = (round(100 * float(one), 4) for one in share)
+    row: dict[str, Any] = {"sent": sent, "lost": lost, "lost_pct": lost_pct, "lost_pct_95": ends}
     known = [one for one in rounds if "clock" in one]
     if known:
         clocks = {one["clock"] for one in known}
@@ -97,7 +94,3 @@ def ways(rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for way in ("there", "back", "between"):
         row[way] = summary_of_counts([one[way] for one in rounds if way in one])
     return row
-
-
-def _percent(share: float) -> float:
-    return round(100 * float(share), 4)

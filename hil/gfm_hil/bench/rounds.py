@@ -66,10 +66,9 @@ def ratios(over: Sequence[float], under: Sequence[float]) -> list[float]:
 def spread(values: Sequence[float]) -> dict[str, Any]:
     """``median``, ``min``, ``max`` and the value of each of the ``turns``, for JSON: four digits
     after the point. At least one value."""
-    of = {"median": statistics.median(values), "min": min(values), "max": max(values)}
-    return {name: round(value, 4) for name, value in of.items()} | {
-        "turns": [round(value, 4) for value in values]
-    }
+    turns = [round(value, 4) for value in values]
+    middle = round(statistics.median(values), 4)
+    return {"median": middle, "min": min(turns), "max": max(turns), "turns": turns}
 
 
 def spread_text(values: Sequence[float], digits: int) -> str:
