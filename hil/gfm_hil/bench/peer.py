@@ -8,9 +8,9 @@ import ctypes
 import re
 import socket
 import subprocess
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from gfm_hil.engine.drive import end_exchange, send_last
 from gfm_hil.engine.handshake import shake_hands
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import Link, link_kind, link_names
-from gfm_hil.links.base import LinkKind
+from gfm_hil.links.base import LinkKind, LinkOptions
 from gfm_hil.links.frame import FrameReader, FrameWriter
 from gfm_hil.links.pump import with_port
 from gfm_hil.realtime import priority
@@ -56,14 +56,24 @@ _CLOCK_TAI = 11
 _UNSYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
 
 
-def kind_of(endpoint: str) -> LinkKind:
-    """The link that has such endpoints. Raises UserError: none has."""
+def _link_of(endpoint: str, options: dict[str, Any], named: str) -> tuple[LinkKind, LinkOptions]:
+    """The link that has such endpoints, and its options, checked. Raises UserError: none has, or
+    they are wrong; ``named``: what the user calls it."""
     kinds = [*map(link_kind, link_names()), datagram.KIND]
     for kind in kinds:
         if re.fullmatch(kind.pattern, endpoint):
-            return kind
+            try:
+                return kind, kind.checked(endpoint, options)
+            except ValueError as problem:
+                raise UserError(f"{named}: {problem}") from None
     forms = ", ".join(kind.form for kind in kinds)
     raise UserError(f"{endpoint}: must be {forms}, or a controller: {FORMS}")
+
+
+def _open_end(role: Role, endpoint: str, options: dict[str, Any]) -> Link:
+    """One end of the link that has such endpoints. Raises UserError: it cannot be opened."""
+    kind, checked = _link_of(endpoint, options, "link")
+    return kind.open(role, endpoint, checked)
 
 
 def scenario_of(inner: bool = False, **link: Any) -> Scenario:
@@ -92,13 +102,9 @@ def peer_of(bench: BenchOptions, place: Path) -> Contender:
         folder.mkdir()
         more |= _controller(to, ports, folder)
         return Contender(name or to, "shm", more["endpoint"], _open, PEER, more, SHM)
-    kind = kind_of(to)
+    kind, _ = _link_of(to, link, "--to")
     if ports is not None:
         raise UserError(f"--map {ports}: is for a controller {FORMS}; {to} is an endpoint")
-    try:
-        kind.checked(to, link)
-    except ValueError as problem:
-        raise UserError(f"--to: {problem}") from None
     _check_route(to)
     limit = ZMQ_IPC if to.startswith("ipc:") else _LIMITS.get(kind.name, "")
     return Contender(name or to, kind.name, to, _open, PEER, more, limit)
@@ -133,16 +139,6 @@ def _check_route(endpoint: str) -> None:
         raise UserError(f"{endpoint}: no route: {getattr(problem, 'strerror', problem)}") from None
 
 
-def open_end(role: Role, endpoint: str, options: dict[str, Any]) -> Link:
-    """One end of the link that has such endpoints. Raises UserError: it cannot be opened."""
-    kind = kind_of(endpoint)
-    try:
-        checked = kind.checked(endpoint, options)
-    except ValueError as problem:
-        raise UserError(f"link: {problem}") from None
-    return kind.open(role, endpoint, checked)
-
-
 def tai_offset(ptp_us: float) -> int:
     """CLOCK_TAI less CLOCK_MONOTONIC, ns, of a machine whose clock follows PTP. Raises UserError:
     the kernel does not know TAI, or says that its clock follows none."""
@@ -154,10 +150,6 @@ def tai_offset(ptp_us: float) -> int:
         raise UserError(f"{where}: the kernel's clock follows none (adjtimex: STA_UNSYNC)")
     if abs(time.clock_gettime_ns(_CLOCK_TAI) - time.time_ns()) < 1_000_000_000:
         raise UserError(f"{where}: CLOCK_TAI is UTC here: ptp4l or phc2sys sets its offset")
-    return _tai_now()
-
-
-def _tai_now() -> int:
     readings = []
     for _ in range(20):
         before = time.monotonic_ns()
@@ -176,7 +168,7 @@ class _Caller:
         bench = make_bench(scenario)
         plant_sample(bench.plant.records, 0, bench.y)
         self._name, self._values = c.name, bench.y
-        self._good = open_end("plant", c.endpoint, more["link"])
+        self._good = _open_end("plant", c.endpoint, more["link"])
         try:
             start = shake_hands("plant", self._good, scenario, lambda: False, lambda text: None)
         except PeerLost as problem:
@@ -269,20 +261,20 @@ def answer(
 
     Args:
         endpoint, options: of the link.
-        ptp_us: as of ``peer_of``.
+        ptp_us: how far CLOCK_TAI of this machine may be off; 0: nobody says.
         fifo: ask for the priority of a run in real time.
         say: receives each line of progress.
     """
     tai_ns = tai_offset(ptp_us) if ptp_us else 0
     with closing(datagram.UdpLink("controller", "udp://0.0.0.0:0")) as nobody:
         _answer_all(nobody, 0, 0.0, np.ones(1, np.int64))  # compiles: no bench would wait for it
-    open_end("controller", endpoint, options).close()
+    _open_end("controller", endpoint, options).close()
     say(f"answering at {endpoint}; Ctrl-C ends it")
     scenario = scenario_of(start_timeout_s=_WEEK_S, endpoint=endpoint)
     with Interrupt() as interrupt:
         while not interrupt.came:
             (priority.ask_for_real_time if fifo else priority.own_processor)("controller")
-            link = open_end("controller", endpoint, options)
+            link = _open_end("controller", endpoint, options)
             try:
                 shake_hands(
                     "controller", link, scenario, lambda: interrupt.came, lambda text: None,
@@ -310,22 +302,17 @@ def _answer_all(link: Link, tai_ns: int, error_ns: float, stop: Numbers) -> int:
 
 def _answer_one(link: Link, tai_ns: int, error_ns: float, interrupt: Interrupt) -> str:
     """Answer until the bench ends; returns how it did."""
-    stop, why = np.zeros(1, np.int64), [0]
-
-    def work() -> None:
-        why[0] = _answer_all(link, tai_ns, error_ns, stop)
-
+    stop = np.zeros(1, np.int64)
     getattr(link, "start", _nothing)()
-    thread = threading.Thread(target=work)
-    thread.start()
-    priority.restore_priority()
-    while thread.is_alive():
-        thread.join(_POLL_S)
-        stop[0] = interrupt.came
+    with ThreadPoolExecutor(1) as pool:
+        answering = pool.submit(_answer_all, link, tai_ns, error_ns, stop)
+        priority.restore_priority()
+        while wait([answering], _POLL_S).not_done:
+            stop[0] = interrupt.came
     getattr(link, "stop", _nothing)()
-    if why[0] == LEFT:  # the bench waits for our last frame
+    if answering.result() == LEFT:  # the bench waits for our last frame
         send_last(link, FrameWriter("u"), 0, STOPPED, 0, np.zeros(NU))
     return {
         LEFT: "the bench has ended", GONE: "the link is gone", OTHER: "another bench begins",
         SILENT: f"the bench has said nothing for {_SILENCE_NS * 1e-9:g} s", 0: "stopped",
-    }[why[0]]  # fmt: skip
+    }[answering.result()]  # fmt: skip

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
-from gfm_hil.bench.cpu_load import Load, cpu_load, program
+from gfm_hil.bench.cpu_load import LOADS, Load, cpu_load, program
 from gfm_hil.bench.histogram import summary
 from gfm_hil.bench.options import BenchOptions
 from gfm_hil.bench.pair import Pair, Policy, pair
@@ -78,19 +78,18 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
         for cell in cells:
             one_round(cell, options.rates[0], _FIRST_S)
         every = list(product(cells, options.rates))
-        rounds: dict[tuple[_Cell, float], list[tuple[Times, float]]] = {one: [] for one in every}
+        rounds = {one: list[tuple[Times, float]]() for one in every}
         for _, share, (cell, khz) in in_turn(every, options.rounds, options.until):
             show(f"{cell.contender.name}, {cell.load}, {khz:g} kHz", share)
             rounds[cell, khz].append(one_round(cell, khz, options.seconds))
         content["sweep"] = [_row(*one, some) for one, some in rounds.items()]
-        content["highest"] = []
+        content["highest"], most_pct = [], options.most_missed_pct
         for k, cell in enumerate(cells):
             show(f"highest rate, {cell.contender.name}, {cell.load}", k / len(cells))
-            found = highest(partial(missed, cell), options.rates, options.most_missed_pct)
-            row = {"highest_khz": found, "most_missed_pct": options.most_missed_pct}
+            bears_khz = highest(partial(missed, cell), options.rates, most_pct)
+            row = {"highest_khz": bears_khz, "most_missed_pct": most_pct}
             content["highest"].append(_keys(cell) | row)
-    makers = {kind: program(kind) for kind in options.loads if kind not in ("idle", "busy")}
-    content["remarks"] += [f"load {kind}: {maker}" for kind, maker in makers.items()]
+    content["remarks"] += [f"load {x}: {program(x)}" for x in options.loads if x not in LOADS]
 
 
 def _open(
@@ -130,14 +129,14 @@ def highest(
     missed: Callable[[float], float | None], rates: Sequence[float], most_pct: float
 ) -> float | None:
     """The highest rate, kHz, of which no more is ``missed``; None if the lowest one is too fast."""
-    low, high = min(rates), max(rates)
+    low, high = float(min(rates)), float(max(rates))
 
     def bears(khz: float) -> bool:
         share = missed(khz)
         return share is not None and share <= most_pct
 
     if bears(high):
-        return float(high)
+        return high
     if not bears(low):
         return None
     for _ in range(_STEPS):
@@ -155,13 +154,14 @@ def _keys(cell: _Cell) -> dict[str, Any]:
 
 
 def _row(cell: _Cell, khz: float, rounds: list[tuple[Times, float]]) -> dict[str, Any]:
-    shares = [share for took, _ in rounds if (share := _missed_pct(took, khz)) is not None]
-    figures = summary([took for took, _ in rounds])
+    took, costs = zip(*rounds, strict=True)
+    shares = [share for times in took if (share := _missed_pct(times, khz)) is not None]
+    figures = summary(took)
     del figures["histogram"]
     return _keys(cell) | {
         "khz": khz,
         "missed_pct": round(float(np.mean(shares)), 4) if shares else None,
-        "processor_pct": round(100 * float(np.median([cost for _, cost in rounds])), 1),
+        "processor_pct": round(100 * float(np.median(costs)), 1),
         "opened_kb": round(cell.kb),
         **figures,
     }
