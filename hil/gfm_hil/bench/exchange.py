@@ -123,8 +123,7 @@ def answer_all(handle, send, receive, spins, y, u, clocks, tai_ns, silence_ns, s
     """Answer each y with our clock; returns LEFT, GONE, SILENT or OTHER, or 0 once told to stop.
 
     Args:
-        handle, send, receive, spins: of the link's port.
-        y, u: ``Frames``, that of u with ``clocks``.
+        handle, send, receive, spins, y, u: as of ``send_all``.
         clocks: integers, as many as u has values; the third one is set.
         tai_ns: CLOCK_TAI less CLOCK_MONOTONIC, 0 for the latter.
         silence_ns: after which to give up.

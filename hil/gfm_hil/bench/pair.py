@@ -100,11 +100,11 @@ def pair(policy: Policy, place: Path) -> Iterator[Pair]:
     stop = np.memmap(path, np.int64, "r+")
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:  # both start now and inherit this: only the parent handles Ctrl-C
-        started = [pool.submit(_ready) for pool in pools.values()]
+        started = [pool.submit(os.getpid) for pool in pools.values()]
     finally:
         signal.signal(signal.SIGINT, handler)
     try:
-        for one in started:
+        for one in started:  # done once ``_set_up`` is
             _wait(one)
         yield Pair(pools, stop)
     finally:
@@ -138,10 +138,6 @@ def _end_with_parent() -> None:
     with suppress(Exception):
         _close()
     os._exit(1)
-
-
-def _ready() -> None:
-    """The first task: it is done once ``_set_up`` is done."""
 
 
 def _open(contender: Contender, payload: int) -> bool:

@@ -124,7 +124,12 @@ class PackageEnd:
     """
 
     port = None
+    _answer: bytes | None = None  # of one whose ``send`` returns with the answer
     WAYS: ClassVar = {"controller": ("u", "y"), "plant": ("y", "u")}
+
+    def receive(self) -> bytes | None:
+        answer, self._answer = self._answer, None
+        return answer
 
 
 def of_package(

@@ -37,15 +37,10 @@ class Caller(PackageEnd):
         self._channel = grpc.insecure_channel(endpoint)
         grpc.channel_ready_future(self._channel).result(_START_S)
         self._call = self._channel.unary_unary(f"/{_SERVICE}/{_METHOD}")
-        self._answer: bytes | None = None
 
     def send(self, message: bytes) -> bool:
         self._answer = self._call(message)
         return True
-
-    def receive(self) -> bytes | None:
-        answer, self._answer = self._answer, None
-        return answer
 
     def close(self) -> None:
         self._channel.close()

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench.contenders import Contender, free_port
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port
 from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.bench.pingpong import Messages, PingPong, over_link
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.links.port import Port
 
 _MOST = 121  # registers that function 23 may write
 
@@ -34,10 +33,8 @@ def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     return over_link(_Client(int(c.endpoint)), own)
 
 
-class _Client:
+class _Client(PackageEnd):
     """The plant's end: it sends a request and has the answer before it polls for one."""
-
-    port: Port | None = None
 
     def __init__(self, port: int) -> None:
         from pymodbus.client import ModbusTcpClient
@@ -46,7 +43,6 @@ class _Client:
         if not self._client.connect():
             raise UserError(f"no Modbus server at port {port}")
         self.close = self._client.close
-        self._answer: bytes | None = None
 
     def send(self, message: bytes) -> bool:
         values = np.frombuffer(message[: len(message) // 2 * 2], ">u2").tolist()
@@ -56,10 +52,6 @@ class _Client:
         good = not answer.isError()
         self._answer = struct.pack(f">{len(values)}H", *answer.registers) if good else None
         return good
-
-    def receive(self) -> bytes | None:
-        answer, self._answer = self._answer, None
-        return answer
 
 
 def _server(port: int) -> PingPong:
