@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,7 +22,7 @@ from gfm_hil.bench.c_code import NoCompiler, compile_c
 from gfm_hil.bench.pingpong import Messages, PingPong, frames, over_link, plain
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.links import link_kind, open_link
+from gfm_hil.links import Link, link_kind, open_link
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.children import GRACE_S
@@ -49,9 +48,9 @@ class Contender:
     name: str  # in tables, unique
     link: str  # name of the link, or of the transport of C or of another package
     endpoint: str  # where both sides meet
-    # opens one end that sends these messages; a function of a module. The controller opens its
-    # end first
-    end: Callable[[Contender, Role, Messages], PingPong]
+    # opens one end that sends these messages; a function or class of a module. What it returns is
+    # called as a link is, if it is no ``PingPong``. The controller opens its end first
+    end: Callable[[Contender, Role, Messages], Any]
     peer: str = "ours"  # ``ours``, ``C`` or the name of another package
     options: dict[str, Any] = field(default_factory=dict)  # of the link
     # name of the contender in C that it is compared with; its own name for one in C
@@ -65,7 +64,9 @@ class Contender:
         here, or does not carry so many bytes."""
         if payload > self.longest:
             raise UserError(f"it carries messages of up to {self.longest} bytes")
-        return self.end(self, role, messages(role, payload))
+        own = messages(role, payload)
+        end = self.end(self, role, own)
+        return end if isinstance(end, PingPong) else over_link(end, own)
 
 
 def missing_packages(peer: str) -> list[str]:
@@ -112,16 +113,13 @@ def of_link(name: str, link: str, endpoint: str, limit: str, **options: Any) -> 
     )
 
 
-def _open_link(c: Contender, role: Role, own: Messages) -> PingPong:
-    return over_link(open_link(c.link, role, c.endpoint, c.options), own)
+def _open_link(c: Contender, role: Role, own: Messages) -> Link:
+    return open_link(c.link, role, c.endpoint, c.options)
 
 
 class PackageEnd:
-    """Base of one end of another package's transport; Python drives it like a link.
-
-    A class of it is made of a role and an endpoint. ``WAYS``: of a role, the names of what it sends
-    and of what it receives.
-    """
+    """Base of one end of another package's transport; Python drives it like a link. ``WAYS``: of a
+    role, the names of what it sends and of what it receives."""
 
     port = None
     _answer: bytes | None = None  # of one whose ``send`` returns with the answer
@@ -130,21 +128,6 @@ class PackageEnd:
     def receive(self) -> bytes | None:
         answer, self._answer = self._answer, None
         return answer
-
-
-def of_package(
-    name: str, endpoint: str, kind: Callable[[Role, str], PackageEnd], peer: str, limit: str
-) -> Contender:
-    """A transport of the package ``peer``, whose ends are of the class ``kind``; the first word of
-    its name is that of its file."""
-    link = name.split()[0]
-    return Contender(name, link, endpoint, partial(_open_package, kind), peer, limit=limit)
-
-
-def _open_package(
-    kind: Callable[[Role, str], PackageEnd], c: Contender, role: Role, own: Messages
-) -> PingPong:
-    return over_link(kind(role, c.endpoint), own)
 
 
 def fresh_endpoint(link: str, folder: Path) -> str:

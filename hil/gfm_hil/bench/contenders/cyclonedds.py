@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, of_package
+from gfm_hil.bench.contenders import Contender, PackageEnd
 from gfm_hil.bench.contenders.ours import UDP
+from gfm_hil.bench.pingpong import Messages
 from gfm_hil.core.roles import Role
 
 #: on the loopback interface without multicast; its receiving thread hands a sample on by itself
@@ -20,13 +21,13 @@ _DOMAINS = 230  # numbers that a domain may have
 
 def contenders(folder: Path) -> Iterator[Contender]:
     domain = str(1 + os.getpid() % _DOMAINS)
-    yield of_package("cyclonedds", domain, Dds, "cyclonedds", UDP)
+    yield Contender("cyclonedds", "cyclonedds", domain, Dds, "cyclonedds", limit=UDP)
 
 
 class Dds(PackageEnd):
     """One end: a writer and a reader, best effort, the last sample alone."""
 
-    def __init__(self, role: Role, domain: str) -> None:
+    def __init__(self, c: Contender, role: Role, own: Messages) -> None:
         from cyclonedds.core import Policy, Qos
         from cyclonedds.domain import Domain, DomainParticipant
         from cyclonedds.idl import make_idl_struct, types
@@ -38,7 +39,7 @@ class Dds(PackageEnd):
         fields = {"content": kinds.sequence[kinds.uint8]}
         message: Any = make_idl_struct("Message", "gfmhil.Message", fields)
         qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
-        number = int(domain)
+        number = int(c.endpoint)
         settings = Domain(number, _SETTINGS)
         participant = DomainParticipant(number)
         out, into = self.WAYS[role]

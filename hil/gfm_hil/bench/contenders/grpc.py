@@ -7,7 +7,7 @@ from typing import Any
 
 from gfm_hil.bench.contenders import Contender, PackageEnd
 from gfm_hil.bench.contenders.ours import UDP
-from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.bench.pingpong import Messages, PingPong
 from gfm_hil.core.roles import Role
 
 _SERVICE, _METHOD = "gfmhil", "exchange"
@@ -18,20 +18,16 @@ def contenders(folder: Path) -> Iterator[Contender]:
     yield Contender("grpc", "grpc", f"unix:{folder}/grpc", _open, "grpcio", limit=UDP)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+def _open(c: Contender, role: Role, own: Messages) -> PingPong | PackageEnd:
     """The controller is the server: u answers the call that brings y. Its guide to performance
     prefers unary calls to streams in Python, which need more threads."""
-    return (
-        _server(c.endpoint, own)
-        if role == "controller"
-        else over_link(Caller(role, c.endpoint), own)
-    )
+    return _server(c.endpoint, own) if role == "controller" else _Caller(c.endpoint)
 
 
-class Caller(PackageEnd):
+class _Caller(PackageEnd):
     """The plant's end: it calls and has the answer before it polls for one."""
 
-    def __init__(self, role: Role, endpoint: str) -> None:
+    def __init__(self, endpoint: str) -> None:
         import grpc
 
         self._channel = grpc.insecure_channel(endpoint)

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, of_package
+from gfm_hil.bench.contenders import Contender, PackageEnd
 from gfm_hil.bench.contenders.ours import SHM
-from gfm_hil.bench.pingpong import LONGEST
+from gfm_hil.bench.pingpong import LONGEST, Messages
 from gfm_hil.core.roles import Role
 
 _ROOM = 64  # messages, as in the links
@@ -16,13 +16,13 @@ _ROOM = 64  # messages, as in the links
 
 def contenders(folder: Path) -> Iterator[Contender]:
     name = f"gfmhil-{secrets.token_hex(8)}"
-    yield of_package("iceoryx2", name, Iceoryx2, "iceoryx2", SHM)
+    yield Contender("iceoryx2", "iceoryx2", name, Iceoryx2, "iceoryx2", limit=SHM)
 
 
 class Iceoryx2(PackageEnd):
     """One end over two services of its publish-subscribe, driven from Python, as a link is."""
 
-    def __init__(self, role: Role, name: str) -> None:
+    def __init__(self, c: Contender, role: Role, own: Messages) -> None:
         import iceoryx2 as iox2
 
         iox2.set_log_level(iox2.LogLevel.Fatal)
@@ -30,7 +30,7 @@ class Iceoryx2(PackageEnd):
 
         def service(way: str) -> Any:
             return (
-                node.service_builder(iox2.ServiceName.new(f"{name}/{way}"))
+                node.service_builder(iox2.ServiceName.new(f"{c.endpoint}/{way}"))
                 .publish_subscribe(iox2.Slice[ctypes.c_uint8])
                 .subscriber_max_buffer_size(_ROOM)
                 .open_or_create()

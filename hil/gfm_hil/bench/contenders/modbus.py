@@ -11,7 +11,7 @@ import numpy as np
 
 from gfm_hil.bench.contenders import Contender, PackageEnd, free_port
 from gfm_hil.bench.contenders.ours import UDP
-from gfm_hil.bench.pingpong import Messages, PingPong, over_link
+from gfm_hil.bench.pingpong import Messages, PingPong
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 
@@ -23,14 +23,12 @@ def contenders(folder: Path) -> Iterator[Contender]:
     yield Contender("modbus tcp", "modbus", port, _open, "pymodbus", limit=UDP)
 
 
-def _open(c: Contender, role: Role, own: Messages) -> PingPong:
+def _open(c: Contender, role: Role, own: Messages) -> PingPong | PackageEnd:
     """The controller is the server. A request of the plant writes y and reads u at once (function
     23), as registers of 16 bits; both have the size of y."""
     if not 2 <= own.shape[1] <= 2 * _MOST:
         raise UserError(f"a Modbus message holds 2 to {2 * _MOST} bytes")
-    if role == "controller":
-        return _server(int(c.endpoint))
-    return over_link(_Client(int(c.endpoint)), own)
+    return (_server if role == "controller" else _Client)(int(c.endpoint))
 
 
 class _Client(PackageEnd):

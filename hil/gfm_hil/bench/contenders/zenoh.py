@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, of_package
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port
 from gfm_hil.bench.contenders.ours import UDP
+from gfm_hil.bench.pingpong import Messages
 from gfm_hil.core.roles import Role
 
 _ROOM = 64  # messages, as in the links
@@ -14,14 +15,14 @@ _ROOM = 64  # messages, as in the links
 
 def contenders(folder: Path) -> Iterator[Contender]:
     tcp = f"tcp/127.0.0.1:{free_port()}"
-    yield of_package("zenoh tcp", tcp, Zenoh, "zenoh", UDP)
+    yield Contender("zenoh tcp", "zenoh", tcp, Zenoh, "zenoh", limit=UDP)
 
 
 class Zenoh(PackageEnd):
     """One end of two peers without a router: an express publisher, which does not batch, of the
     highest priority, and a subscriber whose ring the caller polls."""
 
-    def __init__(self, role: Role, endpoint: str) -> None:
+    def __init__(self, c: Contender, role: Role, own: Messages) -> None:
         import zenoh
 
         config = zenoh.Config()
@@ -29,7 +30,7 @@ class Zenoh(PackageEnd):
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("transport/shared_memory/enabled", "false")  # it outlives a kill
         way = "listen" if role == "controller" else "connect"
-        config.insert_json5(f"{way}/endpoints", json.dumps([endpoint]))
+        config.insert_json5(f"{way}/endpoints", json.dumps([c.endpoint]))
         if way == "connect":
             config.insert_json5("listen/endpoints", "[]")
         self._session = zenoh.open(config)
