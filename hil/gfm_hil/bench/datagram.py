@@ -44,7 +44,7 @@ class UdpLink:
         host, _, port = endpoint.removeprefix("udp://").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _PATIENCE)
-        self._serves = role == "controller"
+        self._serves, self.close = role == "controller", self._socket.close
         try:
             (self._socket.bind if self._serves else self._socket.connect)((host, int(port)))
         except OSError as problem:
@@ -71,9 +71,6 @@ class UdpLink:
 
     def wait(self, seconds: float) -> bool:
         return bool(select.select([self._socket], [], [], seconds)[0])
-
-    def close(self) -> None:
-        self._socket.close()
 
 
 KIND = LinkKind(

@@ -85,10 +85,8 @@ def measurements(options: Namespace) -> list[Measurement]:
 
 
 def _check(kind: str, options: dict[str, Any]) -> BenchOptions:
-    of = options.get
-    links = _split(
-        "--links", of("links", "" if "to" in options else ",".join(link_names())) or None
-    )
+    of, far = options.get, "to" in options
+    links = _split("--links", of("links", None if far else ",".join(link_names())) or None)
     try:
         for name in links:
             link_kind(name)
@@ -96,7 +94,7 @@ def _check(kind: str, options: dict[str, Any]) -> BenchOptions:
         raise UserError(f"--links: {problem}") from None
     return BenchOptions(
         links=links,
-        peers=_peers(of("peers", "none" if "to" in options else "installed")),
+        peers=_peers(of("peers", "none" if far else "installed")),
         modes=_split("--mode", of("mode"), MODES) or MODES,
         loads=_split("--load", of("load"), EVERY if kind == "sweep" else LOADS) or LOADS,
         policies=policies(of("policy", "auto")),
@@ -110,7 +108,7 @@ def _check(kind: str, options: dict[str, Any]) -> BenchOptions:
         seconds=_within("--seconds", of("seconds", 0.1), *_SECONDS.get(kind, (0.01, 60))),
         rounds=_within("--rounds", of("rounds"), 1, 1000),
         until=of("until", math.inf),
-        to=(options["to"], of("as_name")) if "to" in options else None,
+        to=(options["to"], of("as_name")) if far else None,
         option=of("option", ()),
         ports=of("map"),
         for_s=_within("--for", of("for_s", 0.0), 0.0, 1e7),
@@ -167,6 +165,5 @@ def policies(wanted: str) -> list[Policy]:
     allowed = may_sched_fifo()
     if wanted == "fifo" and not allowed:
         raise UserError("--policy fifo: no right to SCHED_FIFO here; use other or auto")
-    if wanted == "auto":
-        return ["fifo", "other"] if allowed else ["other"]
-    return ["fifo"] if wanted == "fifo" else ["other"]
+    every: list[Policy] = ["fifo", "other"] if allowed else ["other"]
+    return every if wanted == "auto" else [one for one in every if one == wanted]

@@ -52,10 +52,6 @@ def _of(show: Callable[[Any], str], *keys: str) -> Column:
     return cell
 
 
-def _number(key: str, form: str = ",") -> Column:
-    return lambda row: format(row[key], form)
-
-
 def _median(key: str, form: str, unit: str = "") -> Column:
     """Of a ``rounds.spread``; – for none."""
     return lambda row: format(row[key]["median"], form) + unit if row[key] else "–"
@@ -73,7 +69,7 @@ def latency_tables(content: Row) -> Iterator[Table]:
     """Round trips, one table per mode and load, and both ways to who answers elsewhere."""
     rows = content["results"]
     columns = {
-        "": "name", "code": "code", **_PERCENTILES, "n": _number("n"),
+        "": "name", "code": "code", **_PERCENTILES, "n": _of("{:,}".format, "n"),
         "of it the bench": _of(micro, "bench_us"), "p50 : limit": _limit,
     }  # fmt: skip
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
@@ -213,7 +209,7 @@ def realtime_tables(content: Row) -> Iterator[Table]:
         return
     named: dict[str, Column] = {"": "link", "load": "load"}
     shares = {
-        "ticks": _number("ticks"),
+        "ticks": _of("{:,}".format, "ticks"),
         "missed": _of(percent, "missed_pct"),
         "the host's own": _of(percent, "host_pct"),
         "beyond it, median": _of(percent, "beyond_host_pct"),
@@ -240,7 +236,7 @@ def _named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Itera
     ]
     if named:
         columns: dict[str, Column] = {key: key for key in keys}
-        columns |= {"who": "name", "ticks": _number("count")}
+        columns |= {"who": "name", "ticks": _of("{:,}".format, "count")}
         by = dict.fromkeys(METHODS[row["method"]] for row in named)
         yield _table(f"{heading}, {' and '.join(by)}", named, columns)
 
@@ -267,7 +263,7 @@ def lockstep_tables(content: Row) -> Iterator[Table]:
         "": "law",
         **{part: _median(f"{part}_ns", ".0f") for part in parts},
         "× real time": _median("times_real_time", ".0f"),
-        "allocations": _number("allocations_per_tick", "g"),
+        "allocations": _of("{:g}".format, "allocations_per_tick"),
     }
     yield _table("The loop in one process: ns a tick", loop["laws"], by_law)
 
@@ -293,14 +289,14 @@ def sweep_tables(content: Row) -> Iterator[Table]:
     if "sweep" not in content:
         return
     named: dict[str, Column] = {"": "name", "load": "load", "policy": "policy", "wait": "wait"}
-    named |= {"B": _number("payload")}
+    named |= {"B": _of("{:,}".format, "payload")}
     figures = {
-        "kHz": _number("khz", "g"),
+        "kHz": _of("{:g}".format, "khz"),
         "p50": _PERCENTILES["p50"],
         "p99": _PERCENTILES["p99"],
         "missed": _of(percent, "missed_pct"),
         "processors": _of(percent, "processor_pct"),
-        "opened, kB": _number("opened_kb"),
+        "opened, kB": _of("{:,}".format, "opened_kb"),
     }
     heading = "Round trips from the deadline, by payload and rate [µs]"
     yield _table(heading, content["sweep"], named | figures)
