@@ -10,14 +10,11 @@ included. ``stop`` are three numbers in memory that both processes share: not 0 
 wait for a deadline, and ``period_ns``.
 """
 
-import ctypes
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -170,19 +167,3 @@ def _pong_python(link: Any, sent: list[bytes], stop: Numbers) -> None:
             continue
         link.send(sent[n % _DIFFERENT])
         n += 1
-
-
-def in_c(library: Path | None, opened: Sequence[int], size: int, keep: ExitStack) -> PingPong:
-    """One end of a limit in C: a compiled transport, the numbers and addresses that its
-    ``open_end`` takes, how many bytes this side sends, and what to free at the end."""
-    assert library is not None
-    c = ctypes.CDLL(str(library))  # calls release the interpreter's lock
-    number, address = ctypes.c_int64, np.ctypeslib.ndpointer(np.int64, 1)
-    c.ping.argtypes, c.ping.restype = [address, *[number] * 3, address, number], number
-    c.pong.argtypes, c.pong.restype = [address, number, address], None
-    numbers = np.array(opened, np.int64)
-
-    def ping(stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
-        return int(c.ping(numbers, size, period_ns, duration_ns, took, len(took)))
-
-    return PingPong(ping, lambda stop: c.pong(numbers, size, stop), keep.close, True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gfm_hil.bench.contenders import PEERS, Contender, free_port, fresh_endpoint, of_link
-from gfm_hil.bench.pingpong import Messages, PingPong, in_c
+from gfm_hil.bench.pingpong import Messages, Numbers, PingPong
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import open_link
@@ -103,4 +103,14 @@ def _limit(
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     keep = ExitStack()
-    return in_c(c.library, c.options["opened"](c.endpoint, role, keep), own.shape[1], keep)
+    numbers, size = np.array(c.options["opened"](c.endpoint, role, keep), np.int64), own.shape[1]
+    library = ctypes.CDLL(str(c.library))  # calls release the interpreter's lock
+    number, address = ctypes.c_int64, np.ctypeslib.ndpointer(np.int64, 1)
+    library.ping.argtypes = [address, *[number] * 3, address, number]
+    library.pong.argtypes = [address, number, address]
+    library.ping.restype, library.pong.restype = number, None
+
+    def ping(stop: Numbers, period_ns: int, duration_ns: int, took: Numbers) -> int:
+        return int(library.ping(numbers, size, period_ns, duration_ns, took, len(took)))
+
+    return PingPong(ping, lambda stop: library.pong(numbers, size, stop), keep.close, True)
