@@ -108,8 +108,11 @@ def _samples(
         if r["rounds_p50_us"]:
             yield (f"real time: {r['link']}, {r['load']}", "µs"), r["rounds_p50_us"]
     for r in content.get("kernel", ()):
-        unit, times = ("× C", r["ratio"]) if by_limit and r["ratio"] else ("ns", r["numba_ns"])
-        yield (f"kernel: {r['law']}, {r['real']}", unit), times["turns"]
+        name = f"kernel: {r['law']}, {r['real']}"
+        if by_limit and r["ratio"]:
+            yield (name, "× C"), r["ratio"]["turns"]
+        else:
+            yield (name, "ns"), r["numba_ns"]["turns"]
 
 
 def interleave(

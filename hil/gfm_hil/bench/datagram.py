@@ -44,7 +44,8 @@ class UdpLink:
         host, _, port = endpoint.removeprefix("udp://").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _PATIENCE)
-        self._serves, self.close = role == "controller", self._socket.close
+        self._serves = role == "controller"
+        self.close = self._socket.close
         try:
             (self._socket.bind if self._serves else self._socket.connect)((host, int(port)))
         except OSError as problem:

@@ -86,7 +86,8 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
         for each in two.values():
             each.both(pace_here, 0, 1, HYBRID, 1)  # compile before timing
         for _, share, cell in in_turn(cells, options.rounds, options.until):
-            (policy, load, wait), seconds = cell, options.seconds
+            policy, load, wait = cell
+            seconds = options.seconds
             show(", ".join(cell), share)
             with load_is(load), ProcessorWatch() as watch:
                 if wait == WATCHED:
@@ -128,7 +129,8 @@ class _Late:
 def _row(
     policy: Policy, load: Load, wait: str, every: Mapping[tuple[Policy, Load, str], _Late]
 ) -> dict[str, Any]:
-    late, ours = every[policy, load, wait], wait in WAITS
+    late = every[policy, load, wait]
+    ours = wait in WAITS
     ticks = sum(each.shape[1] for each in late.rounds)
     gone = [lost(each, PERIOD_NS) for each in late.rounds] if ours else []
     count = sum(map(len, gone))

@@ -56,10 +56,8 @@ class Twin:
     is the type of a ``gfm_t``."""
 
     def __init__(self, library: Path, modules: Sequence[Module]) -> None:
-        self._library, self._prefixes = (
-            ctypes.CDLL(str(library)),
-            {m.name: m.prefix for m in modules},
-        )
+        self._library = ctypes.CDLL(str(library))
+        self._prefixes = {m.name: m.prefix for m in modules}
         real, states = modules[0].real, max(1, *(m.n for m in modules))
         self._scalar = ctypes.c_double if real == np.float64 else ctypes.c_float
         fields = [("x", real, (states,)), *((f, real, (NU,)) for f in ("offset", "u", "trend"))]

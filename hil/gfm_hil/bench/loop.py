@@ -140,13 +140,16 @@ def _lockstep(
             shares[link, delay].append(min(before_ns, half()) / min(stretches))
     return [
         {
-            "link": link, "delay_samples": delay, "mode": "lockstep", "ticks_per_s": spread(rate),
+            "link": link,
+            "delay_samples": delay,
+            "mode": "lockstep",
+            "ticks_per_s": spread(rate),
             "times_real_time": spread([each * T_S for each in rate]),
             "share_of_plant_alone": spread(shares[link, delay]),
         }
         for (link, delay), rate in rates.items()
         if rate
-    ]  # fmt: skip
+    ]
 
 
 def _pace(sent: Times) -> tuple[float, list[float]]:
@@ -198,23 +201,33 @@ def _row(link: str, load: str, runs: list[_Run]) -> dict[str, Any]:
         why = attribute(run.timing, _T_NS, (), run.taken, run.processors)
         causes.update(counts(why.causes))
         names.update(filter(None, why.names))
-        alone = len(lost(run.late, _T_NS - (float(np.median(trip)) if len(trip) else 0.0)))
+        usual = float(np.median(trip)) if len(trip) else 0.0
+        alone = len(lost(run.late, _T_NS - usual))
         host += alone
         host_ticks += run.late.shape[1]
         if len(sent):
             beyond.append(100 * (len(missed[-1]) / len(sent) - alone / run.late.shape[1]))
     count, ours = sum(map(len, missed)), sum(causes[cause] for cause in OURS)
     return {
-        "link": link, "mode": "realtime", "load": load, "policy": runs[0].scheduling,
-        "T_s_us": T_S * 1e6, "ticks": ticks, "missed": count, "missed_pct": _percent(count, ticks),
+        "link": link,
+        "mode": "realtime",
+        "load": load,
+        "policy": runs[0].scheduling,
+        "T_s_us": T_S * 1e6,
+        "ticks": ticks,
+        "missed": count,
+        "missed_pct": _percent(count, ticks),
         "host_pct": _percent(host, host_ticks),
         # the median: one long stop of the machine in a run, or in the pacing, is an outlier
         "beyond_host_pct": round(median(beyond), 4) if beyond else None,
         "rounds_beyond_host_pct": [round(value, 4) for value in beyond],
-        "by_work_or_link_pct": _percent(ours, ticks), "causes": dict(causes),
-        "names": dict(names.most_common()), "bursts": bursts(missed),
-        "method": runs[0].taken.method if runs[0].taken else None, **summary(trips),
-    }  # fmt: skip
+        "by_work_or_link_pct": _percent(ours, ticks),
+        "causes": dict(causes),
+        "names": dict(names.most_common()),
+        "method": runs[0].taken.method if runs[0].taken else None,
+        "bursts": bursts(missed),
+        **summary(trips),
+    }
 
 
 def _percent(count: int, of: int) -> float | None:
@@ -337,7 +350,8 @@ class InprocLoop:
         """The closed loop. Raises UserError: the run ended early, so that there is nothing to
         time."""
         self._reset()
-        b, n, controllers, done = self.bench, ticks or self.ticks, stack([self.bench]), 0
+        b, n = self.bench, ticks or self.ticks
+        done, controllers = 0, stack([b])
         plant, controller = self._rows
 
         def run() -> None:

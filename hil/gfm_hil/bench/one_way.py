@@ -83,8 +83,9 @@ def ways(rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     interval in which that is with 95 % (Clopper and Pearson); ``clock`` and ``within_us``; and
     ``there``, ``back`` and ``between``, each as ``summary_of_counts``."""
     sent, lost = (sum(one[key] for one in rounds) for key in ("sent", "lost"))
-    share = [lost / max(sent, 1), *(binomtest(lost, sent).proportion_ci() if sent else (0.0, 1.0))]
-    lost_pct, *ends = (round(100 * float(one), 4) for one in share)
+    interval = binomtest(lost, sent).proportion_ci() if sent else (0.0, 1.0)
+    shares = [lost / max(sent, 1), *interval]
+    lost_pct, *ends = (round(100 * float(share), 4) for share in shares)
     row: dict[str, Any] = {"sent": sent, "lost": lost, "lost_pct": lost_pct, "lost_pct_95": ends}
     known = [one for one in rounds if "clock" in one]
     if known:

@@ -93,6 +93,8 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="gfmhil-") as place:
         to, ticks = Path(place) / "out", max(1, round(seconds * 1e9 / period_ns))
         line = command(cpus, policy, period_ns // 1000, ticks, to)
-        no, patience = subprocess.DEVNULL, seconds + _MARGIN_S
-        subprocess.run(line, stdout=no, stderr=no, check=False, timeout=patience)
+        subprocess.run(
+            line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False,
+            timeout=seconds + _MARGIN_S,
+        )  # fmt: skip
         return read(to.read_text("utf-8")) if to.exists() else np.zeros(0, np.int64)

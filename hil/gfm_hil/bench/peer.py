@@ -93,7 +93,8 @@ def peer_of(bench: BenchOptions, place: Path) -> Contender:
     ``place`` is for an endpoint of our own. Raises UserError: neither, or nothing can be reached
     there."""
     assert bench.to is not None
-    (to, name), link, ports = bench.to, dict(bench.option), bench.ports
+    to, name = bench.to
+    link, ports = dict(bench.option), bench.ports
     more: dict[str, Any] = {"link": link, "ptp_us": bench.ptp_us, "program": None, "inner": False}
     if bench.ptp_us:
         tai_offset(bench.ptp_us)

@@ -21,7 +21,8 @@ FORMAT = 1
 @contextmanager
 def new_result(kind: str) -> Iterator[dict[str, Any]]:
     """A result without measurements; it is complete when the context ends."""
-    begin, steal, badge = time.monotonic(), StealTime(), environment()
+    begin, steal = time.monotonic(), StealTime()
+    badge = environment()
     content: dict[str, Any] = {"format": FORMAT, "bench": kind, "results": [], "remarks": []}
     content["environment"] = badge
     yield content

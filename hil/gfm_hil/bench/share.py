@@ -60,8 +60,10 @@ class _Mirror:
     """The same link, without a port unless there is one to give."""
 
     def __init__(self, port: Port | None = None) -> None:
-        self.port, self._came = port, list[bytes]()
-        self.send, self.close = self._came.append, self._came.clear
+        self.port = port
+        self._came: list[bytes] = []
+        self.send = self._came.append
+        self.close = self._came.clear
 
     def receive(self) -> bytes | None:
         return self._came.pop() if self._came else None

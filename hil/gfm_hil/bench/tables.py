@@ -68,10 +68,14 @@ _PERCENTILES = {name.replace("_", "."): _of(micro, f"{name}_us") for name in SHA
 def latency_tables(content: Row) -> Iterator[Table]:
     """Round trips, one table per mode and load, and both ways to who answers elsewhere."""
     rows = content["results"]
-    columns = {
-        "": "name", "code": "code", **_PERCENTILES, "n": _of("{:,}".format, "n"),
-        "of it the bench": _of(micro, "bench_us"), "p50 : limit": _limit,
-    }  # fmt: skip
+    columns: dict[str, Column] = {
+        "": "name",
+        "code": "code",
+        **_PERCENTILES,
+        "n": _of("{:,}".format, "n"),
+        "of it the bench": _of(micro, "bench_us"),
+        "p50 : limit": _limit,
+    }
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
         some = [r for r in rows if (r["mode"], r["load"]) == (mode, load)]
         conditions = f"{some[0]['policy']}, {some[0]['payload']} B"
@@ -172,9 +176,13 @@ def jitter_tables(content: Row) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
     if "jitter" in content:
         columns: dict[str, Column] = {
-            "": "policy", "load": "load", "wait": "wait", **_PERCENTILES,
-            "ticks lost": _of(percent, "lost_pct"), "p50, p99 : nanosleep": _agrees,
-        }  # fmt: skip
+            "": "policy",
+            "load": "load",
+            "wait": "wait",
+            **_PERCENTILES,
+            "ticks lost": _of(percent, "lost_pct"),
+            "p50, p99 : nanosleep": _agrees,
+        }
         heading = "A loop that only paces, every 100 µs: late by [µs]"
         yield _table(heading, content["jitter"], columns)
         heading = "Who had the processor in ticks that were late by more than 100 µs"
@@ -273,7 +281,8 @@ def kernel_tables(content: Row) -> Iterator[Table]:
     by_law: dict[str, Row] = {}
     columns: dict[str, Column] = {"": "law", "states": "states"}
     for r in content.get("kernel", ()):
-        law, real = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]}), r["real"]
+        law = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]})
+        real = r["real"]
         law |= {f"{key} {real}": r[key] for key in ("numba_ns", "c_ns", "ratio")}
         columns |= {
             f"numba, {real}": _median(f"numba_ns {real}", ".1f"),

@@ -103,7 +103,8 @@ def _limit(
 
 def _open(c: Contender, role: Role, own: Messages) -> PingPong:
     keep = ExitStack()
-    numbers, size = np.array(c.options["opened"](c.endpoint, role, keep), np.int64), own.shape[1]
+    numbers = np.array(c.options["opened"](c.endpoint, role, keep), np.int64)
+    size = own.shape[1]
     library = ctypes.CDLL(str(c.library))  # calls release the interpreter's lock
     number, address = ctypes.c_int64, np.ctypeslib.ndpointer(np.int64, 1)
     library.ping.argtypes = [address, *[number] * 3, address, number]
