@@ -269,13 +269,12 @@ def answer(
     tai_ns = tai_offset(ptp_us) if ptp_us else 0
     with closing(datagram.UdpLink("controller", "udp://0.0.0.0:0")) as nobody:
         _answer_all(nobody, 0, 0.0, np.ones(1, np.int64))  # compiles: no bench would wait for it
-    _open_end("controller", endpoint, options).close()
-    say(f"answering at {endpoint}; Ctrl-C ends it")
     scenario = scenario_of(start_timeout_s=_WEEK_S, endpoint=endpoint)
     with Interrupt() as interrupt:
         while not interrupt.came:
             (priority.ask_for_real_time if fifo else priority.own_processor)("controller")
             link = _open_end("controller", endpoint, options)
+            say(f"answering at {endpoint}; Ctrl-C ends it")
             try:
                 shake_hands(
                     "controller", link, scenario, lambda: interrupt.came, lambda text: None,
