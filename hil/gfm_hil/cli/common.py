@@ -337,7 +337,7 @@ def _summary_in_words(
         f"{summary['wall_s']:.2f} s · {summary['ticks']} ticks, {shown(summary['misses'])} misses"
     )
     if "latency" in summary:
-        console.print(escape(summary["latency"]), highlight=False, soft_wrap=True)
+        yield escape(summary["latency"])
     if summary["round_trip_us"]:
         text = ", ".join(f"{k} {v:g}" for k, v in summary["round_trip_us"].items())
         yield escape(f"round trip [µs]: {text}")

@@ -69,7 +69,7 @@ def call(options: argparse.Namespace) -> int:
     else:
         loop, label = scenario_loop(scenario, options.converter)
     if options.find is _modes and options.shape is not None:
-        if scenario.network is None or not options.out:
+        if scenario.network is None or not options.figure:
             raise UserError("--shape: takes a scenario with a network, and --out")
         options.scenario = scenario
     common.save_figure(options, lambda: options.draw(loop, options))
