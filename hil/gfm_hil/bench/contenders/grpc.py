@@ -21,10 +21,10 @@ def contenders(folder: Path) -> Iterator[Contender]:
 def _open(c: Contender, role: Role, own: Messages) -> PingPong | PackageEnd:
     """The controller is the server: u answers the call that brings y. Its guide to performance
     prefers unary calls to streams in Python, which need more threads."""
-    return _server(c.endpoint, own) if role == "controller" else _Caller(c.endpoint)
+    return _server(c.endpoint, own) if role == "controller" else _Stub(c.endpoint)
 
 
-class _Caller(PackageEnd):
+class _Stub(PackageEnd):
     """The plant's end: it calls and has the answer before it polls for one."""
 
     def __init__(self, endpoint: str) -> None:
