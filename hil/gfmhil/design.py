@@ -10,10 +10,12 @@ from gfm_design.norms.performance import Weight
 from gfm_hil.api.design import Gamma, NotTuned, Tuning, gamma, latency_tolerance, margins, tune
 from gfm_hil.api.latency import Measured, measured_misses
 from gfm_hil.api.sweeps import GainSweep, StabilityMap, stability_map, sweep
+from gfm_hil.studies.bus_scan import BusScan, bus_scan
 from gfm_hil.studies.forming_share import FormingShare, forming_shares
 from gfm_hil.studies.linear_loop import network_loop
 
 __all__ = [
+    "BusScan",
     "ClosedLoop",
     "FormingShare",
     "GainSweep",
@@ -29,6 +31,7 @@ __all__ = [
     "Unstable",
     "UnstableLoop",
     "Weight",
+    "bus_scan",
     "forming_shares",
     "gamma",
     "latency_tolerance",

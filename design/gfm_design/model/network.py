@@ -132,6 +132,9 @@ class LinearNetwork:
     from_own: Matrix
     #: by the name of each part that turns, where its angle is among the states
     angles: dict[str, int]
+    #: by each node with a capacitor what a current into it does to the states, (n, 2), and its
+    #: voltage by these, (2, n), both in the frame of its island
+    nodes: dict[str, tuple[Matrix, Matrix]]
 
     @property
     def references(self) -> slice:
@@ -592,7 +595,18 @@ class _Writing:
         at = order.tolist()
         angles = {name: at.index(self.at[name].start) for name in self.island if name in names}
         plant = LinearPlant(A, B, B_d, C, C_true)
-        return LinearNetwork(plant, turn, tuple(names), *self._own(names, order), angles)
+        owned = self._own(names, order)
+        nodes = {}
+        for bank in self.plant.wiring.capacitors:
+            k, z = self.plant.wiring.order.index(bank.name), self.modes.modes
+            by_i, v = np.zeros((self.n, 2)), np.zeros((2, self.n))
+            by_i[self.z, 0] = _parts(self.omega_b / bank.C * z[:, k])
+            by_i[self.z, 1] = _parts(1j * self.omega_b / bank.C * z[:, k])
+            v[:, self.z] = _rows(self.modes.states[k])
+            v = v[:, order]
+            v[:, last] += v[:, : len(kept)] @ turn
+            nodes[bank.node] = by_i[order], v
+        return LinearNetwork(plant, turn, tuple(names), *owned, angles, nodes)
 
     def _own(
         self, names: Sequence[str], order: NDArray[np.intp]

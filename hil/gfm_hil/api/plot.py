@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from gfm_hil.api.transients import TransientMap
     from gfm_hil.scenario import Scenario
     from gfm_hil.studies.attraction import Attraction
+    from gfm_hil.studies.bus_scan import BusScan
     from gfm_hil.studies.forming_share import FormingShare
 
 Vector = NDArray[np.float64]
@@ -487,6 +488,18 @@ def mode_shape(loop: NetworkLoop, scenario: Scenario, number: int = 1) -> Axes:
     axes.text(0.99, 0.99, f"mode {number}: {_label(mode).strip()}", transform=axes.transAxes,
               ha="right", va="top", fontsize=9)  # fmt: skip
     return axes
+
+
+@with_look
+def bus_scan(scan: BusScan) -> list[Axes]:
+    """Draw size [p.u.] and angle [degrees] of ``gfmhil.design.bus_scan`` over Hz."""
+    size, phase = pyplot_panels(2, _TWO)
+    _curve(size, scan.hz, np.abs(scan.Z), 0, "Z")
+    _curve(phase, scan.hz, np.degrees(np.angle(scan.Z)), 0, "_")
+    size.set_yscale("log")
+    _tick_degrees(phase)
+    title = f"{scan.title}: bus {scan.bus}, positive sequence"
+    return _finish([size, phase], title, "|Z| [p.u.]", "∠Z [°]")
 
 
 @with_look

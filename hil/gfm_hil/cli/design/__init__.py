@@ -2,7 +2,7 @@
 
 import argparse
 
-from gfm_hil.cli.design import gains, latency, loop, margins, share, sweep, transients
+from gfm_hil.cli.design import bus, gains, latency, loop, margins, share, sweep, transients
 from gfm_hil.core.errors import UserError
 
 #: commands of version 0.1 that are scripts of the repository now; the note goes with version 2
@@ -11,7 +11,7 @@ _MOVED = {"compare": "law_comparison", "box": "deployable check", "deploy": "dep
 
 def add(command: argparse.ArgumentParser) -> None:
     kinds = command.add_subparsers(dest="design", required=True, metavar="WHAT")
-    for module in (gains, margins, latency, loop, sweep, share, transients):
+    for module in (gains, margins, latency, loop, sweep, bus, share, transients):
         module.add(kinds)
     for name in _MOVED:
         moved = kinds.add_parser(name, add_help=False, prefix_chars="\0")  # any option is a word
