@@ -11,6 +11,8 @@ converters twice, the second time with all that ``network.record`` can name.
 circuit, and its parts on one processor core and on two, in time of the clock, with the ratios.
 Rounds of all take turns. Times are those of the processor, so that a busy machine counts little.
 
+With ``--modes`` the linear loop and its modes with their participations are timed instead.
+
 With ``--dpsim``, and DPsim (``pip install dpsim==1.4.0``), a column says what one step of 100 us of
 its EMT solver takes for the same feeders, in three phases, with a voltage source in place of each
 bridge: no DC link, no sensor, no controller, no recording.
@@ -207,6 +209,17 @@ def dpsim(n: int, steps: int) -> float:
     return min(found)
 
 
+def modes(sizes: list[int]) -> None:
+    """Print how long the linear loop of converters on feeders and its modes take."""
+    print("| converters | states | loop, s | modes, s |\n|--:|--:|--:|--:|")
+    for n in sizes:
+        began = time.perf_counter()
+        loop = gfmhil.design.network_loop(star(n))
+        states, made = len(loop.A), time.perf_counter()
+        loop.modes()
+        print(f"| {n} | {states} | {made - began:.2g} | {time.perf_counter() - made:.2g} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=50)
@@ -216,9 +229,12 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of them, beside machines")
     parser.add_argument("--bridges", action="store_true", help="the rig with several bridges")
     parser.add_argument("--record", action="store_true", help="with and without network.record")
+    parser.add_argument("--modes", action="store_true", help="the modes of the linear loop instead")
     parser.add_argument("--cores", help="1,2: two buses and a long line, on so many of them")
     parser.add_argument("--dpsim", action="store_true")
     asked = parser.parse_args()
+    if asked.modes:
+        return modes([int(n) for n in asked.sizes.split(",")])
     ways: dict[str, int | None] = {"one circuit": None}
     if asked.case:
         with tempfile.TemporaryDirectory() as folder:

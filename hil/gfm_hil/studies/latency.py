@@ -11,6 +11,7 @@ from gfm_design.misses.ticks import MEANWHILE, ticks
 from gfm_design.misses.tolerance import WINDOW, LatencyTolerance, Used, light_of
 from gfm_design.misses.words import Words
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.roles import target_of
 from gfm_hil.recording.run import Run
 from gfm_hil.recording.timing import MISS_NEEDS, missed
 from gfm_hil.results.table import Cell, Table
@@ -33,7 +34,9 @@ def misses_of(run: Run) -> Misses:
 
 def in_a_row_words(run: Run) -> str:
     """One sentence: what a run in real time missed, and what its law bears on its plant; empty if
-    it was in lockstep, or the law has no stable linear loop."""
+    it was in lockstep, the controller is not ours, or the law has no stable linear loop."""
+    if target_of(run.summary["controller"]) is None:
+        return ""
     try:
         misses, (loop, label) = misses_of(run), scenario_loop(run.scenario, run.scenario.converter)
         if len(loop.A) > _MOST_STATES or loop.modes()[0].sigma > 0.0:
