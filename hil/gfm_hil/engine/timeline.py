@@ -173,7 +173,8 @@ class Timeline:
             mine = st[self._bench.place]
             tripped = "plant" in self._roles and mine["trip"] not in (0, CONTROLLER)
             # the one time of a trip: when the bridge blocks, in the state that is beyond its limit
-            at = int(mine["trip_tick"]) - self._bench.before if tripped else tick
+            # one that began tripped, from a snapshot, is so from its first tick on
+            at = max(0, int(mine["trip_tick"]) - self._bench.before) if tripped else tick
             if self._bench.scenario.after_trip == "end":
                 self.end(*found, at)
                 return

@@ -257,6 +257,24 @@ def test_a_folder_without_a_snapshot_or_with_a_damaged_one(tmp_path):
         gfmhil.run(start)
 
 
+def test_a_snapshot_after_a_fault_and_a_trip(tmp_path):
+    """Both are over, or go on, with the same bits; a reset brings the converter back."""
+    given = {"title": "cut", "law": "vsg-2", "link": {"type": "inproc"}, "after_trip": "wait"}
+    fault = {"type": "fault", "t": 0.001, "position": 0.3, "R": 0.01, "duration": 0.006}
+    reset = {"type": "reset", "t": 0.03}
+    for trips, R in ((1, 0.01), (0, 0.5)):
+        events = [{**fault, "R": R}, *[reset] * trips]
+        first = {"events": events, "duration": 0.05, "snapshot": 0.02}
+        whole = gfmhil.run({**given, **first}, folder=tmp_path / f"{R}", figures=False)
+        assert len(whole.summary["trips"]) == trips and whole.status == "completed"
+        late = {"events": [{**reset, "t": 0.01}] * trips, "duration": 0.03}
+        late["start_from"] = str(tmp_path / f"{R}")
+        rest = gfmhil.run({**given, **late}, folder=tmp_path / f"{R}-rest", figures=False)
+        assert [trip["tick"] for trip in rest.summary["trips"]] == [0] * trips
+        for name in ("true_p", "true_v_dc", "u_omega_u"):
+            assert rest.columns[name][:].tobytes() == whole.columns[name][200:].tobytes()
+
+
 def test_a_snapshot_while_the_connections_are_others(tmp_path):
     given = {"title": "cut", "duration": 0.01, "law": "vsg-2", "link": {"type": "inproc"},
              "snapshot": 0.006}  # fmt: skip
