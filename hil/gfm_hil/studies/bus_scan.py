@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_design.model.bus import bus_impedance, positive_sequence
+from gfm_design.model.network import NetworkLoop
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import Scenario, load_scenario, plant_of
@@ -15,6 +16,7 @@ from gfm_hil.studies.linear_loop import network_loop
 
 _PROBE = 1e-3  # p.u., of a bank at a node that has none; what it does to Z is taken out again
 _NEAR = 0.2  # Hz; nearer to the island's own frequency there is no impedance, but a steady state
+_ROUNDS, _BETWEEN = 4, 9  # of a refined scan, whose steps become 1/625 as long there
 LOW, HIGH, POINTS = 1.0, 2500.0, 400
 
 
@@ -25,6 +27,7 @@ class BusScan:
     Attributes:
         title: of the scenario.
         bus: the node.
+        f_n: nominal frequency, Hz.
         hz: frequencies of a positive-sequence current, Hz, shape (K,), ascending.
         Z: what it meets in its own sequence, (K,).
         Z_dq: the whole matrix, (K, 2, 2), at ``hz`` less the nominal frequency in the dq frame
@@ -33,54 +36,87 @@ class BusScan:
 
     title: str
     bus: str
+    f_n: float
     hz: NDArray[np.float64]
     Z: NDArray[np.complex128]
     Z_dq: NDArray[np.complex128]
 
     def resonances(self) -> list[dict[str, Any]]:
         """Where abs(Z) is larger or smaller than at both neighbours: a row each with ``hz``,
-        ``size`` in p.u., ``degrees``, and ``kind``, parallel or series."""
-        size = np.abs(self.Z)
-        up = np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] > size[2:])) + 1
-        down = np.flatnonzero((size[1:-1] < size[:-2]) & (size[1:-1] < size[2:])) + 1
-        kinds = dict.fromkeys(up.tolist(), "parallel") | dict.fromkeys(down.tolist(), "series")
+        ``size`` in p.u., ``degrees``, and ``kind``, parallel or series. Beside the nominal
+        frequency there is none: what lies between is not known."""
         return [
-            {"hz": float(self.hz[k]), "size": float(size[k]),
-             "degrees": float(np.degrees(np.angle(self.Z[k]))), "kind": kinds[k]}
-            for k in sorted(kinds)
+            {"hz": float(self.hz[k]), "size": float(abs(self.Z[k])),
+             "degrees": float(np.degrees(np.angle(self.Z[k]))), "kind": kind}
+            for k, kind in _turns(self.Z).items() if not self.hz[k - 1] < self.f_n < self.hz[k + 1]
         ]  # fmt: skip
 
 
-def bus_scan(scenario: Scenario, bus: str, hz: Sequence[float] | NDArray[np.float64]) -> BusScan:
+def bus_scan(
+    scenario: Scenario, bus: str, hz: Sequence[float] | NDArray[np.float64], refine: bool = False
+) -> BusScan:
     """The impedance of a network at a bus.
 
     Args:
         scenario: with a network.
-        bus: name of a node.
-        hz: frequencies of a positive-sequence current, Hz, > 0; those at the nominal one are left
-            out, since there is a steady state and no impedance.
+        bus: name of a node; not that of the grid, which holds its voltage.
+        hz: frequencies of a positive-sequence current, Hz, > 0, ascending; those at the nominal one
+            are left out, since there is a steady state and no impedance.
+        refine: whether to add frequencies around each resonance, so that what ``resonances``
+            returns is that of the resonance, and not of the nearest of ``hz``.
 
     Raises:
-        UserError: there is no network, or no such node; or no operating point.
+        UserError: there is no network, or no such node; no frequency is left; or no operating
+            point.
     """
     if scenario.network is None:
         raise UserError(f"{scenario.title}: has no network")
     wiring = plant_of(scenario).wiring
-    if bus not in wiring.nodes:
-        raise UserError(f"bus = {bus!r}: must be one of {[*wiring.nodes]}")
+    nodes = [node for node in wiring.nodes if node != scenario.network.grid]
+    if bus not in nodes:
+        holds = ", not the grid's, which holds its voltage" if bus in wiring.nodes else ""
+        raise UserError(f"bus = {bus!r}: must be one of {nodes}{holds}")
     f_n = nominal_frequency(scenario)
-    hz = np.asarray(hz, float)
-    hz = hz[np.abs(hz - f_n) > _NEAR]
+    hz = _off_nominal(np.asarray(hz, float), f_n)
+    if not len(hz):
+        raise UserError(f"hz: all lie within {_NEAR} Hz of the nominal {f_n:g} Hz; no impedance")
     probes = bus not in {one.node for one in wiring.capacitors}
     if probes:
         content = scenario.model_dump(mode="json", exclude_none=True)
         content["network"]["capacitors"][f"probe of {bus}"] = {"node": bus, "Q": _PROBE}
         scenario = load_scenario(content, in_process=True)
+    loop, probe = network_loop(scenario), _PROBE * probes
+    Z = _impedance(loop, bus, hz, f_n, probe)
+    for _ in range(_ROUNDS * refine):
+        around = [
+            np.geomspace(hz[k - 1], hz[k + 1], _BETWEEN + 2) for k in _turns(positive_sequence(Z))
+        ]
+        more = np.setdiff1d(_off_nominal(np.concatenate([hz[:0], *around]), f_n), hz)
+        place = np.searchsorted(hz, more)
+        Z = np.insert(Z, place, _impedance(loop, bus, more, f_n, probe), axis=0)
+        hz = np.insert(hz, place, more)
+    return BusScan(scenario.title, bus, f_n, hz, positive_sequence(Z), Z)
+
+
+def _off_nominal(hz: NDArray[np.float64], f_n: float) -> NDArray[np.float64]:
+    return hz[np.abs(hz - f_n) > _NEAR]
+
+
+def _impedance(
+    loop: NetworkLoop, bus: str, hz: NDArray[np.float64], f_n: float, probe: float
+) -> NDArray[np.complex128]:
+    """Z_dq, (K, 2, 2), p.u., without the bank of ``probe`` p.u. that stands there."""
     omega = 2 * np.pi * (hz - f_n)
-    Z = bus_impedance(network_loop(scenario), bus, np.abs(omega))
-    if probes:
+    Z = bus_impedance(loop, bus, np.abs(omega))
+    if probe:
         by_s = 1j * np.abs(omega) / (2 * np.pi * f_n)
-        own = _PROBE * (by_s[:, None, None] * np.eye(2) + np.array([[0.0, -1.0], [1.0, 0.0]]))
+        own = probe * (by_s[:, None, None] * np.eye(2) + np.array([[0.0, -1.0], [1.0, 0.0]]))
         Z = np.linalg.inv(np.linalg.inv(Z) - own)
-    Z = np.where(omega[:, None, None] < 0.0, Z.conj(), Z)
-    return BusScan(scenario.title, bus, hz, positive_sequence(Z), Z)
+    return np.where(omega[:, None, None] < 0.0, Z.conj(), Z)
+
+
+def _turns(Z: NDArray[np.complex128]) -> dict[int, str]:
+    """Where abs(Z) turns, in ascending order: the kind of the resonance by its place."""
+    rises = np.diff(np.abs(Z)) > 0.0
+    places = np.flatnonzero(rises[1:] != rises[:-1])
+    return {int(k) + 1: "parallel" if rises[k] else "series" for k in places}

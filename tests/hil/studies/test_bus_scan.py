@@ -69,20 +69,37 @@ def test_the_command_prints_resonances_and_draws(capsys, tmp_path):
     assert main([*asked, "--json", "-o", file]) == 0
     found = json.loads(capsys.readouterr().out)
     scan = gfmhil.design.bus_scan(load_scenario("three_share_a_load"), "far", found["hz"])
-    assert found["resonances"] == scan.resonances()
+    for row, again in zip(found["resonances"], scan.resonances(), strict=True):
+        assert row == pytest.approx(again) and len(scan.hz) > 400
     np.testing.assert_allclose([z[0] + 1j * z[1] for z in found["Z"]], scan.Z)
     size = np.abs(scan.Z)
     top = max((one for one in found["resonances"]), key=lambda one: one["size"])
-    assert (top["kind"], top["size"]) == ("parallel", size.max())
+    assert (top["kind"], top["size"]) == ("parallel", pytest.approx(size.max()))
     assert "bus far" in (tmp_path / "bus.svg").read_text("utf-8").replace("-->", "")
     assert main(asked) == 0 and "parallel" in capsys.readouterr().out
+
+
+@pytest.mark.full
+def test_a_resonance_is_where_it_is_and_not_at_the_nearest_frequency():
+    """A bank of 0.1 p.u. at the end of a line from the grid; and none beside 50 Hz."""
+    lines = {"spur": {"start": "far", "end": "tip", "L": 0.1, "R": 0.001}}
+    lines |= {name: {"start": "bus", "end": "far", "L": 0.1, "R": 0.01} for name in ("a", "b")}
+    corner = network(lines=lines, capacitors={"bank": {"node": "tip", "Q": 0.1}})
+    scan = gfmhil.design.bus_scan(corner, "tip", np.geomspace(20.0, 2000.0, 40), refine=True)
+    (one,) = scan.resonances()
+    hz = np.linspace(499.0, 501.0, 200_001)
+    Z = np.abs(1.0 / (1.0 / (0.001 + 1j * hz / 50 * 0.1) + 1j * hz / 50 * 0.1))
+    assert (one["kind"], one["hz"]) == ("parallel", pytest.approx(hz[Z.argmax()], rel=2e-4))
+    assert one["size"] == pytest.approx(Z.max(), rel=0.02)
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
         (["pref_step", "bus"], "P_ref steps from 0.5 to 1 p.u.: has no network"),
-        (["plant_of_two", "nowhere"], "bus = 'nowhere': must be one of ['bus', 'connection']"),
+        (["plant_of_two", "nowhere"], "bus = 'nowhere': must be one of ['bus']"),
+        (["plant_of_two", "connection"], "must be one of ['bus'], not the grid's, which holds its"),
+        (["plant_of_two", "bus", "--from", "49.9", "--to", "50.1"], "hz: all lie within 0.2 Hz"),
         (["plant_of_two", "bus", "--from", "0"], "--from, --to, --points: must be 0 < from < to"),
     ],
 )

@@ -27,7 +27,8 @@ def add(kinds: Any) -> None:
                              help=f"{what} (default: %(default)s)")  # fmt: skip
     command.add_argument(
         "--points", type=int, default=POINTS,
-        help="frequencies, evenly by their logarithm (default: %(default)s)",
+        help="frequencies, evenly by their logarithm, besides those near resonances"
+        " (default: %(default)s)",
     )  # fmt: skip
     command.add_argument("--json", action="store_true", help="as JSON")
     add_figure(command)
@@ -38,7 +39,8 @@ def call(options: argparse.Namespace) -> int:
     if not 0.0 < options.low < options.high <= 1e5 or not 2 <= options.points <= 100_000:
         raise UserError("--from, --to, --points: must be 0 < from < to <= 1e5 Hz, 2 to 100000")
     scenario = load_scenario(options.scenario, in_process=True)
-    scan = bus_scan(scenario, options.bus, np.geomspace(options.low, options.high, options.points))
+    hz = np.geomspace(options.low, options.high, options.points)
+    scan = bus_scan(scenario, options.bus, hz, refine=True)
     save_figure(options, lambda: draw(scan))
     found = scan.resonances()
     content = {
