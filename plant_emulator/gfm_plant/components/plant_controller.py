@@ -195,7 +195,9 @@ class PlantController(Dynamic):
     delay_s: NonNegative = Field(
         0.05, le=3600, description="from its measurement until the converters have the set-point, s"
     )
-    control: Literal["V", "Q"] = Field("V", description="what it holds besides the power")
+    control: Literal["V", "Q"] = Field(
+        "V", description="what it holds besides the power, at Q_ref or V_ref"
+    )
     sends: Literal["Q_ref", "V_ref"] = Field("V_ref", description="by which reference")
     P_ref: float | None = Field(
         None, description="power out of the plant, p.u. of its rating; what it is at the start"
@@ -239,6 +241,8 @@ class PlantController(Dynamic):
                 raise ValueError(
                     f"{x}_min = {least:g}, {x}_max = {most:g}: must rise within [{low:g}, {high:g}]"
                 )
+        if getattr(self, unused := self.unused()) is not None:
+            raise ValueError(f"{unused}: has no effect with control = {self.control!r}")
         if not (self.K_p or self.K_i or self.K_pg or self.K_ig):
             raise ValueError("K_p, K_i, K_pg and K_ig are 0: it would send nothing")
         return self
@@ -254,6 +258,10 @@ class PlantController(Dynamic):
     def sent(self) -> list[str]:
         """The references that it commands."""
         return ["P_ref"] * (self.K_pg + self.K_ig > 0) + [self.sends] * (self.K_p + self.K_i > 0)
+
+    def unused(self) -> str:
+        """The reference that it does not hold."""
+        return "Q_ref" if self.control == "V" else "V_ref"
 
     def commands_any(self, converters: Iterable[str]) -> bool:
         """Whether it sends set-points to any of these converters."""
@@ -339,7 +347,9 @@ class PlantController(Dynamic):
                 raise ValueError(f"{at}.converters: {one!r} must be one of {names}")
             k = names.index(one)
             if supervisor[k]:
-                raise ValueError(f"{at}.converters: {one!r} has another plant controller already")
+                again = "has another plant controller already"
+                again = "is there twice" if supervisor[k] == number else again
+                raise ValueError(f"{at}.converters: {one!r} {again}")
             supervisor[k] = number
             if k >= len(own):
                 neighbours["follower"][k - len(own)] = k

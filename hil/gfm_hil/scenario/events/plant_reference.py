@@ -46,8 +46,13 @@ class PlantReference(PlantEvent):
         return f"{self.name}: {', '.join(said)}"
 
     def misfits(self, scenario: Scenario) -> list[str]:
-        names = [] if scenario.network is None else [*scenario.network.plant_controllers]
-        return [] if names else ["there are no network.plant_controllers"]
+        each = {} if scenario.network is None else scenario.network.plant_controllers
+        if not each:
+            return ["there are no network.plant_controllers"]
+        one = each.get(self.name)
+        if one is None or (unused := one.unused()) not in self.values():
+            return []
+        return [f"{unused}: has no effect, {self.name} has control = {one.control!r}"]
 
     def apply(self, plant: gfm_plant.Network) -> None:
         gfm_plant.set_plant_reference(plant, self.name, self.values(), self.sends)
