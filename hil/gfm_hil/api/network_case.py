@@ -174,9 +174,10 @@ class _Build:
         if not self._is_machine(k):
             return bus.static_rating * self.flow.S_b
         if bus.rating is None:
+            grid = ", or stand a grid there: slack = grid" if k == self.flow.slack else ""
             raise UserError(
                 f"{self.flow.title}: bus {bus.name}: its generator has no rating: give sn_mva or"
-                " max_p_mw"
+                f" max_p_mw{grid}"
             )
         return bus.rating * self.flow.S_b
 

@@ -127,7 +127,7 @@ def _ratings(
     """Rating of the generators of each bus, p.u.; None if one of them has none."""
     ratings: dict[int, float | None] = {}
     for table in ("gen", "ext_grid"):
-        for _, row in case[table][case[table].in_service].iterrows():
+        for _, row in _working(case, case[table]).iterrows():
             own = next(
                 (float(row[n]) for n in ("sn_mva", "max_p_mw") if n in row and row[n] > 0), None
             )
@@ -135,6 +135,11 @@ def _ratings(
             before = ratings.get(k, 0.0)
             ratings[k] = None if own is None or before is None else before + own / S_b
     return ratings
+
+
+def _working(case: Any, table: Any) -> Any:
+    """Those rows of a table that are in service, as are their buses."""
+    return table[table.in_service & table.bus.map(case.bus.in_service)]
 
 
 def _static(
@@ -145,7 +150,7 @@ def _static(
     found: dict[int, tuple[complex, float]] = {}
     for table, sign in (("sgen", 1.0), ("storage", -1.0)):
         those = case[table].join(case[f"res_{table}"], rsuffix="_res")
-        for _, row in those[those.in_service].iterrows():
+        for _, row in _working(case, those).iterrows():
             S = sign * complex(row.p_mw_res, row.q_mvar_res) / S_b
             own = max(abs(S), row.sn_mva / S_b if row.sn_mva > 0 else 0.0)
             k = place[int(where[row.bus])]

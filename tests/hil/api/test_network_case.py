@@ -77,6 +77,15 @@ def test_of_python_a_net_of_ones_own(tmp_path):
 
 
 @pytest.mark.full
+def test_what_stands_at_a_bus_out_of_service_is_left_out():
+    net = copy.deepcopy(small())
+    bus = pandapower.create_bus(net, 110.0, name="d", in_service=False)
+    pandapower.create_sgen(net, bus, p_mw=10.0)
+    pandapower.create_gen(net, bus, p_mw=10.0, sn_mva=20.0)
+    network = gfmhil.network_from(net, {"b": "droop-3"}).content["network"]
+    assert [*network["synchronous_machines"]] == ["Ga"] and "grid_following" not in network
+
+
 def test_static_generators_follow_the_grid(tmp_path):
     """They bring what the power flow says, from under what a load draws there, and a converter may
     take a share of them."""
@@ -122,6 +131,10 @@ def without_rating(net):
     net.gen["sn_mva"] = np.nan
 
 
+def slack_without_rating(net):
+    net.ext_grid["max_p_mw"] = float("nan")
+
+
 def too_much(net):
     net.load["p_mw"] = 5000.0
 
@@ -136,6 +149,11 @@ def generates(net):
         (without_slack, "mine: has no slack: an ext_grid, or a gen with slack"),
         (island, "mine: bus c has no path to the slack"),
         (without_rating, "mine: bus b: its generator has no rating: give sn_mva or max_p_mw"),
+        (
+            slack_without_rating,
+            "mine: bus a: its generator has no rating: give sn_mva or max_p_mw,"
+            " or stand a grid there: slack = grid",
+        ),
         (too_much, "mine: its power flow does not converge: "),
         (generates, "mine: bus c: its loads draw -0.06 p.u.; make them static generators"),
     ],
