@@ -55,6 +55,7 @@ Vector = NDArray[np.float64]
 _LOWEST_HZ, _TOP_HZ = 0.02, 5e3  # of a figure; a sampled loop ends at its Nyquist frequency
 _POINTS = 1000
 _TWO = 7.6, 5.6  # inches, of gain and phase
+_STRIP = 0.6  # of a diagram, above it
 _LEAST_DB = -100.0  # the hold has zeros at the Nyquist frequency
 _SHOWN = 12  # modes of the figure of participations
 _LEAST = 0.005  # a part below this in every mode is left out
@@ -484,8 +485,13 @@ def mode_shape(loop: NetworkLoop, scenario: Scenario, number: int = 1) -> Axes:
     mode = modes[number - 1]
     if not mode.shape:
         raise UserError(f"mode {number}: others have the same pole, so it has no shape of its own")
-    axes = fill_diagram(pyplot.figure(), scenario, phasors=mode.shape)
-    axes.text(0.99, 0.99, f"mode {number}: {_label(mode).strip()}", transform=axes.transAxes,
+    figure = pyplot.figure()
+    axes = fill_diagram(figure, scenario, phasors=mode.shape)
+    (low, high), (width, height) = axes.get_ylim(), figure.get_size_inches()
+    axes.set_ylim(low, high + _STRIP)  # the title stands above the diagram
+    figure.set_size_inches(width, height * (1.0 + _STRIP / (high - low)))
+    axes.text(0.99, 1.0 - 0.2 * _STRIP / (high + _STRIP - low),
+              f"mode {number}: {_label(mode).strip()}", transform=axes.transAxes,
               ha="right", va="top", fontsize=9)  # fmt: skip
     return axes
 
