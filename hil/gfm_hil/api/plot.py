@@ -525,6 +525,8 @@ def forming_shares(each: Sequence[FormingShare], title: str = "") -> Axes:
     for one in each:
         if one.mode is None:
             axes.axvline(100 * one.share, color=GREY, lw=0.8, ls=":")
+            axes.text(100 * one.share, 0.02, f"{one.follows}: no linear loop ", rotation=90,
+                      ha="right", transform=axes.get_xaxis_transform(), fontsize=8)  # fmt: skip
     axes.axhline(0.0, color=GREY, lw=0.8)
     axes.set(
         xlabel="rating that forms the grid [%]; a name follows from there on", ylabel="σ [1/s]"
