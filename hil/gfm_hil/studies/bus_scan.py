@@ -16,7 +16,7 @@ from gfm_hil.studies.linear_loop import network_loop
 
 _PROBE = 1e-3  # p.u., of a bank at a node that has none; what it does to Z is taken out again
 _NEAR = 0.2  # Hz; nearer to the island's own frequency there is no impedance, but a steady state
-_ROUNDS, _BETWEEN = 4, 9  # of a refined scan, whose steps become 1/625 as long there
+_ROUNDS, _PARTS = 4, 5  # of a refined scan: steps beside a turn become 1/625 as long
 LOW, HIGH, POINTS = 1.0, 2500.0, 400
 
 
@@ -88,10 +88,9 @@ def bus_scan(
     loop, probe = network_loop(scenario), _PROBE * probes
     Z = _impedance(loop, bus, hz, f_n, probe)
     for _ in range(_ROUNDS * refine):
-        around = [
-            np.geomspace(hz[k - 1], hz[k + 1], _BETWEEN + 2) for k in _turns(positive_sequence(Z))
-        ]
-        more = np.setdiff1d(_off_nominal(np.concatenate([hz[:0], *around]), f_n), hz)
+        beside = sorted({j for k in _turns(positive_sequence(Z)) for j in (k - 1, k)})
+        steps = (hz[1:] / hz[:-1])[beside, None] ** (np.arange(1, _PARTS) / _PARTS)
+        more = _off_nominal((hz[beside, None] * steps).ravel(), f_n)
         place = np.searchsorted(hz, more)
         Z = np.insert(Z, place, _impedance(loop, bus, more, f_n, probe), axis=0)
         hz = np.insert(hz, place, more)

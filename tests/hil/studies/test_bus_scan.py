@@ -86,6 +86,7 @@ def test_a_resonance_is_where_it_is_and_not_at_the_nearest_frequency():
     lines |= {name: {"start": "bus", "end": "far", "L": 0.1, "R": 0.01} for name in ("a", "b")}
     corner = network(lines=lines, capacitors={"bank": {"node": "tip", "Q": 0.1}})
     scan = gfmhil.design.bus_scan(corner, "tip", np.geomspace(20.0, 2000.0, 40), refine=True)
+    assert np.diff(scan.hz).min() > 1e-6
     (one,) = scan.resonances()
     hz = np.linspace(499.0, 501.0, 200_001)
     Z = np.abs(1.0 / (1.0 / (0.001 + 1j * hz / 50 * 0.1) + 1j * hz / 50 * 0.1))
