@@ -147,16 +147,16 @@ def _static(
 ) -> dict[int, tuple[complex, float]]:
     """What the static generators and the storages of each bus bring, and their rating, p.u.; one
     without a rating, or beyond it, has what it brings."""
-    found: dict[int, tuple[complex, float]] = {}
+    by_bus: dict[int, tuple[complex, float]] = {}
     for table, sign in (("sgen", 1.0), ("storage", -1.0)):
         those = case[table].join(case[f"res_{table}"], rsuffix="_res")
         for _, row in _working(case, those).iterrows():
             S = sign * complex(row.p_mw_res, row.q_mvar_res) / S_b
             own = max(abs(S), row.sn_mva / S_b if row.sn_mva > 0 else 0.0)
             k = place[int(where[row.bus])]
-            before = found.get(k, (0j, 0.0))
-            found[k] = before[0] + S, before[1] + own
-    return {k: one for k, one in found.items() if one[1] > 0.0}
+            before = by_bus.get(k, (0j, 0.0))
+            by_bus[k] = before[0] + S, before[1] + own
+    return {k: one for k, one in by_bus.items() if one[1] > 0.0}
 
 
 def _load_pandapower(case: str) -> Any:

@@ -82,28 +82,29 @@ def forming_shares(
     loop = network_loop(scenario)
     references = {m.name: _as_it_is(follows.inner, m.ref, m.op) for m in loop.members}
     ratings = dict(zip(loop.names, 1.0 / plant_of(scenario).par["current"], strict=True))
-    total, whole = sum(ratings.values()), len(forming)
+    total, whole, all_forming = sum(ratings.values()), len(forming), tuple(forming)
     loops, done = (whole * (whole + 1) // 2 if order == BEST else whole), 0
 
-    def made(left: Sequence[str], name: str) -> FormingShare:
+    def step(left: Sequence[str], name: str) -> FormingShare:
         """The network in which those ``left`` form, and ``name`` is the last one to follow."""
-        those = {one: follows for one, was in own.items() if not _follows(was)}
-        those = {one: law for one, law in those.items() if one not in left}
+        changed = [one for one in all_forming if one not in left]
         share = sum(ratings[one] for one in left) / total
         mode, reason = None, ""
         try:
-            mode = linearise(scenario, those, {one: references[one] for one in those}).modes()[0]
+            mode = linearise(
+                scenario, dict.fromkeys(changed, follows), {one: references[one] for one in changed}
+            ).modes()[0]
         except NoEquilibrium as problem:
             reason = str(problem)
         return FormingShare(float(share), name, tuple(left), mode, reason)
 
-    steps = [made(forming, "")]
+    steps = [step(forming, "")]
     while forming:
         each = list[FormingShare]()
         for name in forming if order == BEST else forming[:1]:
             if watch.stopped():
                 raise KeyboardInterrupt
-            each.append(made([one for one in forming if one != name], name))
+            each.append(step([one for one in forming if one != name], name))
             watch.progress(done := done + 1, loops, name)
         steps.append(min(each, key=lambda one: one.sigma))
         forming = [name for name in forming if name != steps[-1].follows]
@@ -117,10 +118,10 @@ def _as_it_is(
     i, v = (complex(*op.x[2 * k : 2 * k + 2]) for k in range(2))
     V = abs(v)
     missing = i * v.conjugate() / V - stage.wanted(ref, float(op.x[V_DC]), V, float(op.u[_OMEGA]))
-    found = ref.copy()
-    found[_P] += missing.real * max(V, stage.V_least)
-    found[_Q] -= missing.imag * max(V, stage.V_least)
-    return found
+    references = ref.copy()
+    references[_P] += missing.real * max(V, stage.V_least)
+    references[_Q] -= missing.imag * max(V, stage.V_least)
+    return references
 
 
 def _follows(law: BuiltLaw) -> bool:

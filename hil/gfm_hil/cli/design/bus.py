@@ -42,13 +42,13 @@ def call(options: argparse.Namespace) -> int:
     hz = np.geomspace(options.low, options.high, options.points)
     scan = bus_scan(scenario, options.bus, hz, refine=True)
     save_figure(options, lambda: draw(scan))
-    found = scan.resonances()
+    resonances = scan.resonances()
     content = {
-        "scenario": scan.title, "bus": scan.bus, "resonances": found, "hz": scan.hz.tolist(),
+        "scenario": scan.title, "bus": scan.bus, "resonances": resonances, "hz": scan.hz.tolist(),
         "Z": [[z.real, z.imag] for z in scan.Z.tolist()],
     }  # fmt: skip
     rows = [[f"{one['hz']:.4g}", one["kind"], f"{one['size']:.4g}", f"{one['degrees']:.3g}"]
-            for one in found]  # fmt: skip
+            for one in resonances]  # fmt: skip
     table = Table(("resonance [Hz]", "kind", "|Z| [p.u.]", "∠Z [°]"), rows)
     title = f"[bold]{escape(scan.bus)}[/] · {escape(scan.title)}"
     print_result(options, content, [title, table if rows else "no resonance there"])
