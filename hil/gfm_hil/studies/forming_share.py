@@ -37,7 +37,9 @@ class FormingShare:
     follows: str  #: the last one that was made to follow; empty at first
     forming: tuple[str, ...]  #: those that form
     mode: NetworkMode | None  #: the one with the largest sigma; None: there is no linear loop
-    reason: str = ""  #: why there is none
+    reason: str  #: why there is none
+    #: P_ref and Q_ref, p.u., of each that was made to follow, with which it keeps its current
+    references: dict[str, dict[str, float]]
 
     @property
     def sigma(self) -> float:
@@ -47,8 +49,11 @@ class FormingShare:
     def plain(self) -> dict[str, Any]:
         """As plain data."""
         mode = None if self.mode is None else self.mode.plain()
-        own = {"share": self.share, "follows": self.follows, "forming": [*self.forming]}
-        return own | {"stable": self.sigma < 0.0, "mode": mode, "reason": self.reason}
+        return {
+            "share": self.share, "follows": self.follows, "forming": [*self.forming],
+            "stable": self.sigma < 0.0, "mode": mode, "reason": self.reason,
+            "references": self.references,
+        }  # fmt: skip
 
 
 def forming_shares(
@@ -87,16 +92,17 @@ def forming_shares(
 
     def step(left: Sequence[str], name: str) -> FormingShare:
         """The network in which those ``left`` form, and ``name`` is the last one to follow."""
-        changed = [one for one in all_forming if one not in left]
+        changed = {one: references[one] for one in all_forming if one not in left}
         share = sum(ratings[one] for one in left) / total
         mode, reason = None, ""
         try:
-            mode = linearise(
-                scenario, dict.fromkeys(changed, follows), {one: references[one] for one in changed}
-            ).modes()[0]
+            mode = linearise(scenario, dict.fromkeys(changed, follows), changed).modes()[0]
         except NoEquilibrium as problem:
             reason = str(problem)
-        return FormingShare(float(share), name, tuple(left), mode, reason)
+        kept = {
+            one: {"P_ref": float(ref[_P]), "Q_ref": float(ref[_Q])} for one, ref in changed.items()
+        }
+        return FormingShare(float(share), name, tuple(left), mode, reason, kept)
 
     steps = [step(forming, "")]
     while forming:

@@ -46,7 +46,8 @@ def call(options: argparse.Namespace) -> int:
         "scenario": scenario.title, "law": options.law, "shares": [one.plain() for one in each]
     }  # fmt: skip
     title = f"[bold]{escape(options.law)}[/] · {escape(scenario.title)}"
-    print_result(options, content, [title, _table(each)])
+    why = [escape(f"{100 * one.share:.0f} %: {one.reason}") for one in each if one.reason]
+    print_result(options, content, [title, _table(each), *why])
     return 0
 
 
@@ -55,7 +56,7 @@ def _table(each: list[FormingShare]) -> Table:
     for one in each:
         cells: list[Any] = [f"{100 * one.share:.0f} %", one.follows or None]
         if (mode := one.mode) is None:
-            rows.append([*cells, None, None, None, one.reason.partition(";")[0]])
+            rows.append([*cells, "no linear loop", None, None, None])
             continue
         parts = [f"{part} {100 * x:.0f} %" for part, x in [*mode.participation.items()][:_PARTS]
                  if x >= 0.01]  # fmt: skip
