@@ -10,6 +10,8 @@ from typing import Any
 
 from gfm_runtime.children import end_with_parent
 
+_PATIENCE_S = 5.0  # for work whose block has failed
+
 
 @contextmanager
 def beside(work: Callable[..., object], *arguments: Any) -> Iterator[None]:
@@ -31,7 +33,9 @@ def beside(work: Callable[..., object], *arguments: Any) -> Iterator[None]:
     process.start()
     try:
         yield
-    except BaseException:
+    except BaseException as problem:
+        if isinstance(problem, Exception):
+            process.join(_PATIENCE_S)  # it may be about to finish a file
         process.kill()
         raise
     finally:

@@ -43,7 +43,22 @@ def test_its_error_is_raised_here(processors, alone, monkeypatch, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_nothing_is_left_of_it_after_an_error_in_the_block(alone, tmp_path):
+def test_after_an_error_in_the_block_it_still_finishes_its_file(alone, tmp_path):
+    def write_slowly() -> None:
+        (tmp_path / "part").write_text("half")
+        time.sleep(0.2)
+        (tmp_path / "part").rename(tmp_path / "whole")
+
+    with pytest.raises(KeyError), beside(write_slowly):
+        while not (tmp_path / "part").is_file():
+            time.sleep(0.01)
+        raise KeyError
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
+def test_nothing_is_left_of_it_after_an_error_in_the_block(alone, tmp_path, monkeypatch):
+    monkeypatch.setattr("gfm_hil.core.beside._PATIENCE_S", 0.1)
+
     def write_later() -> None:
         (tmp_path / "pid").write_text(str(os.getpid()))
         time.sleep(600.0)
