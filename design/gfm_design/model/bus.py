@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gfm_design.model.closed_loop import Response, response
+from gfm_design.model.closed_loop import Response, acts, response
 from gfm_design.model.network import NetworkLoop
 
 
@@ -35,9 +35,7 @@ def bus_impedance(loop: NetworkLoop, node: str, omega: ArrayLike) -> Response:
         K[:, member.u, member.y] = response((c.A, c.B, c.C, c.D), z)
     y = response((plant.A, by_i, plant.C, np.zeros((n_y, 2))), s)
     y = y * np.exp(-s[:, None] * loop.y_delay)[:, :, None]
-    u = np.linalg.solve(np.eye(n_u) - K @ G, K @ y)
-    hold = (1.0 - np.exp(-s * loop.T_s)) / (s * loop.T_s)  # u acts late, and is held over the tick
-    u = u * (hold[:, None] * np.exp(-s[:, None] * loop.u_delay))[:, :, None]
+    u = np.linalg.solve(np.eye(n_u) - K @ G, K @ y) * acts(s, loop.T_s, loop.u_delay)
     both = response((plant.A, np.hstack([plant.B, by_i]), v, np.zeros((2, n_u + 2))), s)
     return np.asarray(both[..., n_u:] + both[..., :n_u] @ u)
 

@@ -544,12 +544,18 @@ class ClosedLoop(LinearLoop):
         K = response((c.A, c.B, c.C, c.D), at)
         y = response((A, by_i, C, y_by_i), s) * np.exp(-s[:, None] * self.y_delay)[:, :, None]
         u = np.linalg.solve(np.eye(n_u) - K @ G, K @ y)
-        if self.T_s is not None:  # u acts late, and is held over the tick
-            hold_at = (1.0 - np.exp(-s * self.T_s)) / (s * self.T_s)
-            u = u * (hold_at[:, None] * np.exp(-s[:, None] * self.u_delay))[:, :, None]
+        if self.T_s is not None:
+            u = u * acts(s, self.T_s, self.u_delay)
         zero = np.zeros((2, n_u + 2))
         v_by = response((A, np.hstack([alone.B, by_i]), v, zero), s)
         return -(v_by[..., n_u:] + v_by[..., :n_u] @ u)
+
+
+def acts(s: Response, T_s: float, u_delay: Matrix) -> Response:
+    """What a sampled command becomes where it acts, late and held over the tick, at s (K,): a
+    factor for each, (K, m, 1)."""
+    hold = (1.0 - np.exp(-s * T_s)) / (s * T_s)
+    return np.asarray(hold[:, None] * np.exp(-s[:, None] * u_delay))[:, :, None]
 
 
 def frequencies_near(poles: Response) -> Matrix:
