@@ -4,6 +4,7 @@ from typing import Literal
 
 Role = Literal["controller", "plant"]
 ROLES: tuple[Role, ...] = ("controller", "plant")
+OTHER: dict[Role, Role] = {"controller": "plant", "plant": "controller"}
 
 #: what this project's own controller calls itself
 OUR_CONTROLLER = "gfmhil"

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from gfm_hil.core.errors import PeerLost, lines
-from gfm_hil.core.roles import OUR_CONTROLLER, Role
+from gfm_hil.core.roles import OTHER, OUR_CONTROLLER, Role
 from gfm_hil.engine.loop_records import limited_reader
 from gfm_hil.links import Link
 from gfm_hil.links.base import LONGEST
@@ -213,7 +213,7 @@ class _Side:
         self, role: Role, link: Link, scenario: Scenario, meeting: Meeting, name: str
     ) -> None:
         self._role, self._link, self._scenario, self._meeting = role, link, scenario, meeting
-        self.other: Role = "plant" if role == "controller" else "controller"
+        self.other = OTHER[role]
         own = {"run": meeting.run} if role == "plant" else {"name": name}
         self._mine = {"role": role, "boot": _boot(), **_what_runs(scenario), **own}
         self._run, self._controller = self._mine.get("run"), self._mine.get("name")

@@ -1,6 +1,7 @@
 """The interface of a link: it carries whole messages and never blocks past the given timeout."""
 
 import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationError
 
-from gfm_hil.core.errors import lines
+from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
 
@@ -44,6 +45,25 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Free all resources; the last messages get a fraction of a second to be sent."""
+
+
+def unusable(endpoint: str, verb: str, why: object) -> UserError:
+    """The error of an end that cannot be ``verb`` (bound, opened, joined) at its endpoint."""
+    return UserError(f"link.endpoint = {endpoint!r}: cannot be {verb}: {why}")
+
+
+def wait_until(ready: Callable[[], bool], until: float, first_s: float, most_s: float) -> bool:
+    """Sleep until ``ready()`` (True), or until ``time.monotonic()`` is ``until``, s (False).
+
+    Each sleep is twice as long as the one before it, from ``first_s`` to ``most_s``.
+    """
+    while not ready():
+        left = until - time.monotonic()
+        if left <= 0:
+            return False
+        time.sleep(min(first_s, left))
+        first_s = min(2 * first_s, most_s)
+    return True
 
 
 class LinkOptions(BaseModel):

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 from gfm_hil.links import ring
-from gfm_hil.links.base import LONGEST, Link
+from gfm_hil.links.base import LONGEST, Link, wait_until
 from gfm_hil.links.port import Port, free_port_function
 
 _LOST = ring.HANDLE  # an additional word after a ring's handle: not 0 once the link is lost
@@ -63,12 +63,11 @@ class PumpedLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        until = time.monotonic() + seconds
-        while not ring.waiting(self._loop):
-            if time.monotonic() >= until or self._problem is not None:
-                return False
-            time.sleep(_SLEEP_S)
-        return True
+        def over() -> bool:
+            return ring.waiting(self._loop) or self._problem is not None
+
+        wait_until(over, time.monotonic() + seconds, _SLEEP_S, _SLEEP_S)
+        return bool(ring.waiting(self._loop))
 
     def close(self) -> None:
         self._link.close()

@@ -1,5 +1,7 @@
 """What the links' compiled functions share of libc: errno and poll."""
 
+import errno
+import select
 from typing import Any
 
 from numba import int64, types
@@ -7,10 +9,17 @@ from numba import int64, types
 from gfm_hil.realtime.atomics import load32
 from gfm_runtime.compiled import compiled
 
+NONE_NOW = (errno.EAGAIN, errno.EINTR)  # nothing has come, or there is no room
+
 _errno_place: Any = types.ExternalFunction("__errno_location", types.int64())
 
-#: poll(2): address of the structures, how many, and ms
+#: poll(2): address of the structures ``pollfd``, how many, and ms
 poll: Any = types.ExternalFunction("poll", types.int32(types.int64, types.int64, types.int32))
+
+
+def pollfd(fd: int) -> int:
+    """struct pollfd as one word: the file descriptor is to be readable."""
+    return fd | select.POLLIN << 32
 
 
 @compiled

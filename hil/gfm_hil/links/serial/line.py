@@ -4,8 +4,6 @@ All state is in one int64 array, the ``handle`` of the port: numbers first, then
 came, of the piece of a message up to its zero, of the message, and of what is still to be written.
 """
 
-import errno
-import select
 import termios
 from functools import partial
 from typing import Any
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.base import LONGEST
 from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.links.serial.framing import DAMAGED, MOST, stuff, unstuff
-from gfm_hil.links.system import errno_now, poll
+from gfm_hil.links.system import NONE_NOW, errno_now, poll, pollfd
 from gfm_hil.realtime.atomics import copy
 from gfm_runtime.compiled import compiled
 
@@ -35,9 +33,7 @@ _MESSAGE = _PIECE + _WORDS
 _REST = _MESSAGE + _WORDS
 _SIZE = _REST + _WORDS
 
-_NONE_NOW = (errno.EAGAIN, errno.EINTR)
 _TIOCOUTQ = termios.TIOCOUTQ
-_EVENTS = 32  # bit offset of ``events`` in struct pollfd
 _PATIENCE_MS = 1
 # A worker of the kernel, of ordinary priority, moves the bytes (flush_to_ldisc of Linux): two loops
 # of SCHED_FIFO that only read leave it no processor. So they read so often, and then sleep: in
@@ -69,7 +65,7 @@ def set_paced(h: NDArray[np.int64], paced: bool) -> None:
 
 def set_line(h: NDArray[np.int64], fd: int) -> None:
     """The line is open; its owner keeps it so, and it does not block. -1: it is closed."""
-    h[FD], h[_POLL] = fd, max(fd, 0) | select.POLLIN << _EVENTS
+    h[FD], h[_POLL] = fd, pollfd(max(fd, 0))
 
 
 @compiled
@@ -82,7 +78,7 @@ def flush(h):
     done = _write(h[FD], h.ctypes.data + _WORD * _REST + h[_REST_AT], left)
     if done < 0:
         why = errno_now()
-        if why not in _NONE_NOW:
+        if why not in NONE_NOW:
             h[GONE] = why
             h[_REST_AT] = h[_REST_END]
         return False
@@ -170,7 +166,7 @@ def receive(h, message):
     got = _read(h[FD], h.ctypes.data + _WORD * _CAME, _AT_ONCE)
     if got < 0:
         why = errno_now()
-        if why in _NONE_NOW:
+        if why in NONE_NOW:
             return 0
         h[GONE] = why
         return -1

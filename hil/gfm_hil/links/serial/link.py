@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.core.errors import PeerLost, UserError, need
+from gfm_hil.core.errors import PeerLost, need
 from gfm_hil.core.roles import Role
-from gfm_hil.links.base import LONGEST
+from gfm_hil.links.base import LONGEST, unusable, wait_until
 from gfm_hil.links.serial import PTY, SerialOptions
 from gfm_hil.links.serial.line import (
     COUNT_DAMAGED,
@@ -76,7 +76,7 @@ class SerialLink:
             self._path.symlink_to(os.ttyname(theirs))
         except OSError as problem:
             self._ends.close()
-            raise self._unusable("made", problem.strerror) from None
+            raise unusable(self._endpoint, "made", problem.strerror) from None
         self._ends.callback(self._path.unlink, missing_ok=True)
         set_line(self._line, ours)
 
@@ -98,13 +98,10 @@ class SerialLink:
         except (OSError, ValueError) as problem:  # SerialException is an OSError
             number = getattr(problem, "errno", None)
             why = os.strerror(number) if number else str(problem)
-            raise self._unusable("opened", why) from None
+            raise unusable(self._endpoint, "opened", why) from None
         self._ends.callback(line.close)
         line.reset_input_buffer()  # what came before we were there
         set_line(self._line, line.fileno())
-
-    def _unusable(self, verb: str, why: str | None) -> UserError:
-        return UserError(f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {why}")
 
     def send(self, message: bytes) -> bool:
         """Send a message; False if the line has no room for it. Raises PeerLost: the device is
@@ -132,11 +129,8 @@ class SerialLink:
 
     def wait(self, seconds: float) -> bool:
         until = time.monotonic() + seconds
-        while not self._there():
-            left = until - time.monotonic()
-            if left <= 0:
-                return False
-            time.sleep(min(_POLL_S, left))
+        if not wait_until(self._there, until, _POLL_S, _POLL_S):
+            return False
         left = max(until - time.monotonic(), 0.0)
         return bool(select.select([self], [], [], left)[0])
 

@@ -4,10 +4,9 @@ import time
 
 import numpy as np
 
-from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import ring
-from gfm_hil.links.base import LONGEST
+from gfm_hil.links.base import LONGEST, unusable, wait_until
 from gfm_hil.links.port import Port
 from gfm_hil.links.shm import segment
 
@@ -50,15 +49,10 @@ class ShmLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        until = time.monotonic() + seconds
-        step = _FIRST_S
-        while not (self._there() and ring.waiting(self._handle)):
-            left = until - time.monotonic()
-            if left <= 0:
-                return False
-            time.sleep(min(step, left))
-            step = min(2 * step, _LONGEST_S)
-        return True
+        def arrived() -> bool:
+            return self._there() and bool(ring.waiting(self._handle))
+
+        return wait_until(arrived, time.monotonic() + seconds, _FIRST_S, _LONGEST_S)
 
     def close(self) -> None:
         """Release the memory; a peer that has joined can still read the last messages."""
@@ -85,9 +79,7 @@ class ShmLink:
             found = segment.create(name) if owner else segment.join(name)
         except segment.Refused as problem:
             verb = "created" if owner else "joined"
-            raise UserError(
-                f"link.endpoint = {self._endpoint!r}: cannot be {verb}: {problem}"
-            ) from None
+            raise unusable(self._endpoint, verb, problem) from None
         if found is None:
             return
         words = np.frombuffer(found.memory, np.int64)

@@ -14,7 +14,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.core.roles import OTHER, ROLES, Role
 
 _KEY_BYTES = 32
 _DOMAIN = "gfmhil"
@@ -59,8 +59,7 @@ class Curve:
     def __init__(self, socket: zmq.Socket[bytes], role: Role, folder: Path) -> None:
         _need_curve()
         public, secret = _key(folder / f"{role}.key_secret")
-        other = "plant" if role == "controller" else "controller"
-        self._peer, _ = _key(folder / f"{other}.key")
+        self._peer, _ = _key(folder / f"{OTHER[role]}.key")
         self._door: ThreadAuthenticator | None = None
         socket.curve_publickey, socket.curve_secretkey = public, secret
         if role == "controller":

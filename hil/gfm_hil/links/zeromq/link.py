@@ -19,7 +19,7 @@ import zmq
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
-from gfm_hil.links.base import LONGEST
+from gfm_hil.links.base import LONGEST, unusable, wait_until
 from gfm_hil.links.port import Port
 from gfm_hil.links.zeromq.native import native_port
 from gfm_hil.links.zeromq.options import ZmqOptions
@@ -82,9 +82,7 @@ class ZmqLink:
         self._role, self._endpoint, self._ipc = role, endpoint, endpoint.startswith(SCHEME)
         if role == "controller" and self._ipc and is_served(endpoint):
             # libzmq would replace the file, and the other run would receive nothing more
-            raise UserError(
-                f"link.endpoint = {endpoint!r}: cannot be bound: occupied by another run"
-            )
+            raise unusable(endpoint, "bound", "occupied by another run")
         self._context = zmq.Context()
         self._socket = pair_socket(self._context)
         self._curve: Curve | None = None
@@ -106,8 +104,7 @@ class ZmqLink:
         except zmq.ZMQError as problem:
             self.close()
             verb = "bound" if role == "controller" else "connected to"
-            why = zmq.strerror(problem.errno or 0)
-            raise UserError(f"link.endpoint = {endpoint!r}: cannot be {verb}: {why}") from None
+            raise unusable(endpoint, verb, zmq.strerror(problem.errno or 0)) from None
         if not options.portable:
             self.port = native_port(self._socket)
             if self.port is None:
@@ -152,11 +149,8 @@ class ZmqLink:
 
     def wait(self, seconds: float) -> bool:
         until = time.monotonic() + seconds
-        while not self._there():
-            left = until - time.monotonic()
-            if left <= 0:
-                return False
-            time.sleep(min(_POLL_S, left))
+        if not wait_until(self._there, until, _POLL_S, _POLL_S):
+            return False
         left = until - time.monotonic()
         return bool(self._socket.poll(max(1, round(left * 1000)), zmq.POLLIN))
 
