@@ -3,7 +3,7 @@
 import numpy as np
 
 from gfm_hil.links.can.layout import Plan
-from gfm_hil.links.can.vectors import NOTHING, belongs, decode, receiver_dtype, set_receiver
+from gfm_hil.links.can.vectors import NOTHING, decode, part_of, receiver_dtype, set_receiver
 from gfm_hil.links.can.wire import MOST, frame_dtype
 from gfm_runtime.signals import Vector
 
@@ -28,8 +28,9 @@ class VectorReceiver:
         return int(self._record["incomplete"][0])
 
     def belongs(self, number: int) -> bool:
-        return bool(belongs(self._record, number))
+        return bool(part_of(self._record, number) != NOTHING)
 
     def take(self, number: int, payload: bytes) -> bytes | None:
-        size = decode(self._record, frame_of(number, payload)[0], self._message)
+        part = part_of(self._record, number)
+        size = decode(self._record, part, frame_of(number, payload)[0], self._message)
         return None if size == NOTHING else self._message[:size].tobytes()

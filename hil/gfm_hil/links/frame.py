@@ -67,6 +67,8 @@ _HEADER = (
     ("sequence", "<u4"),
     ("tick", "<u8"),
 )
+#: what comes before the values
+header_dtype = np.dtype([*_HEADER])
 
 
 def wire_dtype(count: int) -> np.dtype:
@@ -123,6 +125,12 @@ def pack_again(sequence, frame, message):
     f = frame[0]
     f.sequence = sequence[0]
     skip(sequence)
+    seal(message)
+
+
+@inlined
+def seal(message):
+    """Write the CRC that ends a frame."""
     store32(_seal_at(message), crc32(message, len(message) - _CRC_BYTES))
 
 

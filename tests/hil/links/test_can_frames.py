@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gfm_hil.links.can.dbc import INT16, INVALID, VECTORS, offset, read_dbc, write_dbc
-from gfm_hil.links.can.layout import plan_of, unpack_vector
+from gfm_hil.links.can.layout import plan_of
 from gfm_hil.links.can.vectors import VectorSender
 from gfm_hil.links.can.wire import crc8
-from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter
+from gfm_hil.links.frame import FrameError, FrameReader, FrameWriter, frame_dtype
 from gfm_runtime.signals import Group, carried_rows, group, names
 from gfm_runtime.states import RUNNING, SAFE
 
@@ -105,21 +105,17 @@ def test_packing_is_that_of_cantools(data, frame):
     payload = payloads[part.number]
 
     message = DBC[fd].get_message_by_frame_id(part.number)
-    ends = {
-        names[k]: (o - INT16 * s, o + INT16 * s)
-        for k, s, o in zip(part.index, part.scale, part.offset, strict=True)
-    }
+    ends = {names[k]: (o - INT16 * s, o + INT16 * s) for k, _, s, o in part.values.tolist()}
     physical = {n: float(np.clip(sent[names.index(n)], *ends[n])) for n in ends}
     crc = crc8(part.data_id, np.frombuffer(payload, np.uint8))
     header = {"Crc": int(crc), "Counter": tick % 2 * 64 + 128}  # of sequence 0
     assert message.encode({**physical, **header}, strict=False) == payload
 
     decoded = message.decode(payload, decode_choices=False)
-    got = np.full(len(rows), np.nan)
-    unpack_vector(
-        np.frombuffer(payload, np.uint8), part.index, part.start, part.scale, part.offset, got
-    )
-    assert {names[k]: got[k] for k in part.index} == {n: decoded[n] for n in ends}
+    receiver = VectorReceiver(plan, name)
+    *_, whole = (receiver.take(*one) for one in payloads.items())
+    got = np.frombuffer(whole, frame_dtype(name, plan.inner))
+    assert {n: got[n][0] for n in ends} == {n: decoded[n] for n in ends}
     for n, (low, high) in ends.items():
         value, scale = sent[names.index(n)], rows[names.index(n)].scale
         if low <= value <= high:

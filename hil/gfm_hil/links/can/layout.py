@@ -1,4 +1,4 @@
-"""Where each value lies in each frame, from a loaded DBC; compiled packing and unpacking.
+"""Where each value lies in each frame, from a loaded DBC.
 
 cantools reads the DBC once, at the start; the loop never calls it.
 """
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
-from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.links.can import CanOptions
@@ -19,20 +18,20 @@ from gfm_hil.links.can.dbc import (
     COUNTER,
     CRC,
     INNER,
-    INT16,
-    INVALID,
     STATUS,
     TRANSPORT,
     VECTORS,
     read_dbc,
     write_dbc,
 )
-from gfm_hil.links.can.wire import crc8
-from gfm_runtime.compiled import compiled
 from gfm_runtime.regular import read_regular
 from gfm_runtime.signals import Vector, carried
 
 _MOST_BYTES = 16 << 20  # of a DBC file
+
+
+#: a value in a frame: its index in the vector, its first byte, and value = count × scale + offset
+VALUE = [("index", "i8"), ("start", "i8"), ("scale", "f8"), ("offset", "f8")]
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,8 @@ class Layout:
     length: int
     dtype: np.dtype  # a record with one field per signal
     data_id: int  # 16 bits of a hash over the whole definition
-    # which elements of the vector it carries, shape (n,); empty for other frames
-    index: NDArray[np.int64]
-    start: NDArray[np.int64]  # the first byte of each, shape (n,)
-    # scale, offset: value = count × scale + offset, shape (n,), p.u.
-    scale: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    # the elements of the vector that it carries, records of ``VALUE``; none in other frames
+    values: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -99,23 +94,16 @@ def dtype_of(message: Message) -> np.dtype:
 
 def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
     dtype = dtype_of(message)
-    fields: Any = dtype.fields
-    carried = [name for name in vector if name in fields]
-    for name in carried:
-        if fields[name][0] != np.dtype("<i2"):
-            raise ValueError(f"{message.name}.{name}: must be a signed 16-bit value")
-    signals = {s.name: s for s in message.signals}
+    values = []
+    for s in message.signals:
+        if s.name in vector:
+            if dtype[s.name] != np.dtype("<i2"):
+                raise ValueError(f"{message.name}.{s.name}: must be a signed 16-bit value")
+            values.append((vector.index(s.name), s.start // 8, float(s.scale), float(s.offset)))
     return Layout(
-        message.name,
-        message.frame_id,
-        message.length,
-        dtype,
-        _digest(_definition(message), 2),
-        np.array([vector.index(name) for name in carried], np.int64),
-        np.array([fields[name][1] for name in carried], np.int64),
-        np.array([float(signals[name].scale) for name in carried]),
-        np.array([float(signals[name].offset) for name in carried]),
-    )
+        message.name, message.frame_id, message.length, dtype, _digest(_definition(message), 2),
+        np.array(sorted(values), VALUE),
+    )  # fmt: skip
 
 
 def _frames_of(title: str, messages: Mapping[str, Message]) -> list[Message]:
@@ -134,7 +122,7 @@ def plan_of(database: Database, inner: int = False) -> Plan:
     for group, title in (INNER if inner else VECTORS).items():
         wanted = carried(group, inner)
         vectors[group] = [_layout(m, wanted) for m in _frames_of(title, messages)]
-        found = sorted(k for layout in vectors[group] for k in layout.index.tolist())
+        found = sorted(k for layout in vectors[group] for k in layout.values["index"].tolist())
         if found != list(range(len(wanted))):
             why = "; this run has an inner stage" if inner else ""
             raise ValueError(f"frames {title}…: must carry each of {list(wanted)} once{why}")
@@ -155,46 +143,6 @@ def plan_of(database: Database, inner: int = False) -> Plan:
     return plan
 
 
-@compiled
-def pack_vector(values, index, start, scale, offset, data_id, counter, payload):
-    """Write values rounded to counts, and add the end-to-end protection.
-
-    Args:
-        values: the whole vector, p.u.
-        index, start, scale, offset, data_id: as in ``Layout``.
-        counter: the frame's second byte.
-        payload: bytes of the frame, written.
-
-    Returns:
-        How many values exceeded the 16-bit range and were saturated.
-    """
-    saturated = 0
-    for k in range(len(index)):
-        nearest = np.rint((values[index[k]] - offset[k]) / scale[k])
-        if np.isnan(nearest):
-            count = INVALID
-        elif abs(nearest) > INT16:
-            count = INT16 if nearest > 0 else -INT16
-            saturated += 1
-        else:
-            count = int(nearest)
-        payload[start[k]] = count & 0xFF
-        payload[start[k] + 1] = (count >> 8) & 0xFF
-    payload[1] = counter
-    payload[0] = crc8(data_id, payload)
-    return saturated
-
-
-@compiled
-def unpack_vector(payload, index, start, scale, offset, values):
-    """Write a frame's values into the vector; an invalid count becomes NaN."""
-    for k in range(len(index)):
-        count = np.int64(payload[start[k]]) | np.int64(payload[start[k] + 1]) << 8
-        if count >= 0x8000:
-            count -= 0x10000
-        values[index[k]] = np.nan if count == INVALID else count * scale[k] + offset[k]
-
-
 @cache
 def load_plan(options: CanOptions) -> Plan:
     """The frames of the DBC that the options name, or of the generated one. Raises ValueError: the
@@ -203,9 +151,8 @@ def load_plan(options: CanOptions) -> Plan:
         return plan_of(read_dbc(write_dbc(options.fd)), options.inner)
     where = f"dbc = {options.dbc!r}"
     try:
-        plan = plan_of(
-            read_dbc(read_regular(options.dbc, _MOST_BYTES).decode("utf-8")), options.inner
-        )
+        text = read_regular(options.dbc, _MOST_BYTES).decode("utf-8")
+        plan = plan_of(read_dbc(text), options.inner)
     except OSError as problem:
         raise ValueError(f"{where}: {problem.strerror}") from None
     except Exception as problem:  # cantools' parser errors have no common base class

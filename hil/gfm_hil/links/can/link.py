@@ -15,10 +15,11 @@ import isotp
 import numpy as np
 
 from gfm_hil.core.errors import PeerLost, UserError
-from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.links.base import LONGEST
+from gfm_hil.core.roles import OTHER, ROLES, Role
+from gfm_hil.links.base import LONGEST, unusable
 from gfm_hil.links.can import LOOPBACK, CanOptions
 from gfm_hil.links.can.bridge import Bridge
+from gfm_hil.links.can.dbc import SENDERS
 from gfm_hil.links.can.emulation import busy
 from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.loopback import LoopbackBus
@@ -39,7 +40,7 @@ from gfm_hil.links.can.sockets import SOCKETCAN, set_socket
 from gfm_hil.links.can.wire import BRS, FD, MOST, frame_dtype
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.links.port import Port
-from gfm_runtime.signals import Vector, carried
+from gfm_runtime.signals import carried
 
 # both also raise or report what they log, and we print that in one line: silence their logs
 for _name in ("can", "isotp"):
@@ -76,7 +77,7 @@ class CanLink:
             plan = load_plan(options)
         except ValueError as problem:
             raise UserError(f"link.options.{problem}") from None
-        self._other, self._digest = ROLES[1 - ROLES.index(role)], plan.digest
+        self._other, self._digest = OTHER[role], plan.digest
         self._flags, self._where = options.fd * (FD | BRS), endpoint.partition("://")[2]
         self._node = Node(plan, role, options)
         self._message, self._frame = np.zeros(MOST, np.uint8), np.zeros(1, frame_dtype)
@@ -114,17 +115,15 @@ class CanLink:
     @property
     def counters(self) -> dict[str, int]:
         """Counts of bus events, besides the faults that the frame reader counts."""
-        n = self._node
-        counted = {
-            "foreign": n.state["foreign"],
-            "incomplete": n.receiver["incomplete"],
-            "error_frames": n.state["error_frames"],
-            "dropped": n.state["dropped"],
-            "saturated": n.sender["saturated"],
+        state, sender, receiver = self._node.state[0], self._node.sender[0], self._node.receiver[0]
+        return {
+            "foreign": int(state["foreign"]),
+            "incomplete": int(receiver["incomplete"]),
+            "error_frames": int(state["error_frames"]),
+            "dropped": int(state["dropped"]) + getattr(self._bus, "dropped", 0),
+            "saturated": int(sender["saturated"]),
+            "damaged_messages": self._damaged,
         }
-        counts = {name: int(count[0]) for name, count in counted.items()}
-        counts["dropped"] += getattr(self._bus, "dropped", 0)
-        return {**counts, "damaged_messages": self._damaged}
 
     def send(self, message: bytes) -> bool:
         """Send a message; False if the bus has no room for all of it, or if it is one of the
@@ -224,9 +223,8 @@ def warm_up(plan: Plan) -> None:
     """Compile (or load from the cache) what a tick calls, before the other side waits for it."""
     ends = {role: Node(plan, role, CanOptions(fd=plan.fd)) for role in ROLES}
     message = np.zeros(MOST, np.uint8)
-    groups: tuple[tuple[Role, Vector], ...] = (("plant", "y"), ("controller", "u"))
-    for role, group in groups:
-        mine, theirs = ends[role], ends[ROLES[1 - ROLES.index(role)]]
+    for group, role in SENDERS.items():
+        mine, theirs = ends[role], ends[OTHER[role]]
         mine.sockets["fd"] = mine.sockets["others"] = -1  # no socket: nothing is sent or received
         values = np.zeros(len(carried(group, plan.inner)))
         words = FrameWriter(group, plan.inner).pack(0, 0, 0, values)
@@ -254,7 +252,7 @@ def _open_bus(role: Role, endpoint: str, options: CanOptions) -> Any:
         said = str(problem)
         if isinstance(problem, OSError) and problem.errno == errno.EAFNOSUPPORT:
             said = f"this kernel has no CAN; {LOOPBACK}://127.0.0.1:port does without"
-        raise UserError(f"link.endpoint = {endpoint!r}: cannot be opened: {said}") from None
+        raise unusable(endpoint, "opened", said) from None
 
 
 def _check_mtu(channel: str, fd: bool) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.core.roles import Role
+from gfm_hil.core.roles import OTHER, Role
 from gfm_hil.links.can import CanOptions
 from gfm_hil.links.can.emulation import (
     PLACES,
@@ -24,19 +24,20 @@ from gfm_hil.links.can.emulation import (
     set_bus,
 )
 from gfm_hil.links.can.layout import Plan
-from gfm_hil.links.can.sockets import FULL, read_frame, sleep_for_frame, socket_dtype, write_frame
+from gfm_hil.links.can.sockets import FULL, POLL_AT, read_frame, socket_dtype, write_frame
 from gfm_hil.links.can.vectors import (
     PARTS,
-    belongs,
     decode,
     encode,
+    part_of,
     receiver_dtype,
     sender_dtype,
     set_receiver,
     set_sender,
 )
-from gfm_hil.links.can.wire import BUS_OFF, ERROR, EXTENDED, REMOTE, frame_dtype
+from gfm_hil.links.can.wire import BUS_OFF, ERROR, frame_dtype
 from gfm_hil.links.port import Port, free_port_function
+from gfm_hil.links.system import poll
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import compiled, expanded
 
@@ -88,7 +89,7 @@ class Node:
         self.sender, self.receiver = views["sender"], views["receiver"]
         self.out, self.into = views["out"], views["into"]
         self.state["open"] = 1
-        self.state["transport"] = plan.transport["controller" if role == "plant" else "plant"]
+        self.state["transport"] = plan.transport[OTHER[role]]
         plant = role == "plant"
         set_sender(self.sender, plan, "y" if plant else "u", options.heartbeat)
         set_receiver(self.receiver, plan, "u" if plant else "y")
@@ -215,26 +216,18 @@ def process(handle, frame, message):
         if frame.id & BUS_OFF:
             state.lost = WENT_BUS_OFF
             return LOST
-    elif frame.id & (EXTENDED | REMOTE):
-        state.foreign += 1
-    elif belongs(receiver, frame.id):
-        return decode(receiver, frame, message)
-    elif frame.id == state.transport:
+        return NOTHING
+    part = part_of(receiver, frame.id)
+    if part != NOTHING:
+        return decode(receiver, part, frame, message)
+    if frame.id == state.transport:
         return TRANSPORT
-    else:
-        state.foreign += 1
+    state.foreign += 1  # so is a remote or an extended frame: its flag is in ``id``
     return NOTHING
 
 
-@compiled
-def sleep(handle, ms):
-    """Sleep until the socket has a frame, at most ``ms``; not while a frame is on the bus."""
-    if _state(handle)[0].open != 0 and not busy(_bus(handle)):
-        sleep_for_frame(_sockets(handle), ms)
-
-
 _SPINS = 200  # polls, about 0.1 ms: the call that sends a frame also delivers it
-_PATIENCE = 1  # ms
+_PATIENCE_MS = 1
 
 
 def can_port(node: Node) -> Port:
@@ -255,6 +248,7 @@ def _receive(handle, message):
 
 @free_port_function
 def _await(handle, message):
-    sleep(handle, _PATIENCE)
+    if _state(handle)[0].open != 0 and not busy(_bus(handle)):  # a frame on the bus comes sooner
+        poll(_sockets(handle).ctypes.data + POLL_AT, 1, _PATIENCE_MS)
     size = receive(handle, message)
     return -1 if size == LOST else max(0, size)

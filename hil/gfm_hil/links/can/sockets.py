@@ -5,7 +5,6 @@ SocketCAN, and a ``Bridge`` in its place, transfer whole structures; on the loop
 """
 
 import errno
-import select
 import socket
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from numba import types
 
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
-from gfm_hil.links.system import errno_now, poll
+from gfm_hil.links.system import NONE_NOW, errno_now, pollfd
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import compiled
 
@@ -28,15 +27,13 @@ socket_dtype = np.dtype(
         ("fd", "i8"),
         ("others", "i8", (_OTHERS,)),  # sockets connected to the other places
         ("empty_until", "i8", (_OTHERS,)),  # ns
-        ("poll", "i8"),  # struct pollfd: the socket and POLLIN
+        ("poll", "i8"),  # ``pollfd`` of the socket
     ]
 )
-_POLL_AT = socket_dtype.itemsize - 8
+POLL_AT = socket_dtype.itemsize - 8
 
 _DONTWAIT = int(socket.MSG_DONTWAIT)
-_NONE_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN)
-_EVENTS = 32  # bit offset of ``events`` in struct pollfd
 
 # send(2) and recv(2) of libc; addresses are int64
 _transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
@@ -47,7 +44,7 @@ _recv: Any = types.ExternalFunction("recv", _transfer)
 def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = ()) -> None:
     """Initialise one record of ``socket_dtype``; its owner keeps the sockets open."""
     record["kind"], record["fd"], record["others"][0, : len(others)] = kind, fd, others
-    record["poll"] = fd | select.POLLIN << _EVENTS
+    record["poll"] = pollfd(fd)
 
 
 @compiled
@@ -81,15 +78,9 @@ def read_frame(sockets, frame):
     got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD, _DONTWAIT)
     if got < 0:
         why = errno_now()
-        return 0 if why in _NONE_NOW else -why
+        return 0 if why in NONE_NOW else -why
     if got == 0 and sockets[0].kind == SOCKETCAN:  # the bridge has left
         return -errno.ENOTCONN
     f = frame[0]
     f.length = max(0, min(np.int64(f.length), got - HEAD))
     return 1
-
-
-@compiled
-def sleep_for_frame(sockets, ms):
-    """Sleep until the socket is readable, at most ``ms``."""
-    poll(sockets.ctypes.data + _POLL_AT, 1, ms)

@@ -17,11 +17,12 @@ A CAN frame that fails its check becomes a frame that fails the reader's check a
 import numpy as np
 
 from gfm_hil.links.can import wire
-from gfm_hil.links.can.dbc import SENDERS
-from gfm_hil.links.can.layout import Plan, pack_vector, unpack_vector
-from gfm_hil.realtime.atomics import copy
+from gfm_hil.links.can.dbc import INT16, INVALID, SENDERS
+from gfm_hil.links.can.layout import VALUE, Plan
+from gfm_hil.links.frame import DATA_IDS, buffer, header_dtype, is_sealed, seal
+from gfm_hil.realtime.atomics import copy, load32, store32
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import Vector
+from gfm_runtime.signals import Vector, carried
 
 #: a CAN frame: identifier and payload
 CanFrame = tuple[int, bytes]
@@ -33,26 +34,24 @@ _SEQUENCES = 64  # range of the counter's six bits
 _LAG, _MARK = 0x40, 0x80  # its other bits
 _BEHIND = 4  # how many of these sequences count as older vectors
 _LOW = 0xFFFF_FFFF
+_FIRST = header_dtype.itemsize  # where the values begin in a frame of the bench
+_WORD = 8
 _STATUS = ("State", "Reason", "Tick")  # signals of a status frame, in this order
 
-#: a vector's frames by the DBC; part k holds the values first[k] to first[k + 1]
+#: a vector's frames by the DBC, and after them its sender's status as part ``parts``; part k holds
+#: the values first[k] to first[k + 1]
 _TABLE = [
     ("parts", "i8"),
     ("flags", "i8"),  # of a CAN FD frame
-    ("number", "i8", (PARTS,)),
-    ("length", "i8", (PARTS,)),
-    ("data_id", "i8", (PARTS,)),
-    ("first", "i8", (PARTS + 1,)),
-    ("index", "i8", (wire.VALUES,)),
-    ("start", "i8", (wire.VALUES,)),
-    ("scale", "f8", (wire.VALUES,)),
-    ("offset", "f8", (wire.VALUES,)),
-    ("status_number", "i8"),
-    ("status_length", "i8"),
-    ("status_data_id", "i8"),
+    ("number", "i8", (PARTS + 1,)),
+    ("length", "i8", (PARTS + 1,)),
+    ("data_id", "i8", (PARTS + 1,)),
+    ("first", "i8", (PARTS + 2,)),
+    *((name, kind, (wire.VALUES,)) for name, kind in VALUE),
     ("status_at", "i8", (len(_STATUS),)),
     ("status_width", "i8", (len(_STATUS),)),
-    ("size", "i8"),  # of the bench's frames
+    # length and first four bytes of the bench's frames of this vector
+    ("size", "i8"),
     ("head", "i8"),
 ]
 
@@ -99,16 +98,15 @@ def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
 def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
     r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
-    r["size"], r["head"] = wire.size_and_head(group, plan.inner)
+    _, message = buffer(len(carried(group, plan.inner)), DATA_IDS[group])
+    r["size"], r["head"] = len(message), message[:4].view(np.uint32)[0]
     done = 0
-    for k, part in enumerate(parts):
+    for k, part in enumerate([*parts, status]):
         r["number"][k], r["length"][k], r["data_id"][k] = part.number, part.length, part.data_id
-        end = done + len(part.index)
-        for name in ("index", "start", "scale", "offset"):
-            r[name][done:end] = getattr(part, name)
+        end = done + len(part.values)
+        for name, _ in VALUE:
+            r[name][done:end] = part.values[name]
         done = r["first"][k + 1] = end
-    r["status_number"], r["status_length"] = status.number, status.length
-    r["status_data_id"] = status.data_id
     fields = status.dtype.fields
     assert fields is not None
     r["status_at"] = [fields[name][1] for name in _STATUS]
@@ -128,13 +126,14 @@ def encode(sender, message, frames):
         How many; NOTHING if the message is not a frame of this vector.
     """
     s, size = sender[0], len(message)
-    if size != s.size or not wire.begins_with(s.head, message):
+    if size != s.size or load32(message.ctypes.data) != s.head:
         return NOTHING
-    state, reason = np.int64(message[wire.STATE]), np.int64(message[wire.REASON])
-    sequence, tick = wire.number(message, wire.SEQUENCE, 4), wire.number(message, wire.TICK, 8)
+    head = message[:_FIRST].view(header_dtype)[0]
+    state, reason = np.int64(head.state), np.int64(head.reason)
+    sequence, tick = np.int64(head.sequence), np.int64(head.tick)
     lag = (sequence - tick) & _LOW
-    copy(s.values.ctypes.data, message.ctypes.data + wire.FIRST, size - wire.FIRST - wire.CRC_BYTES)
-    good = wire.undamaged(message, size)
+    copy(s.values.ctypes.data, message.ctypes.data + _FIRST, _WORD * s.first[s.parts])
+    good = is_sealed(message)
     if good:
         if tick != s.tick and s.ticks > 0:
             s.ticks -= 1
@@ -145,25 +144,20 @@ def encode(sender, message, frames):
     counter = sequence % _SEQUENCES | (lag & 1) * _LAG | (s.ticks > 0) * _MARK
     count = 0
     if good and (s.ticks > 0 or s.since >= s.heartbeat):
-        _head(frames[0], s.status_number, s.status_length, s.flags)
-        data = frames[0].data[: s.status_length]
+        _head(frames[0], s, s.parts)
+        data = frames[0].data[: s.length[s.parts]]
         data[:] = 0
         wire.put_number(data, s.status_at[0], s.status_width[0], state)
         wire.put_number(data, s.status_at[1], s.status_width[1], reason)
         wire.put_number(data, s.status_at[2], s.status_width[2], tick)
         data[1] = counter
-        data[0] = wire.crc8(s.status_data_id, data)
+        data[0] = wire.crc8(s.data_id[s.parts], data)
         count, s.since = 1, 0
     s.since += 1
     for k in range(s.parts):
-        a, b = s.first[k], s.first[k + 1]
-        _head(frames[count], s.number[k], s.length[k], s.flags)
+        _head(frames[count], s, k)
         data = frames[count].data[: s.length[k]]
-        data[:] = 0  # also the bytes that carry no value
-        s.saturated += pack_vector(
-            s.values, s.index[a:b], s.start[a:b], s.scale[a:b], s.offset[a:b], s.data_id[k],
-            counter, data,
-        )  # fmt: skip
+        _pack(s, k, counter, data)
         if not good:  # it came here damaged and must arrive damaged
             data[0] ^= 0xFF
         count += 1
@@ -171,26 +165,45 @@ def encode(sender, message, frames):
 
 
 @compiled
-def _head(frame, number, length, flags):
-    frame.id, frame.length, frame.flags = number, length, flags
+def _pack(s, part, counter, data):
+    """Write the values of a part, rounded to counts, into its frame, with the protection."""
+    data[:] = 0  # also the bytes that carry no value
+    for k in range(s.first[part], s.first[part + 1]):
+        nearest = np.rint((s.values[s.index[k]] - s.offset[k]) / s.scale[k])
+        if np.isnan(nearest):
+            count = INVALID
+        elif abs(nearest) > INT16:
+            count = INT16 if nearest > 0 else -INT16
+            s.saturated += 1
+        else:
+            count = int(nearest)
+        wire.put_number(data, s.start[k], 2, count)
+    data[1] = counter
+    data[0] = wire.crc8(s.data_id[part], data)
 
 
 @compiled
-def belongs(receiver, number):
-    """Whether an identifier belongs to this vector or to its sender's status."""
+def _head(frame, s, part):
+    frame.id, frame.length, frame.flags = s.number[part], s.length[part], s.flags
+
+
+@compiled
+def part_of(receiver, number):
+    """Which part of this vector, or its sender's status, has an identifier; NOTHING: none."""
     r = receiver[0]
-    for k in range(r.parts):
+    for k in range(r.parts + 1):
         if r.number[k] == number:
-            return True
-    return number == r.status_number
+            return k
+    return NOTHING
 
 
 @compiled
-def decode(receiver, frame, message):
-    """Take a CAN frame of this vector (see ``belongs``).
+def decode(receiver, part, frame, message):
+    """Take a CAN frame of this vector.
 
     Args:
         receiver: one record of ``receiver_dtype``.
+        part: of the frame, see ``part_of``.
         frame: one record of ``wire.frame_dtype``.
         message: bytes, with room for a frame of the bench, written.
 
@@ -198,15 +211,11 @@ def decode(receiver, frame, message):
         The length of the frame of the bench that it completes, or NOTHING.
     """
     r = receiver[0]
-    part, length, data_id = -1, r.status_length, r.status_data_id
-    for k in range(r.parts):
-        if r.number[k] == frame.id:
-            part, length, data_id = k, r.length[k], r.data_id[k]
     data = frame.data[: frame.length]
-    if len(data) != length or data[0] != wire.crc8(data_id, data):
+    if len(data) != r.length[part] or data[0] != wire.crc8(r.data_id[part], data):
         message[: r.size] = 0  # a CRC of 0 is wrong for it
         return r.size
-    if part < 0:
+    if part == r.parts:
         _take_status(r, data)
         return NOTHING
     return _take_values(r, part, data, message)
@@ -237,10 +246,11 @@ def _take_values(r, part, data, message):
     if counter != r.counter:
         r.incomplete += r.have != 0
         r.counter, r.have = counter, 0
-    a, b = r.first[part], r.first[part + 1]
-    unpack_vector(
-        data, r.index[a:b], r.start[a:b], r.scale[a:b], r.offset[a:b], r.values
-    )  # fmt: skip
+    for k in range(r.first[part], r.first[part + 1]):
+        count = wire.number(data, r.start[k], 2)
+        if count >= 0x8000:
+            count -= 0x10000
+        r.values[r.index[k]] = np.nan if count == INVALID else count * r.scale[k] + r.offset[k]
     r.have |= 1 << part
     if r.have != (1 << r.parts) - 1:
         return NOTHING
@@ -251,15 +261,13 @@ def _take_values(r, part, data, message):
         r.incomplete += 1
         return NOTHING
     r.sequence = max(r.sequence, sequence)
-    wire.put_number(message, 0, wire.STATE, r.head)
-    message[wire.STATE], message[wire.REASON] = r.last[0], r.last[1]
-    wire.put_number(message, wire.SPARE, wire.SEQUENCE - wire.SPARE, 0)
-    wire.put_number(message, wire.SEQUENCE, 4, sequence & _LOW)
-    wire.put_number(message, wire.TICK, 8, sequence - r.lag)  # negative: reads as ≥ 2**63, refused
-    copy(
-        message.ctypes.data + wire.FIRST, r.values.ctypes.data, r.size - wire.FIRST - wire.CRC_BYTES
-    )
-    wire.seal(message, r.size)
+    head = message[:_FIRST].view(header_dtype)[0]
+    store32(message.ctypes.data, np.uint32(r.head))
+    head.state, head.reason, head.spare = r.last[0], r.last[1], 0
+    head.sequence = sequence & _LOW
+    head.tick = sequence - r.lag  # negative: reads as ≥ 2**63, refused
+    copy(message.ctypes.data + _FIRST, r.values.ctypes.data, _WORD * r.first[r.parts])
+    seal(message[: r.size])
     return r.size
 
 

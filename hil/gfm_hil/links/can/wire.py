@@ -9,10 +9,9 @@ import time
 import can
 import numpy as np
 
-from gfm_hil.links.crc import crc32
-from gfm_hil.links.frame import DATA_IDS, buffer, wire_dtype
+from gfm_hil.links.frame import wire_dtype
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import NU_INNER, NY_INNER, Vector, carried
+from gfm_runtime.signals import NU_INNER, NY_INNER
 
 frame_dtype = np.dtype(
     [("id", "u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", (2,)), ("data", "u1", 64)]
@@ -86,26 +85,7 @@ def crc8(data_id, payload):
 
 
 VALUES = max(NY_INNER, NU_INNER)  # of the longest vector
-MOST = wire_dtype(VALUES).itemsize  # bytes of the longest frame
-
-
-def _at(field: str) -> int:
-    fields = wire_dtype(1).fields
-    assert fields is not None
-    return int(fields[field][1])
-
-
-STATE, REASON, SPARE, SEQUENCE, TICK, FIRST = map(
-    _at, ("state", "reason", "spare", "sequence", "tick", "values")
-)
-CRC_BYTES = 4  # at the end
-_HEAD_BYTES = STATE  # magic, version, data id
-
-
-def size_and_head(group: Vector, inner: int) -> tuple[int, int]:
-    """Length and first bytes of a vector's frames, which distinguish them from other messages."""
-    _, message = buffer(len(carried(group, inner)), DATA_IDS[group])
-    return len(message), int.from_bytes(message[:_HEAD_BYTES].tobytes(), "little")
+MOST = wire_dtype(VALUES).itemsize  # bytes of the bench's longest frame
 
 
 @compiled
@@ -122,21 +102,3 @@ def put_number(data, at, width, value):
     """Write the low ``width`` bytes of a number, little-endian."""
     for k in range(width):
         data[at + k] = (value >> (8 * k)) & 0xFF
-
-
-@compiled
-def begins_with(head, message):
-    """Whether a message, long enough, begins with these bytes."""
-    return number(message, 0, _HEAD_BYTES) == head
-
-
-@compiled
-def undamaged(message, size):
-    """Whether the CRC of a frame of ``size`` bytes is right."""
-    return crc32(message, size - CRC_BYTES) == number(message, size - CRC_BYTES, CRC_BYTES)
-
-
-@compiled
-def seal(message, size):
-    """Write the CRC of a frame of ``size`` bytes."""
-    put_number(message, size - CRC_BYTES, CRC_BYTES, np.int64(crc32(message, size - CRC_BYTES)))
