@@ -11,6 +11,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind, LinkOptions
 
 LOOPBACK = "can+udp"  # scheme of endpoints on the loopback bus
+LOOPBACK_PLACES = 4  # of a loopback bus: consecutive UDP ports
 
 
 class CanOptions(LinkOptions):
@@ -37,9 +38,6 @@ class CanOptions(LinkOptions):
     emulate: bool = Field(
         False, description="make a virtual bus as late as one of these bit rates; real time only"
     )
-
-
-_PLACES = 4  # places of a loopback bus: consecutive UDP ports
 
 
 def _open(role: Role, endpoint: str, options: CanOptions) -> Link:
@@ -77,8 +75,8 @@ def _fresh(folder: Path) -> str:
     """A loopback bus on free ports below the kernel's ephemeral range."""
     begin = secrets.randbelow(2500)  # so that two runs that start together take different ports
     for k in range(2500):
-        first = 20_000 + _PLACES * ((begin + k) % 2500)
-        probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(_PLACES)]
+        first = 20_000 + LOOPBACK_PLACES * ((begin + k) % 2500)
+        probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(LOOPBACK_PLACES)]
         try:
             for place, probe in enumerate(probes):
                 probe.bind(("127.0.0.1", first + place))

@@ -28,26 +28,24 @@ _SLOW_BITS = 17 + 3 + 12
 _RUN = [5, 1, 1, 2, 2, 1, 1, 3, 3, 1, 1, 2, 2, 1, 1, 4]
 
 
-def fd_time(length: int, bitrate: float, data_bitrate: float) -> float:
-    """Longest time of a CAN FD frame of ``length`` bytes with BRS, s.
+def frame_time(length: int, fd: bool, bitrate: float, data_bitrate: float) -> float:
+    """Longest time of a classic frame, or of one of CAN FD with BRS, s.
 
-    A stuff bit follows five equal bits and counts as the first of the next five. One that would
-    follow the last data bit is replaced by the CRC field's first fixed one.
+    A stuff bit follows five equal bits and counts as the first of the next five. In CAN FD one that
+    would follow the last data bit is replaced by the CRC field's first fixed one.
 
     Args:
-        length: payload in bytes, one of 0 … 8, 12, 16, 20, 24, 32, 48, 64.
-        bitrate, data_bitrate: bit/s.
+        length: payload in bytes, one of ``PAYLOADS``.
+        fd: CAN FD rather than classic.
+        bitrate, data_bitrate: bit/s; a classic frame has the first alone.
     """
+    if not fd:
+        return _CLASSIC_BITS[length] / bitrate
     data = 8 * length
     stuffed = max(0, _RUN[PAYLOADS.index(length)] + data - 2) // 4
     checked = 4 + (17 if length <= 16 else 21)  # stuff count and CRC, with a stuff bit every 4 bits
     fast = 5 + data + stuffed + checked + 1 + checked // 4 + 1  # ESI and DLC; the CRC delimiter
     return _SLOW_BITS / bitrate + fast / data_bitrate
-
-
-def frame_time(length: int, fd: bool, bitrate: float, data_bitrate: float) -> float:
-    """Longest time of a frame with ``length`` bytes on CAN FD or classic CAN, s."""
-    return fd_time(length, bitrate, data_bitrate) if fd else _CLASSIC_BITS[length] / bitrate
 
 
 @dataclass(frozen=True)

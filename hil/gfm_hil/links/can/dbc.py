@@ -18,7 +18,7 @@ from cantools.database.can.formats.dbc.dbc_attribute_definition import DbcAttrib
 from cantools.database.can.formats.dbc.dbc_specifics import DbcSpecifics
 from cantools.database.conversion import BaseConversion
 
-from gfm_hil.core.roles import Role
+from gfm_hil.core.roles import OTHER, ROLES, Role
 from gfm_runtime.signals import Signal as Row
 from gfm_runtime.signals import Vector, carried_rows, table_hash
 from gfm_runtime.states import REASONS, STATES
@@ -39,7 +39,7 @@ _IDS = {"PlantStatus": 0x100, "ControllerStatus": 0x101, "Commands": 0x110, "Com
         "Measurements": 0x120, "MeasurementsInner": 0x128, "PlantTransport": 0x700,
         "ControllerTransport": 0x701}  # fmt: skip
 PAYLOADS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # bytes of a frame; the index is the DLC
-_NODES = {"plant": "Plant", "controller": "Controller"}
+_NODES: dict[Role, str] = {"plant": "Plant", "controller": "Controller"}
 
 
 def offset(row: Row) -> float:
@@ -106,17 +106,16 @@ def _status() -> list[Signal]:
 def write_dbc(fd: bool) -> str:
     """The text of the DBC file for CAN FD, or for classic CAN."""
     frames: list[tuple[str, int, int, list[Signal], Role]] = []
-    for role in ("plant", "controller"):
+    for role in ROLES:
         frames.append((STATUS[role], _IDS[STATUS[role]], 8, _status(), role))
         frames.append((TRANSPORT[role], _IDS[TRANSPORT[role]], 64 if fd else 8, [], role))
     for name, role in SENDERS.items():
         for inner in (False, True):
             frames += [(*frame, role) for frame in _vector(name, inner, fd)]
-    other = {"plant": "Controller", "controller": "Plant"}
     messages = []
     for title, number, length, signals, role in sorted(frames, key=lambda f: f[1]):
         for signal in signals:
-            signal.receivers = [other[role]]
+            signal.receivers = [_NODES[OTHER[role]]]
         messages.append(Message(number, title, length, signals, senders=[_NODES[role]], is_fd=fd))
     database = Database(
         messages,

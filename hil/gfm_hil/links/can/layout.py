@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from cantools.database.can import Database, Message
@@ -42,7 +41,7 @@ class Layout:
     name: str
     number: int
     length: int
-    dtype: np.dtype  # a record with one field per signal
+    signals: dict[str, tuple[int, int]]  # first byte and number of bytes of each
     data_id: int  # 16 bits of a hash over the whole definition
     # the elements of the vector that it carries, records of ``VALUE``; none in other frames
     values: np.ndarray
@@ -75,34 +74,23 @@ def _digest(text: str, size: int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:size], "little")
 
 
-def dtype_of(message: Message) -> np.dtype:
-    """A record with the layout of the DBC. Raises ValueError: a signal is not made of whole bytes,
-    little-endian."""
+def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
+    """The layout of a frame. Raises ValueError: a signal is not made of whole bytes, little-endian,
+    or a value of the vector not of two, with a sign."""
+    values = []
     for s in message.signals:
         if s.start % 8 or s.length not in (8, 16, 32) or s.byte_order != "little_endian":
             raise ValueError(
                 f"{message.name}.{s.name}: must be 1, 2 or 4 whole bytes, little-endian"
             )
-    parts: Any = {
-        "names": [s.name for s in message.signals],
-        "formats": [f"<{'i' if s.is_signed else 'u'}{s.length // 8}" for s in message.signals],
-        "offsets": [s.start // 8 for s in message.signals],
-        "itemsize": message.length,
-    }
-    return np.dtype(parts)
-
-
-def _layout(message: Message, vector: tuple[str, ...] = ()) -> Layout:
-    dtype = dtype_of(message)
-    values = []
-    for s in message.signals:
         if s.name in vector:
-            if dtype[s.name] != np.dtype("<i2"):
+            if s.length != 16 or not s.is_signed:
                 raise ValueError(f"{message.name}.{s.name}: must be a signed 16-bit value")
             values.append((vector.index(s.name), s.start // 8, float(s.scale), float(s.offset)))
+    signals = {s.name: (s.start // 8, s.length // 8) for s in message.signals}
     return Layout(
-        message.name, message.frame_id, message.length, dtype, _digest(_definition(message), 2),
-        np.array(sorted(values), VALUE),
+        message.name, message.frame_id, message.length, signals,
+        _digest(_definition(message), 2), np.array(sorted(values), VALUE),
     )  # fmt: skip
 
 
@@ -137,8 +125,7 @@ def plan_of(database: Database, inner: int = False) -> Plan:
         inner,
     )
     for layout in [*vectors["y"], *vectors["u"], *plan.status.values()]:
-        fields: Any = layout.dtype.fields
-        if [fields.get(name, (None, -1))[1] for name in (CRC, COUNTER)] != [0, 1]:
+        if [layout.signals.get(name, (-1,))[0] for name in (CRC, COUNTER)] != [0, 1]:
             raise ValueError(f"{layout.name}: must begin with {CRC} and {COUNTER}")
     return plan
 

@@ -16,10 +16,10 @@ from typing import Any
 import can
 import numpy as np
 
+from gfm_hil.links.can import LOOPBACK_PLACES
 from gfm_hil.links.can.sockets import FULL, LOOPBACK, set_socket, socket_dtype, write_frame
 from gfm_hil.links.can.wire import frame_dtype, pack, unpack
 
-NODES = 4
 _HOST = "127.0.0.1"
 _BUFFER = 1 << 20  # bytes; the kernel may grant fewer
 
@@ -41,8 +41,8 @@ class LoopbackBus(can.BusABC):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        own = self._bind(first, reversed(range(NODES)) if place is None else [place])
-        self._others = [_connect(first + k) for k in range(NODES) if k != own]
+        own = self._bind(first, reversed(range(LOOPBACK_PLACES)) if place is None else [place])
+        self._others = [_connect(first + k) for k in range(LOOPBACK_PLACES) if k != own]
         self.record = np.zeros(1, socket_dtype)
         set_socket(self.record, LOOPBACK, self.fileno(), [other.fileno() for other in self._others])
         self._frame = np.zeros(1, frame_dtype)

@@ -39,7 +39,7 @@ from gfm_hil.links.can.wire import BUS_OFF, ERROR, frame_dtype
 from gfm_hil.links.port import Port, free_port_function
 from gfm_hil.links.system import poll
 from gfm_hil.realtime.clock import now_ns
-from gfm_runtime.compiled import compiled, expanded
+from gfm_runtime.compiled import compiled, expanded, inlined
 
 #: no message; the bus is lost, see ``lost``; a frame of the handshake came, in ``into``
 NOTHING, LOST, TRANSPORT = -1, -2, -3
@@ -150,17 +150,21 @@ def send(handle, message):
     return sent
 
 
+@inlined
+def _read(handle, frame):
+    """Whether the socket has a frame, which is then read; if it is lost, ``lost`` says why."""
+    came = read_frame(_sockets(handle), frame)
+    if came < 0:
+        _state(handle)[0].lost = -came
+    return came > 0
+
+
 @compiled
 def fetch(handle):
     """Read the frames that the socket has; returns whether one is ready to be processed."""
     bus, places, into = _bus(handle), _places(handle), _into(handle)
     # an emulated bus needs every frame's time of arrival: read them all now
-    while has_room(bus) and (bus[0].emulate or bus[0].through == 0):
-        came = read_frame(_sockets(handle), into)
-        if came < 0:
-            _state(handle)[0].lost = -came
-        if came <= 0:
-            break
+    while has_room(bus) and (bus[0].emulate or bus[0].through == 0) and _read(handle, into):
         arrive(bus, places, into, 1, now_ns() if bus[0].emulate else 0)
     return is_through(bus, places, now_ns() if bus[0].emulate else 0)
 
@@ -174,10 +178,7 @@ def _take_frame(handle, frame):
         if there:
             deliver(bus, _places(handle), frame)
         return there
-    came = read_frame(_sockets(handle), frame)
-    if came < 0:
-        _state(handle)[0].lost = -came
-    return came > 0
+    return _read(handle, frame)
 
 
 @compiled

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from gfm_hil.links.can import LOOPBACK_PLACES
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
 from gfm_hil.links.system import NONE_NOW, errno_now, pollfd
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import compiled
 
 SOCKETCAN, LOOPBACK = range(2)
-_OTHERS = 3  # places of a loopback bus besides our own
+_OTHERS = LOOPBACK_PLACES - 1  # besides our own
 _RECHECK_NS = 50_000_000  # how long to skip a place that was empty
 
 socket_dtype = np.dtype(

@@ -107,10 +107,7 @@ def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
         for name, _ in VALUE:
             r[name][done:end] = part.values[name]
         done = r["first"][k + 1] = end
-    fields = status.dtype.fields
-    assert fields is not None
-    r["status_at"] = [fields[name][1] for name in _STATUS]
-    r["status_width"] = [fields[name][0].itemsize for name in _STATUS]
+    r["status_at"], r["status_width"] = zip(*(status.signals[n] for n in _STATUS), strict=True)
 
 
 @compiled
