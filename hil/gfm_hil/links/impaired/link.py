@@ -8,13 +8,12 @@ from llvmlite import ir
 from numba import carray, types  # type: ignore[attr-defined]
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.links.base import Link
+from gfm_hil.links.base import LONGEST, Link
 from gfm_hil.links.impaired import Impairment
 from gfm_hil.links.impaired.stage import (
     COUNTED,
     INNER,
     INNER_WORDS,
-    LONGEST,
     REFUSED,
     admit,
     make_stage,

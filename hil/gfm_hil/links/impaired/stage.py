@@ -8,7 +8,9 @@ every link, in Python and in compiled loops.
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.links.base import LONGEST
 from gfm_hil.links.impaired import Impairment
+from gfm_hil.realtime.atomics import copy
 from gfm_hil.realtime.clock import end_this_process, now_ns
 from gfm_runtime.compiled import cached
 
@@ -21,10 +23,9 @@ COUNTED = {"seen": SEEN, "lost": LOST, "corrupted": CORRUPTED, "duplicated": DUP
            "refused": REFUSED}  # fmt: skip
 _QUEUE = 26
 
-PLACES, _WORDS = 64, 64  # messages in the queue; words of 8 bytes in each
+PLACES, _WORD = 64, 8  # messages in the queue; bytes
 _DUE, _KEY, _SIZE, _DATA = range(4)  # of one place: ns, order, bytes (0: free), message
-_PLACE = _DATA + _WORDS
-LONGEST = 8 * _WORDS
+_PLACE = _DATA + LONGEST // _WORD
 
 _ONE = 1 << 32  # probability 1
 _LONG = 1_000_000_000  # ns: longest time that a frame waits for the next one to overtake it
@@ -67,15 +68,12 @@ def _draw(h):
 def _keep(h, message, size, due, key):
     """Copy a message into a free place of the queue; if there is none, count it as dropped and
     return -1."""
+    to, origin = h.ctypes.data, message.ctypes.data  # in a branch numba would count references
     for n in range(PLACES):
         at = _QUEUE + n * _PLACE
         if h[at + _SIZE] == 0:
             h[at + _DUE], h[at + _KEY], h[at + _SIZE] = due, key, size
-            for word in range((size + 7) // 8):
-                value = np.uint64(0)
-                for k in range(8 * word, min(8 * word + 8, size)):
-                    value |= np.uint64(message[k]) << np.uint64(8 * (k % 8))
-                h[at + _DATA + word] = np.int64(value)
+            copy(to + _WORD * (at + _DATA), origin, size)
             return at
     h[DROPPED] += 1
     return -1
@@ -159,15 +157,13 @@ def admit(h, message, size):
 @cached
 def release(h, message):
     """Write the next message that is due to ``message``; returns its length in bytes, or 0."""
+    to, origin = message.ctypes.data, h.ctypes.data
     best = -1
     now = now_ns()
     for n in range(PLACES):
         at = _QUEUE + n * _PLACE
-        if (
-            h[at + _SIZE] > 0
-            and h[at + _DUE] <= now
-            and (best < 0 or h[at + _KEY] < h[best + _KEY])
-        ):
+        due = h[at + _SIZE] > 0 and h[at + _DUE] <= now
+        if due and (best < 0 or h[at + _KEY] < h[best + _KEY]):
             best = at
     if best < 0:
         return 0
@@ -176,6 +172,5 @@ def release(h, message):
     if h[_HELD] == best:  # no frame arrived to overtake it
         h[_HELD] = 0
         h[REORDERED] -= 1
-    for k in range(min(size, len(message))):
-        message[k] = (np.uint64(h[best + _DATA + k // 8]) >> np.uint64(8 * (k % 8))) & 0xFF
+    copy(to, origin + _WORD * (best + _DATA), min(size, len(message)))
     return size

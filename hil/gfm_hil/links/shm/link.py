@@ -49,10 +49,10 @@ class ShmLink:
         return self._message[:size].tobytes() if size else None
 
     def wait(self, seconds: float) -> bool:
-        def arrived() -> bool:
+        def has_message() -> bool:
             return self._there() and bool(ring.waiting(self._handle))
 
-        return wait_until(arrived, time.monotonic() + seconds, _FIRST_S, _LONGEST_S)
+        return wait_until(has_message, time.monotonic() + seconds, _FIRST_S, _LONGEST_S)
 
     def close(self) -> None:
         """Release the memory; a peer that has joined can still read the last messages."""
