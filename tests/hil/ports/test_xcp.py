@@ -264,7 +264,7 @@ def test_on_a_can_bus_a_frame_is_a_packet(run, tmp_path):
         assert ask(b"\xfd", arbitration_id=0x200) == b""  # of others on the bus
     file = tmp_path / "can.a2l"
     memory = Memory(run, LAWS, False, lambda: 100)
-    file.write_text(memory.a2l("bench", xcp_section(line, 1000, ["UPLOAD"])))
+    file.write_text(memory.a2l("bench", xcp_section(line)))
     shown = subprocess.run(
         [A2LTOOL, file, "--strict", "--show-xcp"], check=True, capture_output=True, text=True
     ).stdout.lower()

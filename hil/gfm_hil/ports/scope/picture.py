@@ -39,10 +39,14 @@ _AUTO_S = 0.5  # or a picture's length, if longer: without an edge, AUTO then sh
 IDLE, ARMED, FILLING, AUTO, HELD = range(5)
 
 
-class Trigger(BaseModel):
-    """The trigger condition and mode."""
+class PageMessage(BaseModel):
+    """What a page sends, or a part of it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Trigger(PageMessage):
+    """The trigger condition and mode."""
 
     channel: str = Field(max_length=40)
     level: float = Field(ge=-1e9, le=1e9)
@@ -115,10 +119,8 @@ class Acquisition:
 ChannelName = Annotated[str, Field(max_length=40)]
 
 
-class PictureRequest(BaseModel):
+class PictureRequest(PageMessage):
     """A page's request for pictures."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Literal["look"]
     id: int = Field(ge=0, lt=2**53)  # a frame carries it as float64
@@ -142,11 +144,8 @@ class ScopePicture:
     """
 
     def __init__(self, pyramid: Pyramid, request: PictureRequest, head: int) -> None:
-        for name in [
-            *request.channels,
-            *request.watched,
-            *([request.trigger.channel] if request.trigger else []),
-        ]:
+        triggers = [request.trigger.channel] if request.trigger else []
+        for name in (*request.channels, *request.watched, *triggers):
             if name not in pyramid:
                 raise ValueError(f"channel = {name!r}: unknown")
         self._pyramid, self._request = pyramid, request

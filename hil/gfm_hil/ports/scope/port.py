@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from gfm_hil.core.errors import UserError
+from gfm_hil.core.identity import address
 from gfm_hil.ports.port import BesideRun, OperatorPort, make_tls, say
 
 _OPERATOR = "operator"  # who has the address with control if no names are given
@@ -46,22 +47,19 @@ class ScopePort(OperatorPort):
         from gfm_hil.ports.scope.recording import open_recording
         from gfm_hil.ports.scope.server import Scope
         from gfm_hil.ports.scope.session import Access
-        from gfm_hil.recording.run import converters_of
 
         run.wait(commands=False)
         access = Access(
             [*options.name, options.host], dict.fromkeys(options.operator or [_OPERATOR])
         )
-        places = [run.folder / name for name in converters_of(run.folder)] or [run.folder]
-        scope = Scope([open_recording(place) for place in places], access)
+        scope = Scope([open_recording(place) for place in run.places.values()], access)
 
         def ready(port: int) -> None:
-            host = f"[{options.host}]" if ":" in options.host else options.host
-            address = f"http{'s' if self.tls else ''}://{host}:{port}/"
-            say(f"scope, to look: {address}")
+            where = f"http{'s' if self.tls else ''}://{address((options.host, port))}/"
+            say(f"scope, to look: {where}")
             for name, token in access.tokens.items():
                 whose = "" if name == _OPERATOR else f" ({name})"
-                say(f"with control{whose}:   {address}#token={token}")
+                say(f"with control{whose}:   {where}#token={token}")
 
         ports = [self.number, 0] if options.port is None else [options.port]
         run.serve_until(scope.serve(options.host, ports, self.tls, ready), lambda: run.interrupted)

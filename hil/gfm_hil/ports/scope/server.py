@@ -4,8 +4,6 @@ import asyncio
 import contextlib
 import http
 import logging
-import os
-import socket
 import ssl
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -199,10 +197,8 @@ def _listen(host: str, ports: list[int]) -> Listener:
     for port in ports:
         try:
             return Listener(host, port, WAITING, HALF_OPEN_S, HALF_OPEN_S)
-        except socket.gaierror as problem:
-            reason = problem.strerror
         except OSError as problem:
-            reason = os.strerror(problem.errno) if problem.errno else str(problem)
+            reason = problem.strerror or str(problem)
     raise UserError(f"--host {host} --port {ports[0]}: {reason}")
 
 

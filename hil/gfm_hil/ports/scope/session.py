@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.identity import Identity, address
 from gfm_hil.core.rate import Rate
-from gfm_hil.ports.scope.picture import PictureRequest, ScopePicture
+from gfm_hil.ports.scope.picture import PageMessage, PictureRequest, ScopePicture
 from gfm_hil.ports.scope.pyramid import Pyramid
 
 #: carries out an event and returns its tick; raises UserError with the reason of a refusal
@@ -101,18 +101,14 @@ def in_words(kind: str, **content: Any) -> str:
     return json.dumps({"kind": kind, **content})
 
 
-class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Hello(_Message):
+class Hello(PageMessage):
     """The first message; with a valid token the page may control."""
 
     kind: Literal["hello"]
     token: str = Field(max_length=200)
 
 
-class Play(_Message):
+class Play(PageMessage):
     """Replay a finished run from ``start`` [s] at ``speed`` times real time; without a speed show
     all of it again."""
 
@@ -121,7 +117,7 @@ class Play(_Message):
     speed: float = Field(0.0, ge=0, le=100)
 
 
-class Command(_Message):
+class Command(PageMessage):
     """An event that the run shall carry out."""
 
     kind: Literal["command", "tell"]  # the latter for one version

@@ -1,7 +1,4 @@
-"""Streams a run's recording while it grows: to PlotJuggler, to our own tools, to Prometheus.
-
-A separate process reads the files to which the loop appends, and does not disturb the loop.
-"""
+"""Streams a run's recording while it grows: to PlotJuggler, to our own tools, to Prometheus."""
 
 from gfm_hil.ports.streams.messages import BlockReader, TickBlock
 

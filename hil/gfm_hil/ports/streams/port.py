@@ -12,6 +12,7 @@ from pathlib import Path
 import zmq
 
 from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.identity import address
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.supervised import attempt
 from gfm_hil.engine.announcement import not_running
@@ -150,7 +151,7 @@ def _bind(
     socket.set(zmq.MAXMSGSIZE, _LONGEST)
     socket.set(zmq.RCVHWM, _WAITING)
     socket.set(zmq.SNDHWM, ROOM)
-    where = f"tcp://{f'[{host}]' if ':' in host else host}:{port or '*'}"
+    where = f"tcp://{address((host, port or '*'))}"
     try:
         socket.set(zmq.IPV6, int(":" in host))
         socket.bind(where)

@@ -5,7 +5,6 @@ import contextlib
 import select
 import socket
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,7 +18,7 @@ from gfm_hil.ports.xcp.memory import Memory
 from gfm_hil.ports.xcp.slave import MOST, Slave
 
 _ANSWER_S = 0.1
-_TIMEOUT_MS = 7000  # T1: a command to the run may take six seconds
+_TIMEOUT_MS = 7000  # T1 and T2: a command to the run may take six seconds
 _COMMANDS = (
     "GET_COMM_MODE_INFO", "GET_ID", "SET_MTA", "UPLOAD", "SHORT_UPLOAD", "DOWNLOAD",
     "SHORT_DOWNLOAD",
@@ -153,14 +152,14 @@ class CanFd:
         )  # fmt: skip
 
 
-def xcp_section(line: Udp | CanFd, timeout_ms: int, commands: Sequence[str]) -> list[str]:
-    """The A2L file's section on XCP: T1 and T2, ms, and the optional commands that there are."""
+def xcp_section(line: Udp | CanFd) -> list[str]:
+    """The A2L file's section on XCP: T1 and T2, and the optional commands that there are."""
     return [
         "/begin IF_DATA XCP",
         "  /begin PROTOCOL_LAYER",
-        f"    0x0100 {timeout_ms} {timeout_ms} 0 0 0 0 0 {line.most} {line.most}",
+        f"    0x0100 {_TIMEOUT_MS} {_TIMEOUT_MS} 0 0 0 0 0 {line.most} {line.most}",
         "    BYTE_ORDER_MSB_LAST ADDRESS_GRANULARITY_BYTE",
-        *(f"    OPTIONAL_CMD {name}" for name in commands),
+        *(f"    OPTIONAL_CMD {name}" for name in _COMMANDS),
         "  /end PROTOCOL_LAYER",
         *line.if_data(),
         "/end IF_DATA",
@@ -216,7 +215,7 @@ class XcpPort(OperatorPort):
         )
 
         def a2l() -> str:
-            return memory.a2l("bench", xcp_section(self.line, _TIMEOUT_MS, _COMMANDS))
+            return memory.a2l("bench", xcp_section(self.line))
 
         if options.a2l is not None:
             write_text(options.a2l, a2l())
