@@ -5,7 +5,7 @@ from __future__ import annotations
 from gfm_hil.core.terminal import markdown
 from gfm_hil.ports.modbus.device import Device
 from gfm_hil.ports.modbus.image import SunSpecPoint, definition
-from gfm_hil.ports.modbus.measures import RunState, Slack
+from gfm_hil.ports.modbus.measures import SLACK_POINTS, RunState
 from gfm_hil.ports.modbus.points import LawDroops
 from gfm_hil.recording.columns import CONTROLLER_COLUMNS, PLANT_COLUMNS
 from gfm_hil.scenario import load_scenario
@@ -52,7 +52,7 @@ def _device() -> Device:
     device = Device(
         load_scenario("pref_step"), _LAWS, lambda: view, lambda event: None, 5000, lambda: 0.0
     )
-    device.slack = Slack(1.0, 1.0, 1.0, 1.0)
+    device.slack = dict.fromkeys(SLACK_POINTS, 1.0)
     device.refresh()
     return device
 

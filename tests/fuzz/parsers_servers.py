@@ -95,7 +95,7 @@ def _modbus(place: Path) -> Iterator[Take]:
     async def action(
         code: int, first: int, at: int, count: int, registers: list[int], written: Any
     ) -> Any:
-        refused = await device.access(code, at, written)
+        refused = await device.access(at, written)
         registers[: len(device.image.registers)] = device.image.registers
         if written is not None:
             written[:] = device.image.registers[at - first : at - first + count]

@@ -58,7 +58,7 @@ class Bench:
         """One request with these points, which must be adjacent."""
         points = [(self.device.image.points[path], value) for path, value in wanted]
         registers = [r for point, value in points for r in point.encode(value)]
-        return asyncio.run(self.device.access(16, points[0][0].address, registers))
+        return asyncio.run(self.device.access(points[0][0].address, registers))
 
     def read(self, path: str):
         self.device.refresh()

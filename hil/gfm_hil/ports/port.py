@@ -45,6 +45,15 @@ class Refusal(Exception):
         self.code = code
 
 
+@contextlib.contextmanager
+def refusing(code: int, error: type[Exception]) -> Iterator[None]:
+    """Make a refusal, with a code of the protocol, of an error that is raised in this context."""
+    try:
+        yield
+    except error as problem:
+        raise Refusal(code, str(problem)) from None
+
+
 class BesideRun:
     """The run that a port serves; a context manager.
 

@@ -316,6 +316,6 @@ def test_no_write_cuts_a_point_in_two():
     bench = Bench()
     at = bench.device.image.points["704.WSet"].address
     for first, registers in ((at, [1]), (at + 1, [1]), (at - 1, [1, 0])):
-        found = asyncio.run(bench.device.access(16, first, registers))
+        found = asyncio.run(bench.device.access(first, registers))
         assert found == ExcCodes.ILLEGAL_ADDRESS
     assert bench.told == []

@@ -6,7 +6,7 @@ out one request at a time; clients can read meanwhile.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ from gfm_hil.core.identity import Identity
 from gfm_hil.core.rate import Rate
 from gfm_hil.ports.modbus.grid_forming import GridForming
 from gfm_hil.ports.modbus.image import VENDOR, Image, SunSpecPoint, Value
-from gfm_hil.ports.modbus.measures import Measures, RunState, Slack
+from gfm_hil.ports.modbus.measures import Measures, RunState
 from gfm_hil.ports.modbus.points import (
     ActiveLaw,
     Direct,
@@ -31,7 +31,7 @@ from gfm_hil.ports.modbus.points import (
     SetPoint,
     VoltVar,
 )
-from gfm_hil.ports.port import Refusal
+from gfm_hil.ports.port import Refusal, refusing
 from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
 
@@ -74,6 +74,7 @@ class Device:
 
     Attributes:
         local: the bench commands; clients are refused.
+        slack: as ``Watcher.slack`` returned it last.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class Device:
         self._was_safe = False
         self._beats, self._seen, self._second = 0, -1, 0
         self._fresh = -1  # the device's tick at the last refresh
-        self.slack = Slack()
+        self.slack: Mapping[str, float] = {}
         self.local = False
         self.refresh()
 
@@ -165,15 +166,11 @@ class Device:
                 else:
                     self.refresh()
 
-    async def access(
-        self, code: int, address: int, written: Sequence[Any] | None
-    ) -> ExcCodes | None:
+    async def access(self, address: int, written: Sequence[Any] | None) -> ExcCodes | None:
         """Process a request from pymodbus; None: pymodbus answers it from the image.
 
         Raises nothing: a refused request changes nothing; the vendor model shows the reason.
         """
-        if code not in (READ, WRITE_ONE, WRITE_MANY):
-            return ExcCodes.ILLEGAL_FUNCTION
         if written is None:
             if int(self._elapsed_s() / TICK_S) != self._fresh:
                 self.refresh()
@@ -200,17 +197,15 @@ class Device:
                 raise Refusal(ExcCodes.DEVICE_FAILURE, "the run has not begun")
             plans = self._plans(points, run)
             _count(plans)
-            try:
+            with refusing(ExcCodes.DEVICE_FAILURE, UserError):
                 await self._carry_out(plans)
-            except UserError as problem:
-                raise Refusal(ExcCodes.DEVICE_FAILURE, str(problem)) from None
         self.refresh()
 
     def _plans(
         self, points: Sequence[tuple[SunSpecPoint, Sequence[int]]], run: RunState
     ) -> list[Effect]:
         by_group: dict[PointGroup, dict[str, Value]] = {}
-        try:
+        with refusing(ExcCodes.ILLEGAL_VALUE, ValueError):
             for point, part in points:
                 value = point.decode(part)
                 if value is None:
@@ -219,8 +214,6 @@ class Device:
                 by_group.setdefault(self._owner[point.path], {})[point.path] = value
             now = self._elapsed_s()
             return [group.plan(values, run, now) for group, values in by_group.items()]
-        except ValueError as problem:
-            raise Refusal(ExcCodes.ILLEGAL_VALUE, str(problem)) from None
 
     async def _carry_out(self, plans: Sequence[Effect]) -> None:
         """Send the run every command, then store the new state; raises UserError if the run
@@ -249,7 +242,5 @@ def _count(plans: Sequence[Effect]) -> None:
     kinds = [event["type"] for plan in plans for event in plan.events]
     if client is None or not kinds or "stop" in kinds:
         return
-    try:
+    with refusing(ExcCodes.DEVICE_BUSY, UserError):
         client.rate.take()
-    except UserError as problem:
-        raise Refusal(ExcCodes.DEVICE_BUSY, str(problem)) from None

@@ -23,14 +23,9 @@ _NAMES_S = 0.1  # how old names and gains may be
 _WINDOW_S = 1.0  # window of the slack
 
 
-@dataclass(frozen=True)
-class Slack:
-    """Time left when u[k] arrived at the plant before tick k + 1, µs; NaN without deadlines."""
-
-    p50: float = math.nan
-    p1: float = math.nan
-    p01: float = math.nan
-    least: float = math.nan
+#: percentiles of the slack, the time left when u[k] arrived before tick k + 1, by the points of the
+#: vendor model that show them, µs
+SLACK_POINTS = {"SlkP50": 50, "SlkP1": 1, "SlkP01": 0.1, "SlkMin": 0}
 
 
 @dataclass(frozen=True)
@@ -91,13 +86,12 @@ class Watcher:
         """Make the next ``look`` read the names again, after a command."""
         self._asked = -math.inf
 
-    def slack(self) -> Slack:
-        """The slack over the last second of ticks; u[k] is due when tick k + 1 begins."""
+    def slack(self) -> dict[str, float]:
+        """The slack over the last second of ticks by ``SLACK_POINTS``; empty without deadlines."""
         done = self._run.done("plant")
-        if not done:
-            return Slack()
-        left = SLACK.spread(self._run.columns, self._T_s, max(done - self._window, 0), done)
-        return Slack(*(left.percentile(q) * 1e-3 for q in (50, 1, 0.1, 0))) if left else Slack()
+        first = max(done - self._window, 0)
+        left = SLACK.spread(self._run.columns, self._T_s, first, done) if done else None
+        return {name: left.percentile(q) * 1e-3 for name, q in SLACK_POINTS.items()} if left else {}
 
 
 _GRID_FORMING = 1 << 1  # bits of 701.DERMode, 702.CtrlModes, 702.IntIslandCat
@@ -197,11 +191,12 @@ class Measures:
         return found
 
     def now(
-        self, run: RunState, slack: Slack, beats: int, heart_lost: bool, local: bool
+        self, run: RunState, slack: Mapping[str, float], beats: int, heart_lost: bool, local: bool
     ) -> dict[str, Value]:
         """The points that change with the run.
 
         Args:
+            slack: by ``SLACK_POINTS``, as far as it is known.
             beats: number of seconds in which the run advanced.
             heart_lost: the client's heartbeat is missing.
             local: remote control is refused.
@@ -238,10 +233,7 @@ class Measures:
             f"{VENDOR}.QRef": run.references["Q_ref"],
             f"{VENDOR}.Tick": float(run.tick),
             f"{VENDOR}.Miss": float(run.misses),
-            f"{VENDOR}.SlkP50": slack.p50,
-            f"{VENDOR}.SlkP1": slack.p1,
-            f"{VENDOR}.SlkP01": slack.p01,
-            f"{VENDOR}.SlkMin": slack.least,
+            **{f"{VENDOR}.{name}": slack.get(name) for name in SLACK_POINTS},
             f"{VENDOR}.SafeRsn": run.reason,
         }
 

@@ -187,7 +187,7 @@ def _registers(device: Device) -> SimDevice:
     async def action(
         code: int, first: int, at: int, count: int, registers: list[int], written: Any
     ) -> ExcCodes | None:
-        refused = await device.access(code, at, written)
+        refused = await device.access(at, written)
         image = device.image.registers
         registers[: len(image)] = image
         if written is not None:  # pymodbus writes them to its registers

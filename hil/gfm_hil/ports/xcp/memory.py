@@ -24,7 +24,7 @@ from typing import Any
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
-from gfm_hil.ports.port import Refusal
+from gfm_hil.ports.port import Refusal, refusing
 from gfm_hil.recording.columns import describe, signals_of
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
@@ -180,17 +180,15 @@ class Memory:
         event = self._event(kind, given)
         if event is None:
             return
-        try:
+        with refusing(ACCESS_DENIED, UserError):
             tick = self._operator.command(event, by)["tick"]
-        except UserError as problem:
-            raise Refusal(ACCESS_DENIED, str(problem)) from None
         until = time.monotonic() + _RECORDED_S
         while self._recorded() <= tick and time.monotonic() < until:
             time.sleep(1e-3)  # tools read back what they have written
 
     def _event(self, kind: str, given: dict[str, float]) -> dict[str, Any] | None:
         """The command of a write, or None if it changes nothing."""
-        try:
+        with refusing(OUT_OF_RANGE, ValueError):
             if not all(map(math.isfinite, given.values())):
                 raise ValueError(f"{given}: must be finite")
             if kind == _A_REFERENCE:
@@ -202,16 +200,12 @@ class Memory:
                 if number not in range(len(self._laws)):
                     raise ValueError(f"law {number:g}: must be one of 0 to {len(self._laws) - 1}")
                 return {"type": "law", "law": self._laws[int(number)]}
-        except ValueError as problem:
-            raise Refusal(OUT_OF_RANGE, str(problem)) from None
         now = self._now()
         if now.get("active") != kind:
             raise Refusal(ACCESS_DENIED, f"{kind}: is not the law in force")
         values = {n: v for n, v in given.items() if v != self._gain(kind, n, now)}
-        try:
+        with refusing(OUT_OF_RANGE, LawError):
             build_law(self._files[kind], tied(self._files[kind], {**now["gains"], **values}))
-        except LawError as problem:
-            raise Refusal(OUT_OF_RANGE, str(problem)) from None
         return {"type": "gains", "values": values} if values else None
 
     def _at(self, address: int) -> _Number:
@@ -221,7 +215,5 @@ class Memory:
         return cell
 
     def _now(self) -> dict[str, Any]:
-        try:
+        with refusing(NOT_NOW, UserError):
             return self._operator.snapshot()
-        except UserError as problem:
-            raise Refusal(NOT_NOW, str(problem)) from None
