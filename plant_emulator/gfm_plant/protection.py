@@ -8,8 +8,6 @@ exact to their rounding, so that nothing drifts.
 
 import math
 
-import numpy as np
-
 from gfm_plant.layout import field
 from gfm_plant.names import (
     BAD_COMMAND,
@@ -178,6 +176,8 @@ def _watch(plant: PlantRecords, k: int, what: int, value: float, sign: float) ->
         return
     # The tick that first sees a crossing starts the time.
     if s.crossed[what] >= r.trip_ticks[what]:
+        if s.trip == 0:
+            s.tripped_by = what
         trip(plant, k, what + 1 if what < N_TRIPS else OVERLOAD, value)
     s.crossed[what] += 1
 
@@ -215,9 +215,7 @@ def trip_reason(plant: PlantRecords, k: int = 0) -> str:
     if code == CONTROLLER:
         return _BLOCKED[value]
     if code == OVERLOAD:
-        ticks = r["trip_ticks"][N_TRIPS:]
-        step = np.flatnonzero((ticks >= 0) & (s["crossed"][N_TRIPS:] > ticks))[0]
-        what, quantity, sign = N_TRIPS + int(step), "RMS of i over a cycle", +1
+        what, quantity, sign = int(s["tripped_by"]), "RMS of i over a cycle", +1
     else:
         what = code - 1
         _, quantity, sign = TRIPS[what]

@@ -177,6 +177,7 @@ converter_state_dtype = np.dtype(
         ("trip", "i8"),  # a key of `protection.TRIP_REASONS`, 0: none
         ("trip_tick", "i8"),
         ("trip_value", "f8"),
+        ("tripped_by", "i8"),  # place of its threshold in trip_limit, of a protection
         # of a bridge that is to start again, see `protection.start_condition`; the speed of the
         # capacitor's voltage that a blocked one sees
         ("waits", "i8"),

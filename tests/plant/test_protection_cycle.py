@@ -85,7 +85,7 @@ def test_each_step_of_the_profile_has_its_own_time():
     short = np.concatenate([np.full(1000, 1.0), np.full(350, 2.5), np.full(8000, 1.5)])
     *_, trip, _ = shown(short, overload=PROFILE)  # 35 ms of 2.5 p.u.
     assert not trip.any()
-    between = np.concatenate([np.full(1000, 1.0), np.full(8000, 1.8)])
+    between = np.concatenate([np.full(1000, 1.0), np.full(8000, 1.8), np.zeros(1000)])
     *_, trip, plant = shown(between, overload=PROFILE)
     assert "> 1.6 p.u. for 0.5 s" in trip_reason(plant)
 

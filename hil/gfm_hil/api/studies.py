@@ -4,6 +4,7 @@ import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,7 @@ def campaign(
     folder: str | Path | None = None,
     *,
     laws: Sequence[str | Path | Law] = (),
-    workers: int = 1,
-    dask: str | None = None,
+    workers: int | str = 1,
     resume: bool = False,
     x: str | None = None,
     y: str | None = None,
@@ -55,8 +55,8 @@ def campaign(
             the campaign in memory.
         laws: names, law files or ``Law``; those of the campaign if there are none.
         workers: processes; 1 runs all in this one. A program that asks for more needs
-            ``if __name__ == "__main__":``, as the module ``multiprocessing`` says.
-        dask: address of a cluster that runs it instead, e.g. ``tcp://host:8786``.
+            ``if __name__ == "__main__":``, as the module ``multiprocessing`` says. Or the
+            address of a Dask cluster, e.g. ``tcp://host:8786``.
         resume: go on with what the folder holds.
         x, y: drawn paths of the map, or sums of them (``"a + b"``); those of the file if None.
         watch: of the runs; if it stops them, the result says how many are missing.
@@ -65,12 +65,13 @@ def campaign(
     Raises:
         UserError: one line a mistake; the folder is in use.
         LawError: one of the laws is none.
-        WorkerLost: a worker died, or a run raised an error; its ``result`` has all others.
+        WorkerLost: workers died of the same runs, or one raised an error; its ``result`` has all
+            others.
     """
     with law_files(laws) as files:
         return run_campaign(
             given, None if folder is None else Path(folder), laws=files, changes=changes,
-            workers=workers, dask=dask, resume=resume, x=x, y=y, watch=watch,
+            workers=workers, resume=resume, x=x, y=y, watch=watch,
         )  # fmt: skip
 
 
@@ -85,7 +86,7 @@ def conform(
     ports: str | Path | None = None,
     network: str | Path | None = None,
     judged: str | None = None,
-    workers: int = 1,
+    workers: int | str = 1,
     figures: bool = True,
     watch: Watch = SILENT,
 ) -> Conformity:
@@ -115,7 +116,7 @@ def conform(
     Raises:
         UserError: one line a mistake; the folder is in use.
         LawError: a law or the inner stage is none.
-        WorkerLost: a worker died, or a run raised an error.
+        WorkerLost: workers died of the same run, or one raised an error.
         KeyboardInterrupt: the watch stopped it.
     """
     check_workers(workers)
@@ -128,6 +129,8 @@ def conform(
         raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
     place = _new_place(folder)
+    if isinstance(workers, str):  # those of a cluster have working directories of their own
+        place = place and place.absolute()
     cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
     if over is not None:
         under = under.model_copy(update={"plant": over.plant})
@@ -138,12 +141,15 @@ def conform(
             law_file(file)
         converters = Path(temporary) if place is None else place / "converters"
         jobs = make_jobs(files, cases, inner, under, converters, place, figures, external, over)
-        found = execute(jobs, workers, watch)
         digests = {name: laws_digest([file], inner) for name, file in files.items()}
         own = under_test_file(converter)
         droops = {job.law: job.under.droop for job in jobs}
         path = None if over is None else over.path
-        hashes = file_hashes(files, inner, own, under.plant.converter, cases, external, (), path)
+        hashed = partial(
+            file_hashes, files, inner, own, under.plant.converter, cases, external, (), path
+        )
+        hashes = hashed()
+        found = execute(jobs, workers, hashed, watch)
     names = [*files, *([external.name] if external else [])]
     words = over.words() if over else ""
     made = Conformity(

@@ -4,7 +4,7 @@ a scenario such as the grid's strength, the depth of a sag, or a limit."""
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -112,7 +112,7 @@ def clearing_map(
     longest: float = clearing.LONGEST_S,
     after: float = clearing.AFTER_S,
     within: float = WITHIN_S,
-    workers: int = 1,
+    workers: int | str = 1,
     watch: Watch = SILENT,
     **changes: Any,
 ) -> TransientMap[ClearingTime]:
@@ -123,7 +123,7 @@ def clearing_map(
         over: values by the name of a quantity: ``scr``, the short-circuit ratio of the grid with
             its own X/R; ``inner.KEY``, a key of the inner stage, e.g. ``inner.I_max``; or a key of
             the scenario by its dotted path, e.g. ``events.0.V_g``, the depth of a sag.
-        workers: processes.
+        workers: as for ``campaign``.
         watch: told the places done.
 
     Raises:
@@ -170,7 +170,7 @@ def attraction_map(
     over: Over,
     after: float = angles.AFTER_S,
     within: float = angles.WITHIN,
-    workers: int = 1,
+    workers: int | str = 1,
     watch: Watch = SILENT,
     **changes: Any,
 ) -> TransientMap[Attraction]:
@@ -201,16 +201,17 @@ def _map(
     over: Over,
     work: Callable[[Scenario], Found],
     nowhere: Callable[[Scenario], Found],
-    workers: int,
+    workers: int | str,
     watch: Watch,
 ) -> TransientMap[Found]:
     """``work`` at every place of a map; ``nowhere`` is what it finds where none can begin."""
     axes = _axes(over)
-    own = as_law(base.law if law is None else law)
+    law = base.law if law is None else law
+    own = as_law(law)
     found: dict[int, Found] = {}
     with ExitStack() as stack:  # the law has files of its own while this lasts
         tasks = [
-            (k, _at(base, own, dict(zip(axes, values, strict=True)), stack))
+            (k, _at(base, law, own, dict(zip(axes, values, strict=True)), stack))
             for k, values in enumerate(itertools.product(*axes.values()))
         ]
 
@@ -218,13 +219,27 @@ def _map(
             found[result[0]] = replace(result[1], law=own.name)
             watch.progress(len(found), len(tasks), "")
 
-        if workers > 1:
-            compiled_benches(tasks[0][1], watch.notice)
         with pool_of(workers) as pool:
-            run_tasks(partial(_work, work, nowhere), tasks, pool, workers, keep, watch.stopped)
+            each_law: dict[str, Scenario] = {scenario.law: scenario for _, scenario in tasks}
+            pool.check_equal(partial(_digests, [*each_law.values()]))
+            if pool.is_local:
+                _compile_once([scenario for _, scenario in tasks], watch)
+            run_tasks(partial(_work, work, nowhere), tasks, pool, keep, watch)
     if len(found) < len(tasks):
         raise KeyboardInterrupt
     return TransientMap(own.name, base.title, axes, tuple(found[k] for k in range(len(tasks))))
+
+
+def _compile_once(scenarios: Sequence[Scenario], watch: Watch) -> None:
+    """Fill numba's cache here, so that workers need not all compile the same."""
+    for scenario in scenarios:
+        with suppress(UserError):  # no operating point
+            compiled_benches(scenario, watch.notice)
+            return
+
+
+def _digests(scenarios: Sequence[Scenario]) -> list[str]:
+    return [scenario.digest() for scenario in scenarios]
 
 
 def _axes(over: Over) -> dict[str, tuple[float, ...]]:
@@ -240,13 +255,15 @@ def _axes(over: Over) -> dict[str, tuple[float, ...]]:
     return axes
 
 
-def _at(base: Scenario, own: Law, values: Mapping[str, float], stack: ExitStack) -> Scenario:
-    """The scenario at one place of a map."""
+def _at(
+    base: Scenario, law: str | Path | Law, own: Law, values: Mapping[str, float], stack: ExitStack
+) -> Scenario:
+    """The scenario at one place of a map, under a law as the caller names it and as an object."""
     of_stage = {n.removeprefix(OF_STAGE): x for n, x in values.items() if n.startswith(OF_STAGE)}
     if of_stage:
-        own = own.with_inner(base.inner, own.name, **of_stage)
+        law = own.with_inner(base.inner, own.name, **of_stage)
         base = base.model_copy(update={"inner": None})
-    (file,) = stack.enter_context(law_files([own])).values()
+    (file,) = stack.enter_context(law_files([law])).values()
     keys: dict[str, Any] = {
         name.replace(".", "__"): x
         for name, x in values.items()

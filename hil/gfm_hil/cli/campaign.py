@@ -19,8 +19,7 @@ from gfm_hil.studies.workers import WorkerLost, processes
 def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", help="campaign file, or the name of a shipped one")
     command.add_argument("--resume", action="store_true", help="run only what is missing in --out")
-    command.add_argument("--workers", type=int, metavar="N", help="processes; all cores by default")
-    command.add_argument("--dask", metavar="ADDRESS", help="run on a cluster, e.g. tcp://host:8786")
+    common.add_workers(command, "all cores")
     command.add_argument("--x", metavar="PATH", help="drawn path of the figure, or a sum a+b")
     command.add_argument("--y", metavar="PATH", help="the same; the first two drawn by default")
     command.add_argument("--only", type=int, metavar="RUN", help="one run, with its run folder")
@@ -30,8 +29,6 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Carry the command out; 0 if every run ran, whatever became of it."""
-    if options.workers is not None and options.dask:
-        raise UserError("--workers, --dask: the cluster knows its workers; give one of them")
     if options.resume and (not options.out or options.only is not None):
         raise UserError("--resume: goes with --out, the folder to go on with, and without --only")
     if options.only is not None:
@@ -41,8 +38,8 @@ def call(options: argparse.Namespace) -> int:
         try:
             found = campaign(
                 options.file, common.new_folder(options.out, name),
-                workers=processors() if options.workers is None else options.workers,
-                dask=options.dask, resume=options.resume, x=options.x, y=options.y, watch=watch,
+                workers=common.workers_of(options, processors()), resume=options.resume,
+                x=options.x, y=options.y, watch=watch,
             )  # fmt: skip
         except WorkerLost as problem:
             found, lost = problem.result, str(problem)

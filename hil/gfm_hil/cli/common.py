@@ -287,6 +287,22 @@ def add_study_options(command: argparse.ArgumentParser, printed: str, stem: str)
     command.add_argument("--quiet", action="store_true", help="no progress on stderr")
 
 
+def add_workers(command: argparse.ArgumentParser, default: str) -> None:
+    """--workers, of which there are by default as many as the words say, and --dask, for
+    ``workers_of``."""
+    where = command.add_mutually_exclusive_group()
+    words = f"processes; {default} by default"
+    where.add_argument("--workers", type=int, metavar="N", help=words)
+    where.add_argument(
+        "--dask", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786"
+    )
+
+
+def workers_of(options: argparse.Namespace, default: int) -> int | str:
+    """How many processes a command is to use, or the address of a cluster."""
+    return options.dask or (default if options.workers is None else options.workers)
+
+
 def print_parts(parts: Iterable[str | Table]) -> None:
     """Print lines, which have rich's markup, and tables."""
     console = terminal(highlight=False)

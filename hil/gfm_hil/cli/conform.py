@@ -93,10 +93,7 @@ def add(command: argparse.ArgumentParser) -> None:
         help="of the --network: the converter that gets the --law and is judged; its first one, "
         "with its own law, if not given",
     )  # fmt: skip
-    command.add_argument(
-        "--workers", type=int, default=processors(), metavar="N",
-        help="processes; all cores by default",
-    )  # fmt: skip
+    common.add_workers(command, "all cores")
     command.add_argument("--no-figures", action="store_true", help="no figure of each run")
     command.add_argument(
         "--list", nargs="?", const="tests", choices=("tests", "parts", "limits"),
@@ -129,7 +126,8 @@ def call(options: argparse.Namespace) -> int:
             laws, against, folder, inner=options.inner, converter=options.converter,
             controller=options.controller, ports=options.map,
             network=options.network, judged=options.judged,
-            workers=options.workers, figures=not options.no_figures, watch=watch,
+            workers=common.workers_of(options, processors()),
+            figures=not options.no_figures, watch=watch,
         )  # fmt: skip
     return _tell(options, found, time.monotonic() - began, folder)
 

@@ -4,12 +4,13 @@ import contextlib
 import multiprocessing
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from itertools import islice
 from multiprocessing import forkserver
+from pathlib import Path
 from typing import Any, TypeVar
 
 from gfm_hil.core.errors import Unfinished, UserError
@@ -17,6 +18,7 @@ from gfm_runtime.children import end_with_parent
 
 MOST = 1024  # workers
 _AHEAD = 2  # tasks in hand a worker
+_DEATHS = 3  # of workers, of the same task, end a study
 _POLL_S = 0.2
 
 # One thread a worker: two would fight for the cores, and a sum split in two has other last bits.
@@ -54,78 +56,131 @@ class Watch:
 SILENT = Watch()
 
 
-def check_workers(workers: int) -> None:
-    """Raise UserError unless so many processes can be."""
-    if not 1 <= workers <= MOST:
+def check_workers(workers: int | str) -> None:
+    """Raise UserError unless so many processes can be; the address of a cluster is not looked
+    up."""
+    if isinstance(workers, int) and not 1 <= workers <= MOST:
         raise UserError(f"workers = {workers}: must lie in [1, {MOST}]")
+
+
+class Pool:
+    """Where the tasks of a study are worked on: in this process, one after the other.
+
+    Attributes:
+        workers: how many tasks it works on at a time.
+        in_hand: tasks that it should have at a time.
+        is_local: whether its workers are on this machine, and use its files and numba's cache.
+    """
+
+    workers = 1
+    in_hand = 1
+    is_local = True
+
+    def submit(self, function: Callable[..., Result], *args: Any) -> Future[Result]:
+        """A task; an error that it raises is the future's."""
+        future = Future[Result]()
+        try:
+            future.set_result(function(*args))
+        except Exception as problem:
+            future.set_exception(problem)
+        return future
+
+    def check_equal(self, digest: Callable[[], object]) -> None:
+        """Raise UserError unless every worker has this version of the project, and gets from a
+        function what this process gets from it."""
+
+    def check_shared(self, folder: Path) -> None:
+        """Raise UserError unless every worker sees a folder of this machine, which may be made
+        later."""
 
 
 def run_tasks(
     function: Callable[[Task], Result],
     tasks: Iterable[Task],
-    pool: Executor | None,
-    workers: int,
+    pool: Pool,
     keep: Callable[[Result], None],
-    stopped: Callable[[], bool],
+    watch: Watch,
 ) -> None:
-    """Work on all tasks, here or at so many a time in a pool, until ``stopped``, which is asked
-    after each or a few times a second; those under way then are still finished. ``keep`` gets every
-    result. Raises WorkerLost: a worker died, or the function raised an error; the results of all
-    other finished tasks are kept."""
-    waiting = iter(tasks)
-    if pool is None:
-        for task in waiting:
-            if stopped():
-                return
-            try:
-                result = function(task)
-            except Exception as problem:
-                raise WorkerLost(str(problem) or repr(problem)) from problem
-            keep(result)
-        return
-    pending: set[Future[Result]] = set()
+    """Work on all tasks until ``watch.stopped``, which is asked after each or a few times a second;
+    those under way then are still finished. ``keep`` gets every result. What a worker had in hand
+    that died (killed, out of memory), another one takes up. Raises WorkerLost: workers died of the
+    same task again and again, or the function raised an error; the results of all other finished
+    tasks are kept."""
+    waiting = ((task, 0) for task in tasks)
+    again = deque[tuple[Task, int]]()  # tasks whose worker died, and how often
+    pending: dict[Future[Result], tuple[Task, int]] = {}
     try:
         while True:
-            if stopped():
-                pending = {future for future in pending if not future.cancel()}
+            if watch.stopped():
+                again.clear()
+                pending = {f: task for f, task in pending.items() if not f.cancel()}
             else:
-                free = _AHEAD * workers - len(pending)
-                pending |= {pool.submit(function, task) for task in islice(waiting, free)}
+                while len(pending) < pool.in_hand:
+                    if (one := again.popleft() if again else next(waiting, None)) is None:
+                        break
+                    pending[pool.submit(function, one[0])] = one
             if not pending:
                 return
-            done, pending = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            _keep(done, keep)
+            done = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED).done
+            if any(isinstance(future.exception(), BrokenProcessPool) for future in done):
+                watch.notice("a worker process died (killed, or out of memory?); going on …")
+                done = wait(pending).done  # that ended all others too
+            failed = None
+            for future in done:
+                task, deaths = pending.pop(future)
+                problem = future.exception()
+                if problem is None:
+                    keep(future.result())
+                elif isinstance(problem, BrokenProcessPool) and deaths + 1 < _DEATHS:
+                    again.append((task, deaths + 1))
+                else:
+                    failed = problem
+            if isinstance(failed, BrokenProcessPool):
+                words = f"{_DEATHS} worker processes died of the same work (out of memory?)"
+                raise WorkerLost(words) from failed
+            if failed is not None:
+                raise WorkerLost(str(failed) or repr(failed)) from failed
     finally:
         for future in pending:
             future.cancel()
 
 
-def _keep(done: set[Future[Result]], keep: Callable[[Result], None]) -> None:
-    failed = None
-    for future in done:
-        problem = future.exception()
-        if problem is None:
-            keep(future.result())
-        else:
-            failed = problem
-    if isinstance(failed, BrokenProcessPool):
-        raise WorkerLost("a worker process died (killed, or out of memory?)") from failed
-    if failed is not None:
-        raise WorkerLost(str(failed) or repr(failed)) from failed
+class Processes(Pool):
+    """So many processes with one thread each, forked when there is work from a server that has
+    imported what all need; others take the place of those that died."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers, self.in_hand = workers, _AHEAD * workers
+        self._context = multiprocessing.get_context("forkserver")
+        # scipy loads its parts when they are first used
+        first = f"{__package__}.forked"
+        self._context.set_forkserver_preload(
+            [first, f"{__package__}.campaign.worker", "scipy.signal"]
+        )
+        self._executor = self._start()
+
+    def _start(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(self.workers, mp_context=self._context, initializer=_set_up)
+
+    def submit(self, function: Callable[..., Result], *args: Any) -> Future[Result]:
+        try:
+            return self._executor.submit(function, *args)
+        except BrokenProcessPool:
+            self._executor = self._start()
+            return self._executor.submit(function, *args)
+
+    def shut_down(self) -> None:
+        """End the processes after what they work on now."""
+        self._executor.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes with one thread each. They are forked, when there is work, from a server
-    that at once begins to import what all need. All end with this process, and a KeyboardInterrupt
-    in this context ends them at once."""
+def processes(workers: int) -> Iterator[Processes]:
+    """A pool of processes, whose server begins to import at once. All end with this process, and a
+    KeyboardInterrupt in this context ends them at once."""
     before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    context = multiprocessing.get_context("forkserver")
-    # scipy loads its parts when they are first used
-    first = f"{__package__}.forked"
-    context.set_forkserver_preload([first, f"{__package__}.campaign.worker", "scipy.signal"])
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_set_up)
+    pool = Processes(workers)
     try:
         # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -134,7 +189,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
         try:
             yield pool
         finally:
-            pool.shutdown(cancel_futures=True)
+            pool.shut_down()
     except KeyboardInterrupt:
         for process in multiprocessing.active_children():
             process.kill()
@@ -154,12 +209,17 @@ def _set_up() -> None:
 
 
 @contextlib.contextmanager
-def pool_of(workers: int) -> Iterator[Executor | None]:
-    """``processes``, or None for 1 worker, which works here. Raises UserError: so many processes
-    cannot be."""
+def pool_of(workers: int | str) -> Iterator[Pool]:
+    """So many processes, of which 1 is this one, or the Dask cluster at an address. Raises
+    UserError: so many cannot be, or there is no such cluster."""
     check_workers(workers)
-    if workers == 1:
-        yield None
-        return
-    with processes(workers) as pool:
-        yield pool
+    if isinstance(workers, str):
+        from gfm_hil.studies.cluster import cluster
+
+        with cluster(workers) as there:
+            yield there
+    elif workers == 1:
+        yield Pool()
+    else:
+        with processes(workers) as pool:
+            yield pool

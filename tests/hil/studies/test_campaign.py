@@ -2,7 +2,6 @@
 
 import json
 import multiprocessing
-import os
 import shutil
 import signal
 import subprocess
@@ -10,7 +9,6 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,13 @@ import gfmhil
 from gfm_hil.cli.main import main
 from gfm_hil.core.errors import UserError
 from gfm_hil.studies.campaign import worker
-from gfm_hil.studies.campaign.execute import CHUNK, Store
+from gfm_hil.studies.campaign.execute import Store
 from gfm_hil.studies.campaign.figure import fill_map
 from gfm_hil.studies.campaign.loading import load_campaign
 from gfm_hil.studies.campaign.result import find_axes, summary, verdict
 from gfm_hil.studies.campaign.spec import Campaign
-from gfm_hil.studies.campaign.worker import Record, run_chunk
-from gfm_hil.studies.workers import WorkerLost, processes, run_tasks
+from gfm_hil.studies.campaign.worker import run_chunk
+from gfm_hil.studies.workers import WorkerLost
 
 from ...support.files import text_of
 from ...support.page import unpacked
@@ -176,42 +174,6 @@ def test_a_run_alone_is_that_of_the_campaign(whole, tmp_path):
         assert result["status"] == record["status"]
 
 
-@pytest.mark.full
-def test_dask_gives_the_same_bits(whole):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, dashboard_address=None
-    ) as local:
-        arguments = ["campaign", str(whole / "small.toml"), "--out", str(whole / "dask")]
-        assert main([*arguments, "--dask", local.scheduler_address, "--quiet"]) == 0
-    assert stored(whole / "dask") == stored(whole / "two")
-
-
-def test_dask_without_the_package_says_so(file, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    out = tmp_path / "out"
-    assert main(["campaign", str(file()), "--out", str(out), "--dask", "tcp://127.0.0.1:9"]) == 2
-    assert "pip install 'gfmhil[dask]'" in capsys.readouterr().err
-    assert not out.exists()
-
-
-@pytest.mark.full
-def test_a_killed_worker_is_reported_and_the_rest_kept(file):
-    campaign = load_campaign(str(file(**{"runs = 10": "runs = 2000"})))
-    jobs = [[(k + j, "mimo-gfm") for j in range(CHUNK)] for k in range(0, 2000, CHUNK)]
-    kept: list[Record] = []
-
-    def keep(records: list[Record]) -> None:
-        kept.extend(records)
-        for process in multiprocessing.active_children():
-            os.kill(process.pid or 0, signal.SIGKILL)
-
-    with processes(1) as pool, pytest.raises(WorkerLost, match="a worker process died"):
-        run_tasks(partial(run_chunk, campaign), jobs, pool, 1, keep, lambda: False)
-    assert [r["run"] for r in kept] == list(range(len(kept)))
-    assert kept
-
-
 def test_an_error_in_a_run_names_the_run(file, monkeypatch):
     def fail(*_: Any) -> None:
         raise ZeroDivisionError("as if there were a mistake")
@@ -311,7 +273,6 @@ def test_wrong_files(file, tmp_path, refused, changed, words):
     ("options", "words"),
     [
         (["--workers", "0"], "workers = 0: must lie in"),
-        (["--workers", "2", "--dask", "tcp://a:1"], "give one of them"),
         (["--resume"], "goes with --out"),
         (["--only", "10", "--out", "x"], "--only 10: must lie in [0, 9]"),
         (["--x", "plant.factors.C_f"], "'plant.factors.C_f' is not drawn"),

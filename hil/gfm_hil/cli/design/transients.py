@@ -8,7 +8,7 @@ from typing import Any
 
 from gfm_hil.api import plot
 from gfm_hil.api.transients import SCR, WITHIN_S, attraction_map, clearing_map
-from gfm_hil.cli.common import numbers, print_result, watching
+from gfm_hil.cli.common import add_workers, numbers, print_result, watching, workers_of
 from gfm_hil.cli.design.common import add_figure, add_loop_options, chosen_scenario, save_figure
 from gfm_hil.core.errors import UserError
 from gfm_hil.results.table import Table
@@ -76,7 +76,7 @@ def _add(kinds: Any, name: str, text: str, scenario: str, after: float) -> argpa
         help="how long a run goes on afterwards at least (default: %(default)s); one whose angle is"
         " not back by then goes on, to 24 s",
     )  # fmt: skip
-    command.add_argument("--workers", type=int, default=1, help="processes (default: %(default)s)")
+    add_workers(command, "1")
     add_figure(command)
     return command
 
@@ -123,7 +123,7 @@ def _tell(
             rows = [each[0].row()]
         else:
             found = at_map(
-                None, scenario, over=over, workers=options.workers, watch=watch, **how_map
+                None, scenario, over=over, workers=workers_of(options, 1), watch=watch, **how_map
             )
             each, rows = found.found, found.rows()
             save_figure(options, lambda: draw(found))

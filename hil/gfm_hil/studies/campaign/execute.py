@@ -5,8 +5,7 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +27,15 @@ from gfm_hil.studies.campaign.worker import (
     record,
     run_chunk,
 )
-from gfm_hil.studies.workers import SILENT, Watch, WorkerLost, check_workers, pool_of, run_tasks
+from gfm_hil.studies.workers import (
+    SILENT,
+    Pool,
+    Watch,
+    WorkerLost,
+    check_workers,
+    pool_of,
+    run_tasks,
+)
 
 CHUNK = 32  # runs a task: half a second, so that little is lost and little is waited for
 _FILE = "runs.jsonl"
@@ -112,16 +119,15 @@ def run_campaign(
     *,
     laws: Mapping[str, str],
     changes: Mapping[str, Any],
-    workers: int,
-    dask: str | None,
+    workers: int | str,
     resume: bool,
     x: str | None,
     y: str | None,
     watch: Watch = SILENT,
 ) -> CampaignResult:
     """As ``gfmhil.campaign``, with law files by name. Raises UserError: one line a mistake; the
-    folder is in use. Raises WorkerLost: a worker died, or a run raised an error; its ``result`` has
-    all others."""
+    folder is in use. Raises WorkerLost: workers died of the same runs, or one raised an error; its
+    ``result`` has all others."""
     check_workers(workers)
     if resume and folder is None:
         raise UserError("resume: goes with the folder to go on with (--out)")
@@ -129,24 +135,23 @@ def run_campaign(
     try:
         with contextlib.ExitStack() as stack:
             # workers import while the runs are checked
-            pool = None if dask else stack.enter_context(pool_of(workers))
+            pool = stack.enter_context(pool_of(workers))
             campaign = load_campaign(given, laws, changes, checks_progress(watch))
             axes = find_axes(campaign, x, y)
-            if dask:  # before anything is written
-                pool, workers = stack.enter_context(cluster(dask, campaign))
+            pool.check_equal(campaign.digest)  # before anything is written
             store = Store(folder, campaign, resume)
             if jobs := store.missing(campaign):
-                if not dask:
+                if pool.is_local:
                     compile_once(campaign, watch.notice)
-                _execute(campaign, jobs, pool, workers, store, watch)
+                _execute(campaign, jobs, pool, store, watch)
     except WorkerLost as problem:
         lost = problem
     except KeyboardInterrupt:  # of a second signal: the runs under way are lost
         if store is None or not watch.stopped():
             raise
     assert store is not None
-    where, wall_s = dask or workers, time.monotonic() - began
-    found = CampaignResult(campaign, store.sorted(campaign), folder, where, wall_s, axes)
+    wall_s = time.monotonic() - began
+    found = CampaignResult(campaign, store.sorted(campaign), folder, workers, wall_s, axes)
     if folder is not None:
         found.write(folder)
     if lost is not None:
@@ -172,12 +177,7 @@ def checks_progress(watch: Watch) -> Tell:
 
 
 def _execute(
-    campaign: Campaign,
-    jobs: Sequence[Job],
-    pool: Executor | None,
-    workers: int,
-    store: Store,
-    watch: Watch,
+    campaign: Campaign, jobs: Sequence[Job], pool: Pool, store: Store, watch: Watch
 ) -> None:
     """Run all jobs, or until the watch stops them; arguments and errors as for ``run_tasks``."""
     of = campaign.file.runs * len(campaign.file.laws)
@@ -190,35 +190,9 @@ def _execute(
         told = ", ".join(f"{n} {v.replace('-', ' ')}" for v, n in counts.items())
         watch.progress(len(verdicts), of, told)
 
-    size = min(CHUNK, -(-len(jobs) // workers))
+    size = min(CHUNK, -(-len(jobs) // pool.workers))
     chunks = (jobs[k : k + size] for k in range(0, len(jobs), size))
-    run_tasks(partial(run_chunk, campaign), chunks, pool, workers, keep, watch.stopped)
-
-
-@contextlib.contextmanager
-def cluster(address: str, campaign: Campaign) -> Iterator[tuple[Executor, int]]:
-    """A Dask cluster as (executor, number of threads). Raises UserError: no distributed here,
-    nobody at the address, or a worker with other contents."""
-    try:
-        from distributed import Client
-    except ImportError:
-        words = "--dask: needs the package distributed: pip install 'gfmhil[dask]'"
-        raise UserError(words) from None
-    try:
-        client: Any = Client(address, timeout="10s")
-    except (OSError, ValueError) as problem:
-        raise UserError(f"--dask {address}: no scheduler there: {problem}") from None
-    with client:
-        threads = sum(client.nthreads().values())
-        if not threads:
-            raise UserError(f"--dask {address}: the cluster has no workers")
-        mine = campaign.digest()
-        for worker, theirs in client.run(campaign.digest, on_error="return").items():
-            if theirs != mine:
-                raise UserError(
-                    f"--dask {address}: {worker} has another gfmhil, law or converter: {theirs!r}"
-                )
-        yield client.get_executor(pure=False), threads
+    run_tasks(partial(run_chunk, campaign), chunks, pool, keep, watch)
 
 
 def run_alone(campaign: Campaign, run: int, law: str, folder: Path) -> Record:

@@ -2,8 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from gfm_hil.studies.conformity.saturation import mark_saturation
 from gfm_hil.studies.conformity.sets import Case, TestPart, scenario_of
 from gfm_hil.studies.conformity.shared_start import SharedStart, after_settling, alike, first_event
 from gfm_hil.studies.conformity.verdict import CANNOT, FAIL, PASS, Outcome, Verdict, worst
-from gfm_hil.studies.workers import RunFailed, Watch, WorkerLost, pool_of, run_tasks
+from gfm_hil.studies.workers import Pool, RunFailed, Watch, WorkerLost, pool_of, run_tasks
 from gfm_runtime import get_law, law_file
 
 
@@ -211,10 +210,19 @@ def declared_for(under: UnderTest, law: str) -> UnderTest:
     return under.model_copy(update={"droop": own_droop(get_law(law))})
 
 
-def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]:
-    """What becomes of all jobs; 1 worker runs all in this process. Raises UserError: so many
-    workers cannot be. Raises WorkerLost: a worker died, or a run raised an error. Raises
-    KeyboardInterrupt: the watch stopped it before its end."""
+def execute(
+    jobs: Sequence[Job], workers: int | str, digest: Callable[[], object], watch: Watch
+) -> list[PartResult]:
+    """What becomes of all jobs. Raises UserError: so many workers cannot be, or those of a cluster
+    see other files. Raises WorkerLost: workers died, or a run raised an error. Raises
+    KeyboardInterrupt: the watch stopped it before its end.
+
+    Args:
+        jobs: of one report.
+        workers: as of ``pool_of``.
+        digest: over the files on which the report rests.
+        watch: of the runs.
+    """
     found: list[PartResult] = []
 
     def keep(one: PartResult) -> None:
@@ -225,11 +233,15 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
 
     lost = None
     try:
-        if workers > 1:
-            compile_once(jobs, watch.notice)
         with pool_of(workers) as pool, scratch.temporary("gfmhil-starts-") as place:
-            started = share_starts(jobs, place, pool, workers, watch)
-            run_tasks(run_part, started, pool, workers, keep, watch.stopped)
+            pool.check_equal(digest)
+            for folder in {job.folder or job.converters for job in jobs}:
+                pool.check_shared(folder)
+            if pool.is_local:
+                if pool.workers > 1:
+                    compile_once(jobs, watch.notice)
+                jobs = share_starts(jobs, place, pool, watch)
+            run_tasks(run_part, jobs, pool, keep, watch)
     except WorkerLost as problem:
         lost = problem
     except KeyboardInterrupt:  # of a second signal: the runs under way are lost
@@ -241,14 +253,13 @@ def execute(jobs: Sequence[Job], workers: int, watch: Watch) -> list[PartResult]
     return found
 
 
-def share_starts(
-    jobs: Sequence[Job], place: Path, pool: Executor | None, workers: int, watch: Watch
-) -> list[Job]:
+def share_starts(jobs: Sequence[Job], place: Path, pool: Pool, watch: Watch) -> list[Job]:
     """The jobs, those of a model that begin alike with one start, which is run here.
 
     Args:
         place: folder for these starts, which lasts while jobs run.
-        pool, workers, watch: as of ``execute``.
+        pool: which uses that folder too.
+        watch: of the runs.
     """
     groups: dict[str, list[tuple[int, Scenario]]] = {}
     for k, job in enumerate(jobs):
@@ -269,7 +280,7 @@ def share_starts(
     watch.notice(f"running what {shared} runs begin with, once …")
     good = set[Path | None]()
     begins = [start for start, _ in starts]
-    run_tasks(SharedStart.make, begins, pool, workers, good.add, watch.stopped)
+    run_tasks(SharedStart.make, begins, pool, good.add, watch)
     if {start.folder for start in begins} - good and not watch.stopped():
         watch.notice("the model does not go on from a snapshot: each of its runs settles anew")
     of = {k: start for start, members in starts if start.folder in good for k in members}
