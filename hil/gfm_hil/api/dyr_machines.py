@@ -65,11 +65,6 @@ def read_machines(path: str | Path) -> Machines:
     return Machines(machines, list(dict.fromkeys(ignored)))
 
 
-def _genrou(p: Numbers) -> Made:
-    saturates = p.pop("S_10"), p.pop("S_12")
-    return {**p}, ["its saturation is left out"] if any(saturates) else []
-
-
 def _sexs(p: Numbers) -> Made:
     T_A = p.pop("T_A/T_B") * p["T_B"]
     return _lagging({"type": "SEXS", "T_R": 0.0, "T_A": T_A, **p}, "T_R", "T_B", "T_E")
@@ -110,7 +105,7 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         "machine",
         ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
          "S_10", "S_12"),
-        _genrou,
+        lambda p: ({**p}, []),
     ),
     "SEXS": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max"), _sexs),
     "IEEET1": (

@@ -1,4 +1,4 @@
-"""A synchronous machine of order 6 with its controls: the equations of GENROU, without saturation.
+"""A synchronous machine of order 6 with its controls: the equations of GENROU.
 
 All of it is in p.u. of the machine's rating and in the frame of its rotor, whose q axis is 90
 degrees ahead of its d axis; i flows out of the machine. X'' is that of both axes, so that the
@@ -9,8 +9,13 @@ stator is a voltage behind one branch, R and X'', of the circuit that is solved 
     psi_q'' = -a_q E_d' + (1 - a_q) psi_kq,    a_q = (X'' - X_l) / (X_q' - X_l),
     T_d0''  d psi_kd/dt = -g_d,    g_d = psi_kd + (X_d' - X_l) i_d - E_q',
     T_q0''  d psi_kq/dt = -g_q,    g_q = psi_kq + (X_q' - X_l) i_q + E_d',
-    T_d0'   d E_q'/dt = E_fd - E_q' - (X_d - X_d') (i_d - g_d (X_d' - X'') / (X_d' - X_l)^2),
-    T_q0'   d E_d'/dt =      - E_d' + (X_q - X_q') (i_q - g_q (X_q' - X'') / (X_q' - X_l)^2).
+    T_d0'   d E_q'/dt = E_fd - E_q' - (X_d - X_d') (i_d - g_d (X_d' - X'') / (X_d' - X_l)^2)
+                        - S psi_d'',
+    T_q0'   d E_d'/dt =      - E_d' + (X_q - X_q') (i_q - g_q (X_q' - X'') / (X_q' - X_l)^2)
+                        + S psi_q'' (X_q - X_l) / (X_d - X_l).
+
+Its iron saturates by S(|psi''|): S times the flux is a parabola above a flux from which it begins
+(`controls.control.parabola`), by S_10 and S_12 at fluxes of 1 and 1.2. X'' does not saturate.
 
 Its torque, psi_d'' i_q - psi_q'' i_d, drives the swing equation. The exciter gives E_fd by the size
 V of its terminals' voltage, the governor the torque of the turbine and the stabiliser a voltage by
@@ -46,7 +51,7 @@ from gfm_plant.components.controls import (
     govern,
     stabilise,
 )
-from gfm_plant.components.controls.control import Control
+from gfm_plant.components.controls.control import Control, parabola
 from gfm_plant.components.machine import SPEED, Rotating
 from gfm_plant.components.part import LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
@@ -78,12 +83,31 @@ _NUDGE = 1e-6  # of a derivative by differences
 
 
 @compiled
-def _windings(one: Any, x: Any, E_fd: float, i: complex, out: Any) -> None:
-    """Write d/dt of the rotor's states, 1/s, at a current i."""
+def _flux(one: Any, x: Any) -> complex:
+    """Return psi'' by the states x, or its d/dt by theirs."""
+    return complex(
+        one.a_d * x[E_Q] + (1.0 - one.a_d) * x[PSI_KD],
+        -one.a_q * x[E_D] + (1.0 - one.a_q) * x[PSI_KQ],
+    )
+
+
+@compiled
+def _saturation(one: Any, psi: complex) -> float:
+    """Return S at a flux psi''."""
+    size = math.sqrt(psi.real * psi.real + psi.imag * psi.imag)
+    if size <= one.s_a:
+        return 0.0
+    S: float = one.s_b * (size - one.s_a) ** 2 / size
+    return S
+
+
+@compiled
+def _windings(one: Any, x: Any, E_fd: float, i: complex, psi: complex, S: float, out: Any) -> None:
+    """Write d/dt of the rotor's states, 1/s, at a current i, a flux psi'' and its saturation."""
     g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
     g_q = x[PSI_KQ] + one.X_ql * i.imag + x[E_D]
-    out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d)) / one.T_d10
-    out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q)) / one.T_q10
+    out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d) - S * psi.real) / one.T_d10
+    out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q) + S * one.s_q * psi.imag) / one.T_q10
     out[PSI_KD], out[PSI_KQ] = -g_d / one.T_d20, -g_q / one.T_q20
 
 
@@ -93,18 +117,10 @@ def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     1 + w and a current i; returns the torque of the turbine, if it has a governor."""
     V_s = stabilise(one.pss, one.pss_p, x, PSS, w, one.pss_set, out)
     E_fd = excite(one.avr, one.avr_p, x, AVR, V, one.avr_set + V_s, out)
-    _windings(one, x, E_fd, i, out)
+    psi = _flux(one, x)
+    _windings(one, x, E_fd, i, psi, _saturation(one, psi), out)
     turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, w, one.governor_set, out)
     return turbine
-
-
-@compiled
-def _flux(one: Any, x: Any) -> complex:
-    """Return psi'' by the states x, or its d/dt by theirs."""
-    return complex(
-        one.a_d * x[E_Q] + (1.0 - one.a_d) * x[PSI_KD],
-        -one.a_q * x[E_D] + (1.0 - one.a_q) * x[PSI_KQ],
-    )
 
 
 @compiled
@@ -191,9 +207,9 @@ def _at_rest(n: Any, now: Any, one: Any, c: int, part: int) -> None:
 
 class SynchronousMachine(Rotating):
     """A synchronous machine with transient and subtransient reactances and its controls: field and
-    damper windings of order 6, the subtransient reactance the same in both axes, without
-    saturation. The defaults are those of the machines of Kundur's two areas (Power System Stability
-    and Control, example 12.6)."""
+    damper windings of order 6, the subtransient reactance the same in both axes. The defaults are
+    those of the machines of Kundur's two areas (Power System Stability and Control, example 12.6),
+    without their saturation."""
 
     title: ClassVar = "Synchronous machine of order 6"
     example: ClassVar = {
@@ -216,6 +232,8 @@ class SynchronousMachine(Rotating):
             # X_dd is X_d - X_d', X_dl is X_d' - X_l, and so for q; k and a as in the equations
             *((name, "f8") for name in ("X_dd", "X_qq", "X_dl", "X_ql", "k_d", "k_q", "a_d")),
             *((name, "f8") for name in ("a_q", "X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20")),
+            # saturation: from which flux on, of the parabola, and its share in the q axis
+            *((name, "f8") for name in ("s_a", "s_b", "s_q")),
             # of each control: its kind, 0 if there is none, and its numbers
             *((role, "i8") for role in ROLES),
             *((f"{role}_p", "f8", (MOST_NUMBERS,)) for role in ROLES),
@@ -249,6 +267,8 @@ class SynchronousMachine(Rotating):
     T_q10: Positive = Field(0.4, description="open-circuit transient time constant T_q0', s")
     T_d20: Positive = Field(0.03, description="open-circuit subtransient time constant T_d0'', s")
     T_q20: Positive = Field(0.05, description="open-circuit subtransient time constant T_q0'', s")
+    S_10: NonNegative = Field(0.0, description="saturation S(1.0), at a flux of 1 p.u.")
+    S_12: NonNegative = Field(0.0, description="saturation S(1.2), at 1.2 p.u.; 0: none at all")
     avr: AnyExciter | None = Field(
         None, description="voltage regulator with its exciter; E_fd is constant if none"
     )
@@ -272,6 +292,12 @@ class SynchronousMachine(Rotating):
         return self
 
     @model_validator(mode="after")
+    def _saturates(self) -> Self:
+        if self.S_10 > self.S_12:
+            raise ValueError(f"S_10 = {self.S_10:g}: must be at most S_12, {self.S_12:g}")
+        return self
+
+    @model_validator(mode="after")
     def _fit_together(self) -> Self:
         if self.pss is not None and self.avr is None:
             raise ValueError("pss: acts on a voltage regulator; give the machine an avr, too")
@@ -280,6 +306,11 @@ class SynchronousMachine(Rotating):
             if self.governor is not None and value != type(self).model_fields[name].default:
                 raise ValueError(f"{name} = {value:g}: leave it out, the governor has its own")
         return self
+
+    def _parabola(self) -> tuple[float, float]:
+        """From which flux on its iron saturates, and how much."""
+        a, b = parabola(1.0, self.S_10, 1.2, self.S_12)
+        return (a if b > 0.0 else math.inf), b
 
     def _controls(self) -> Iterator[tuple[str, int, Control]]:
         """Role and first state of each control that it has."""
@@ -324,6 +355,8 @@ class SynchronousMachine(Rotating):
             record[f"X_{axis}{axis}"], record[f"X_{axis}l"] = X - X_1, X_1 - self.X_l
             record[f"a_{axis}"] = (self.X_2 - self.X_l) / (X_1 - self.X_l)
             record[f"k_{axis}"] = (X_1 - self.X_2) / (X_1 - self.X_l) ** 2
+        record["s_a"], record["s_b"] = self._parabola()
+        record["s_q"] = (self.X_q - self.X_l) / (self.X_d - self.X_l)
         record["P_set"], record["begins"] = self.P, 1
 
     def steady(
@@ -337,11 +370,16 @@ class SynchronousMachine(Rotating):
 
     def settle(self, record: Any, v: complex, omega: float, omega_b: float, z: Matrix) -> complex:
         i, v = complex(*z[:2]), complex(*z[2:])
-        q_axis = v + complex(self.R, omega * self.X_q) * i
+        iron = SimpleNamespace(**dict(zip(("s_a", "s_b"), self._parabola(), strict=True)))
+        S = _saturation.py_func(iron, (v + complex(self.R, omega * self.X_2) * i) / omega)
+        S_q = S * float(record["s_q"])
+        X_q = self.X_q - (self.X_q - self.X_2) * S_q / (1.0 + S_q)
+        q_axis = v + complex(self.R, omega * X_q) * i
         unit = -1j * q_axis / abs(q_axis)
         i_d, i_q = (own := i * unit.conjugate()).real, own.imag
-        E_fd = (v * unit.conjugate() + self.R * own).imag / omega + self.X_d * i_d
-        E_q, E_d = E_fd - (self.X_d - self.X_d1) * i_d, (self.X_q - self.X_q1) * i_q
+        E = (v * unit.conjugate() + self.R * own).imag / omega + self.X_d * i_d
+        E_q, E_d = E - (self.X_d - self.X_d1) * i_d, (X_q - self.X_q1) * i_q
+        E_fd = E + S * (E - (self.X_d - self.X_2) * i_d)
         psi_kd = E_q - (self.X_d1 - self.X_l) * i_d
         psi_kq = -E_d - (self.X_q1 - self.X_l) * i_q
         torque = ((v + self.R * i) * i.conjugate()).real / omega + self.D * (omega - 1.0)
@@ -424,5 +462,7 @@ class SynchronousMachine(Rotating):
             return found
 
         V_s = output("pss", w, one.pss_set)
-        _windings.py_func(one, x, output("avr", V, one.avr_set + V_s), i, out)
+        psi = _flux.py_func(one, x)
+        S = _saturation.py_func(one, psi)
+        _windings.py_func(one, x, output("avr", V, one.avr_set + V_s), i, psi, S, out)
         return output("governor", w, one.governor_set)

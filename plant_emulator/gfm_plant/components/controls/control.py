@@ -1,10 +1,21 @@
 """What a control of a synchronous machine declares: an exciter with its regulator, a governor with
 its turbine, or a stabiliser."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 from gfm_plant.parameters import Options
+
+
+def parabola(E_1: float, S_1: float, E_2: float, S_2: float) -> tuple[float, float]:
+    """The numbers a and b of a saturation: S(E) E = b (E - a)^2 above a and 0 below it, through
+    S(E_1) = S_1 and S(E_2) = S_2; without S_2 there is none."""
+    if S_2 == 0.0:
+        return 0.0, 0.0
+    first, second = math.sqrt(S_1 * E_1), math.sqrt(S_2 * E_2)
+    rise = (second - first) / (E_2 - E_1)
+    return E_2 - second / rise, rise**2
 
 
 class Control(Options):

@@ -8,13 +8,12 @@ where S(E) = b (E - a)^2 above a and 0 below it is the saturation, whose two num
 points of it, S(E_1) = S_E1 E_1 and S(E_2) = S_E2 E_2.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from gfm_plant.components.controls.control import Exciter
+from gfm_plant.components.controls.control import Exciter, parabola
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
@@ -76,11 +75,7 @@ class Ieeet1(Exciter):
 
     def saturation(self) -> tuple[float, float]:
         """Its numbers a and b."""
-        if self.S_E2 == 0.0:
-            return 0.0, 0.0
-        first, second = math.sqrt(self.S_E1 * self.E_1), math.sqrt(self.S_E2 * self.E_2)
-        rise = (second - first) / (self.E_2 - self.E_1)
-        return self.E_2 - second / rise, rise**2
+        return parabola(self.E_1, self.S_E1, self.E_2, self.S_E2)
 
     def field(self, E_fd: float) -> float:
         """The output of the regulator that an excitation needs at rest."""
