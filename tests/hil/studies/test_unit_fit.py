@@ -58,11 +58,11 @@ def record(run: gfmhil.Run, place: Path, seed: int, sigma: float, lag: float) ->
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("sigma", "lag"), [(0.02, 5e-4), (0.03, 0.01)])
-def test_the_intervals_hold_what_is_true_in_95_of_100_draws(run, tmp_path, sigma, lag):
+def test_the_intervals_hold_what_is_true_in_95_of_100_draws(run, tmp_path):
+    """Half of them with a meter that is slow."""
     inside = dict.fromkeys(TRUE, 0)
     for seed in range(DRAWS):
-        record(run, tmp_path, seed, sigma, lag)
+        record(run, tmp_path, seed, *((0.02, 5e-4), (0.03, 0.01))[seed % 2])
         read = gfmhil.load_run(tmp_path / "noisy.mat", tmp_path / "map.toml", SCENARIO)
         fit = envelopes.fit_run(read)
         for name, (low, high) in fit.interval.items():
