@@ -50,7 +50,7 @@ class Kernel:
             + f" >{shlex.quote(str(self._log))} 2>&1",
         ]
         job.write_text("\n".join(lines) + "\n")
-        first = "in_process_in_counts or netem"
+        first = "in_process_in_counts or loss"
         compiling = [*test, "-k", first, "--basetemp", str(folder / "first")]
         kernel = ["linux.uml", "mem=2G", "rootfstype=hostfs", "rootflags=/", "rw", "quiet",
                   f"init={INIT}", f"UML_JOB={job}", f"UML_STATUS={self._status}",
