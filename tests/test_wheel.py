@@ -70,42 +70,39 @@ def test_the_sdist_builds_the_wheel_for_every_python(without_code):
     assert without_code.name.endswith("-py3-none-any.whl")
 
 
-def _installed(python: str | Path, folder: Path, wheel: Path) -> Path:
-    """The Python of a new environment with a wheel and what it needs."""
-    _done(python, "-m", "venv", folder)
-    new = folder / "bin" / "python"
-    lock = ROOT / "requirements" / "container.txt"
-    install = [new, "-m", "pip", "install", "--quiet", "--no-compile"]  # what it imports does that
-    _done(*install, "--require-hashes", "-r", lock)
-    _done(*install, "--no-deps", wheel)
-    _done(new, "-m", "pip", "check")
-    return new
-
-
-def _newest_python() -> str | None:
-    """The newest other Python that pyproject.toml claims and this machine has."""
+def _newest_python() -> str:
+    """The newest Python that pyproject.toml claims and this machine has."""
     for minor in range(14, sys.version_info.minor, -1):
         environment = {**os.environ, "PYENV_VERSION": f"3.{minor}"}  # where pyenv has them
         ask = [f"python3.{minor}", "-c", "import sys; print(sys.executable)"]
         with suppress(FileNotFoundError, subprocess.CalledProcessError):
             return subprocess.check_output(ask, env=environment, text=True).strip()
-    return None
+    return sys.executable
 
 
 def test_the_newest_python_runs_it(without_code, tmp_path):
-    newest = _newest_python()
-    if newest is None:
-        pytest.skip("this machine has no newer Python than the tests")
-    python = _installed(newest, tmp_path / "venv", without_code)
+    """In a new environment with what the image has."""
+    _done(_newest_python(), "-m", "venv", tmp_path / "venv")
+    python = tmp_path / "venv" / "bin" / "python"
+    lock = ROOT / "requirements" / "container.txt"
+    install = [python, "-m", "pip", "install", "--quiet", "--no-compile"]  # imports do that
+    _done(*install, "--require-hashes", "-r", lock)
+    _done(*install, "--no-deps", without_code)
+    _done(python, "-m", "pip", "check")
     cache = str(tmp_path / "cache")
     command = [python, "-P", "-m", "gfm_hil", "run", "pref_step", "--link", "inproc"]
     said = _done(*command, "-o", tmp_path / "run", NUMBA_CACHE_DIR=cache)
     assert "completed" in said and "compiling the loop" in said
 
 
-def test_in_a_fresh_environment_the_first_run_compiles_nothing(built, tmp_path):
-    python = _installed(sys.executable, tmp_path / "venv", built)
-    cache, gfmhil = tmp_path / "cache", [python, "-P", "-m", "gfm_hil"]
-    said = _done(*gfmhil, "run", "pref_step", "-o", tmp_path / "run", NUMBA_CACHE_DIR=str(cache))
+def test_the_first_run_compiles_nothing(built, tmp_path):
+    """The wheel stands before our own folders on the path, with the packages of the tests."""
+    place, cache = tmp_path / "place", tmp_path / "cache"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", "--no-deps"]
+    _done(*pip, "--target", place, built)
+    said = _done(
+        sys.executable, "-P", "-m", "gfm_hil", "run", "pref_step", "-o", tmp_path / "run",
+        NUMBA_CACHE_DIR=str(cache), PYTHONPATH=str(place),
+    )  # fmt: skip
     assert "completed" in said and "compiling" not in said
     assert not list(cache.rglob("*.nb[ic]"))
