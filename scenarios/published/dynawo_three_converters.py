@@ -184,7 +184,7 @@ def solved(t: Any, of: Variant) -> tuple[Any, Any]:
             switch(x, now)
         at = np.append(t[(t >= start) & (t < end)], end)
         result = solve_ivp(lambda _, x, now=now: rates(x, now, of), (start, end), x, "LSODA", at,
-                           rtol=1e-8, atol=1e-10)  # fmt: skip
+                           rtol=1e-6, atol=1e-8)  # fmt: skip
         x = result.y[:, -1].copy()
         found.append(result.y[: 3 * N_STATES, :-1])
     y = np.concatenate(found, axis=1).reshape(3, N_STATES, -1)
