@@ -21,6 +21,7 @@ from gfm_hil.recording.columns import TABLE
 from gfm_hil.recording.log import read_log
 from gfm_runtime import law_file
 
+from ...support.modbus import SCENARIO
 from ...support.processes import GFMHIL, PATIENCE_S, free_port, running
 from ...support.xcp import (
     CONNECT,
@@ -271,17 +272,6 @@ def test_on_a_can_bus_a_frame_is_a_packet(run, tmp_path):
     assert "can" in shown and ("0x123" in shown or str(0x123) in shown), shown
 
 
-SCENARIO = """
-title = "calibrated"
-duration = 600.0
-after_trip = "wait"
-ready_laws = ["vsg-5"]
-[link]
-options = { portable = true }  # slow: over shared memory it would end with millions of ticks
-peer_timeout_s = 30.0
-"""
-
-
 @contextlib.contextmanager
 def mastered(folder: Path, *options: str) -> Iterator[Any]:
     """pyxcp, connected to a slave of the run in a process of its own."""
@@ -339,7 +329,7 @@ def test_pyxcp_measures_and_calibrates_a_run(tmp_path):
             first = read("tick")
             write("P_ref", 0.8)
             write("active_law", 1.0)
-            write("vsg_5.D_p", 0.012)
+            write("vsg_5_tuned.D_p", 0.012)
             assert read("tick") > first and read("ref_P_ref") == 0.8
             with pytest.raises(BaseException, match="OUT_OF_RANGE"):
                 master.setMta(where["P_ref"])
@@ -361,4 +351,4 @@ def test_pyxcp_measures_and_calibrates_a_run(tmp_path):
     with np.load(folder / "signals.npz") as file:
         # the plant may have sampled once more before it ended
         steps = [x[~np.isnan(x)][-1] for x in (file["ref_P_ref"], file["law"])]
-    assert steps == [0.8, 2.0]  # the law's third entry: vsg-5 with its new gain
+    assert steps == [0.8, 3.0]  # the law's fourth entry: vsg-5-tuned with its new gain
