@@ -41,15 +41,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(name: str, link: dict[str, Any], **content: Any) -> str:
-    # a tick takes 0.1 s: each poll of a loop is a system call, and the loops share one processor
-    text = {
-        "title": "test",
-        "duration": 0.01,
-        "events": EVENTS,
-        "link": {**LINK, **link},
-        **content,
-    }
-    Path(name).write_text(toml_text(text))
+    # a tick takes 0.1 s: each poll is a system call, and both loops share one processor
+    base = {"title": "test", "duration": 0.01, "events": EVENTS, "link": LINK | link}
+    Path(name).write_text(toml_text(base | content))
     return name
 
 
