@@ -128,9 +128,7 @@ def conform(
     if not given and external is None:
         raise UserError("law, controller: name one to test")
     sets = [against] if isinstance(against, str | Path) else list(against)
-    place = _new_place(folder)
-    if isinstance(workers, str):  # those of a cluster have working directories of their own
-        place = place and place.absolute()
+    place = _new_place(folder, workers)
     cases, under = load_cases([str(one) for one in sets]), load_under_test(converter)
     if over is not None:
         under = under.model_copy(update={"plant": over.plant})
@@ -173,12 +171,13 @@ def _network(
     return over
 
 
-def _new_place(folder: str | Path | None) -> Path | None:
+def _new_place(folder: str | Path | None, workers: int | str = 1) -> Path | None:
     """The folder of a report. Raises UserError: it holds something."""
     if folder is None:
         return None
     check_empty(Path(folder))
-    return Path(folder)
+    # the workers of a cluster have working directories of their own
+    return Path(folder).absolute() if isinstance(workers, str) else Path(folder)
 
 
 def _write_report(made: Conformity, watch: Watch) -> Conformity:

@@ -145,7 +145,7 @@ def run_tasks(
             future.cancel()
 
 
-class Processes(Pool):
+class ProcessPool(Pool):
     """So many processes with one thread each, forked when there is work from a server that has
     imported what all need; others take the place of those that died."""
 
@@ -175,12 +175,12 @@ class Processes(Pool):
 
 
 @contextlib.contextmanager
-def processes(workers: int) -> Iterator[Processes]:
+def processes(workers: int) -> Iterator[ProcessPool]:
     """A pool of processes, whose server begins to import at once. All end with this process, and a
     KeyboardInterrupt in this context ends them at once."""
     before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    pool = Processes(workers)
+    pool = ProcessPool(workers)
     try:
         # it starts with SIGINT blocked: Ctrl-C is the parent's to handle, also while it imports
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
