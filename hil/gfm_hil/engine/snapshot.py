@@ -29,9 +29,11 @@ from gfm_runtime.assembly import SPARE
 if TYPE_CHECKING:
     from gfm_hil.engine.external_ticks import SteppedController
     from gfm_hil.engine.setup import Bench
+    from gfm_plant.wiring import Wiring
 
 _LARGEST = 1 << 30  # bytes of a file
 _SAME = ("T_s", "inner", "counts", "seed", "references", "plant", "network")
+_CHANGED = ("units", "branches", "opened", "closed", "blocked")  # of a wiring, by events
 _OWN = ("ctl", "laws", "states", "est")  # records of a controller of ours
 
 
@@ -39,19 +41,21 @@ def keep_snapshot(bench: Bench, folder: Path, roles: Sequence[Role]) -> None:
     """Write down the state of one side, or of both in process, between two ticks.
 
     Raises:
-        ValueError: a law has other gains than its file, or the connections are not those of the
-            start, so that a run of this scenario could not begin here.
+        ValueError: a law has other gains than its file, or something in the network is under way,
+            so that a run of this scenario could not begin here.
         gfm_hil.controllers.ControllerError: a controller that is not ours refuses.
         OSError: it cannot be written.
     """
     if "plant" in roles and bench.place == 0:
-        plant = bench.plant
+        plant, wired = bench.plant, bench.wired
+        settled = replace(plant.wiring, fault=None, opening=())  # without what is over
         over = not any(phases for phases, _ in plant.conducting().values())
-        if over and replace(plant.wiring, fault=None) == bench.wired != plant.wiring:
-            plant.rewire(bench.wired)  # without the place of a fault that is over
-        if plant.wiring != bench.wired:
-            raise ValueError("the connections of the plant are not those of its start")
-        _write(_file(folder, "plant"), _memory(bench))
+        changed = {name: getattr(wired, name) for name in _CHANGED}
+        if not over or replace(settled, **changed) != wired:
+            raise ValueError("a fault, a breaker that opens or a synchro-check goes on")
+        if settled != plant.wiring:
+            plant.rewire(settled)
+        _write(_file(folder, "plant"), _memory(bench) | _connections(settled))
     if "controller" in roles:
         c = bench.controller
         if c.gains or int(c.ctl["active"][0]) >= len(c.laws) - SPARE:
@@ -72,7 +76,10 @@ def start_from(scenario: Scenario, benches: Sequence[Bench]) -> None:
         own = _folder(folder, bench)
         if bench.place == 0:
             kept = _read(_file(own, "plant"), where)
-            plant, own_net = bench.plant, bench.plant.net.copy()
+            plant = bench.plant
+            if (wiring := _connected(plant.wiring, kept, where)) != plant.wiring:
+                plant.rewire(wiring)
+            own_net = plant.net.copy()
             for name, record in _memory(bench).items():
                 put_back(where, kept, name, record)
             plant.keep_addresses([int(own_net[name][0]) for name in WAYS])
@@ -110,6 +117,38 @@ def _folder(folder: Path, bench: Bench) -> Path:
 
 def _file(folder: Path, role: Role) -> Path:
     return folder / f"snapshot_{role}.npz"
+
+
+def _connections(wiring: Wiring) -> State:
+    """What events change of a wiring and a snapshot keeps: ``_CHANGED``."""
+    lines = [(unit.L_g, unit.R_g) for unit in wiring.units]
+    return {
+        "opened": np.array(sorted(wiring.opened), str),
+        "closed": np.array([wiring.closed]),
+        "blocked": np.array(sorted(wiring.blocked), int),
+        "lines": np.array([*lines, *((one.L, one.R) for one in wiring.branches)]),
+    }
+
+
+def _connected(wiring: Wiring, kept: State, where: str) -> Wiring:
+    """A wiring with what a snapshot kept. Raises UserError: it is of another network."""
+    n = len(wiring.units)
+    lines = np.zeros((n + len(wiring.branches), 2))
+    put_back(where, kept, "lines", lines)
+    return replace(
+        wiring,
+        units=tuple(
+            replace(unit, L_g=L, R_g=R)
+            for unit, (L, R) in zip(wiring.units, lines[:n].tolist(), strict=True)
+        ),
+        branches=tuple(
+            replace(branch, L=L, R=R)
+            for branch, (L, R) in zip(wiring.branches, lines[n:].tolist(), strict=True)
+        ),
+        closed=bool(kept["closed"][0]),
+        opened=frozenset(kept["opened"].tolist()),
+        blocked=frozenset(kept["blocked"].tolist()),
+    )
 
 
 def _memory(bench: Bench) -> State:

@@ -275,10 +275,48 @@ def test_a_snapshot_after_a_fault_and_a_trip(tmp_path):
             assert rest.columns[name][:].tobytes() == whole.columns[name][200:].tobytes()
 
 
-def test_a_snapshot_while_the_connections_are_others(tmp_path):
+def test_a_snapshot_in_a_fault_is_refused(tmp_path):
     given = {"title": "cut", "duration": 0.01, "law": "vsg-2", "link": {"type": "inproc"},
              "snapshot": 0.006}  # fmt: skip
     fault = {"type": "fault", "t": 0.005, "position": 0.5, "R": 0.2, "duration": 0.004}
     run = gfmhil.run({**given, "events": [fault]}, folder=tmp_path / "cut", figures=False)
-    said = "the snapshot cannot be kept: the connections of the plant are not those of its start"
+    said = "the snapshot cannot be kept: a fault, a breaker that opens or a synchro-check goes on"
     assert (run.status, run.summary["reason"]) == ("safe", said)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ({"type": "breaker", "name": "base", "closed": False}, []),
+        ({"type": "breaker", "name": "base", "closed": False}, [{"type": "breaker",
+          "name": "base", "closed": True}]),
+        ({"type": "grid-breaker", "closed": False}, [{"type": "grid-breaker", "closed": True}]),
+        ({"type": "breaker", "name": "to grid", "closed": False}, [{"type": "reset",
+          "converter": "C"}]),
+    ],
+)  # fmt: skip
+def test_a_snapshot_has_the_breakers_of_its_tick(before, after, tmp_path):
+    given = network(
+        link={"type": "inproc"}, after_trip="wait",
+        events=[{"t": 0.01, **before}, *({"t": 0.07, **one} for one in after)],
+    )  # fmt: skip
+    given["network"]["loads"]["far"] = {"node": "bus", "P": 0.1}
+    low = {"over_current": {"threshold": 0.45, "delay_s": 0.0}}
+    given["network"]["converters"]["C"]["plant"] = {**RIG, "protection": low}  # trips in the island
+    whole = gfmhil.run_network(given, tmp_path / "cut", figures=False, snapshot=CUT * T_S)
+    later = {**given, "events": [{"t": 0.02, **one} for one in after], "duration": 0.05}
+    rest = gfmhil.run_network(later, start_from=str(tmp_path / "cut"))
+    for name, run in rest.items():
+        assert run.status == whole[name].status == "completed"
+        check_equal(run, whole[name], CUT, OF_TIME)
+
+
+def test_a_snapshot_has_the_line_of_its_tick(tmp_path):
+    given = {"title": "cut", "law": "vsg-2", "link": {"type": "inproc"},
+             "plant": {"grid": {"scr": 3.0, "x_over_r": 5.0}}}  # fmt: skip
+    weaker = [{"type": "grid-impedance", "t": 0.01, "scr": 2.0, "x_over_r": 5.0}]
+    first = {"events": weaker, "duration": 0.1, "snapshot": CUT * T_S}
+    whole = gfmhil.run({**given, **first}, folder=tmp_path / "cut", figures=False)
+    rest = gfmhil.run({**given, "duration": 0.05, "start_from": str(tmp_path / "cut")})
+    check_equal(rest, whole, CUT, OF_TIME)
