@@ -292,8 +292,7 @@ def test_a_snapshot_in_a_fault_is_refused(tmp_path):
         ({"type": "breaker", "name": "base", "closed": False}, [{"type": "breaker",
           "name": "base", "closed": True}]),
         ({"type": "grid-breaker", "closed": False}, [{"type": "grid-breaker", "closed": True}]),
-        ({"type": "breaker", "name": "to grid", "closed": False}, [{"type": "reset",
-          "converter": "C"}]),
+        ({"type": "grid-phase-jump", "degrees": -30.0}, [{"type": "reset", "converter": "C"}]),
     ],
 )  # fmt: skip
 def test_a_snapshot_has_the_breakers_of_its_tick(before, after, tmp_path):
@@ -302,9 +301,10 @@ def test_a_snapshot_has_the_breakers_of_its_tick(before, after, tmp_path):
         events=[{"t": 0.01, **before}, *({"t": 0.07, **one} for one in after)],
     )  # fmt: skip
     given["network"]["loads"]["far"] = {"node": "bus", "P": 0.1}
-    low = {"over_current": {"threshold": 0.45, "delay_s": 0.0}}
-    given["network"]["converters"]["C"]["plant"] = {**RIG, "protection": low}  # trips in the island
+    low = {"over_current": {"threshold": 0.6, "delay_s": 0.0}}
+    given["network"]["converters"]["C"]["plant"] = {**RIG, "protection": low}
     whole = gfmhil.run_network(given, tmp_path / "cut", figures=False, snapshot=CUT * T_S)
+    assert len(whole["C"].summary["trips"]) == (before["type"] == "grid-phase-jump")
     later = {**given, "events": [{"t": 0.02, **one} for one in after], "duration": 0.05}
     rest = gfmhil.run_network(later, start_from=str(tmp_path / "cut"))
     for name, run in rest.items():
