@@ -114,7 +114,8 @@ def with_machine(place: Path | None = None) -> Scenario:
 
 
 def with_synchronous_machine(place: Path | None = None) -> Scenario:
-    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, "avr": {"K": 50.0}}
+    controls = {"avr": {"type": "EXDC2", "T_B": 1.0, "T_C": 0.5}, "governor": {"type": "HYGOV"}}
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, **controls}
     core = {"core": {"node": "far", "S": 1.0}}
     parts = {"machines": {}, "synchronous_machines": {"M": machine}, "saturations": core}
     return island(**{**MACHINE, **parts})
@@ -122,7 +123,7 @@ def with_synchronous_machine(place: Path | None = None) -> Scenario:
 
 def with_controls(place: Path | None = None) -> Scenario:
     saturated = {"E_1": 1.0, "S_E1": 0.04, "E_2": 2.0, "S_E2": 0.33}
-    controls = {"avr": {"type": "IEEET1", **saturated}, "governor": {"D_t": 0.1}, "pss": {}}
+    controls = {"avr": {"type": "IEEET1", **saturated}, "governor": {"type": "IEEEG1"}, "pss": {}}
     machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "D": 1.0, "S_10": 0.1, "S_12": 0.3}
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine | controls}})
 

@@ -12,6 +12,9 @@ from scipy.integrate import solve_ivp
 from gfm_plant.components import SynchronousMachine
 from gfm_plant.components.controls import EXCITERS, GOVERNORS, STABILISERS
 from gfm_plant.components.controls.control import Control
+from gfm_plant.components.controls.exdc2 import Exdc2
+from gfm_plant.components.controls.hygov import Hygov
+from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
 from gfm_plant.components.controls.pss1a import Pss1a
 from gfm_plant.components.controls.sexs import Sexs
@@ -48,6 +51,9 @@ def stepped(one: Control, output: float, seen: float, by: float, t: np.ndarray) 
 
 SEXS = Sexs(K=50.0, T_A=0.4, T_B=1.5, E_min=-5.0)
 IEEET1 = Ieeet1(V_Rmin=-8.0, V_Rmax=8.0)
+EXDC2 = Exdc2(T_B=1.2, T_C=0.3, V_Rmin=-8.0, V_Rmax=8.0)
+IEEEG1 = Ieeeg1(T1=0.1, T2=0.05, T6=0.4, K1=0.2, K3=0.3, K5=0.3, K7=0.1)  # T7 left out
+HYGOV = Hygov(D_turb=0.0)
 TGOV1 = Tgov1(D_t=0.3)
 PSS1A = Pss1a(T6=0.02, A1=0.05, A2=0.001, V_STmin=-9.0, V_STmax=9.0)
 PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
@@ -63,6 +69,14 @@ PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
             (np.polymul([20.0], [0.35, 1]),
              np.polyadd(product(([1], [0.2, 1]), ([1], [0.314, 1]), ([1], [0.35, 1]))[1],
                         [20.0 * 0.063, 0.0])),
+        ]),
+        # the same with its lead and lag within the loop
+        (EXDC2, 1.8, 1.02, [
+            ([-1.0], [0.02, 1]),
+            (product(([20.0], [1]), ([0.3, 1], [1]), ([0.35, 1], [1]))[0],
+             np.polyadd(product(([1], [1.2, 1]), ([1], [0.2, 1]), ([1], [0.314, 1]),
+                                ([1], [0.35, 1]))[1],
+                        np.polymul([0.3, 1], [20.0 * 0.063, 0.0]))),
         ]),
         (Pss1a(T6=0.0, A1=0.0, A2=0.0), 0.0, 0.0, [
             ([200.0, 0], [10.0, 1]), ([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]),
@@ -91,6 +105,52 @@ def test_a_governor_by_its_block_diagram():
     assert TGOV1.per_speed() == 20.3
 
 
+def test_a_governor_of_one_shaft_by_its_block_diagram():
+    t, by = np.linspace(0.0, 30.0, 300), 1e-4
+    ahead = product(([-20.0], [1]), ([0.05, 1], [0.1, 1]), ([1], [0.1, 1]), ([1], [0.3, 1]))
+    behind_5 = product(ahead, ([1], [7.0, 1]))
+    behind_6 = product(behind_5, ([1], [0.4, 1]))
+    parts = ((0.2, ahead), (0.3, behind_5), (0.4, behind_6))
+    exact = sum(share * signal.step(system, T=t)[1] for share, system in parts)
+    np.testing.assert_allclose(stepped(IEEEG1, 0.6, 0.0, by, t), by * exact, atol=1e-8)
+    assert IEEEG1.per_speed() == pytest.approx(18.0)
+
+
+def test_a_governor_of_one_shaft_opens_no_faster_than_it_may():
+    t = np.linspace(0.0, 1.0, 50)
+    one = Ieeeg1(T4=0.0, T5=0.0, K1=1.0, K3=0.0, U_o=0.1)
+    found = stepped(one, 0.5, 0.0, -0.05, t)
+    np.testing.assert_allclose(found, 0.1 * t, atol=1e-6)
+
+
+def test_a_hydraulic_governor_by_its_linear_model():
+    """Of small steps: the gate by the permanent and the temporary droop, and the water behind it,
+    whose inertia acts against it at first."""
+    t, by, P = np.linspace(0.0, 400.0, 4001), 1e-6, 0.6
+    g = P / 1.2 + 0.08
+    error = product(([1], [0.05, 1]), ([5.0, 1], [0.5 * 5.0, 0.0]))  # c by set - w - R c
+    gate = error[0], np.polyadd(error[1], 0.05 * error[0])
+    # of h (q - q_NL) with h = (q/g)^2: dq/dt = (2/T_W) (dg - dq) / g
+    slope = 2.0 * (g - 0.08) / g
+    # dP/A_t = dq + slope (dq - dg)
+    turbine = 1.2 * np.polysub([0.0, 2.0 / g], [slope, 0.0]), np.array([1.0, 2.0 / g])
+    system = product((-gate[0], gate[1]), ([1], [0.2, 1]), turbine)
+    _, exact = signal.step(system, T=t)
+    found = stepped(HYGOV, P, 0.0, by, t)
+    np.testing.assert_allclose(found, by * exact, atol=1e-9)
+    assert found[-1] == pytest.approx(-by * 1.2 / 0.05, rel=1e-2)
+    assert found[1] > 0
+
+
+def test_the_limits_of_a_commutator_exciter_follow_the_voltage():
+    one = Exdc2(V_Rmax=2.0, V_Rmin=-2.0)
+    _, asked = one.rest(1.5, 1.0)
+    out, p = np.zeros(5), np.array(one.numbers())
+    Exdc2.rates.py_func(p, np.array([0.5, 2.0, 1.5, 1.5, 0.1]), 0, 0.5, asked, out)
+    assert out[1] == 0.0  # at 0.5 p.u. it is beyond its limit, and rises no further
+    assert out[2] == pytest.approx((0.5 * 2.0 - 1.5) / 0.314)
+
+
 def test_the_saturation_passes_both_points():
     one = Ieeet1(E_1=2.8, S_E1=0.04, E_2=3.73, S_E2=0.33)
     for E, S_E in ((2.8, 0.04), (3.73, 0.33)):
@@ -101,8 +161,9 @@ def test_the_saturation_passes_both_points():
 
 def test_a_rest_does_not_move():
     saturated = Ieeet1(E_1=2.8, S_E1=0.04, E_2=3.73, S_E2=0.33)
-    for one in (SEXS, IEEET1, saturated, TGOV1, PSS1A, PLAIN):
+    for one in (SEXS, IEEET1, EXDC2, saturated, TGOV1, IEEEG1, HYGOV, PSS1A, PLAIN):
         output, seen = (0.0, 0.01) if isinstance(one, Pss1a) else (3.0, 0.01)
+        seen = 1.0 if isinstance(one, Exdc2) else seen
         states, asked = one.rest(output, seen)
         out = np.zeros(len(states))
         found = type(one).rates.py_func(np.array(one.numbers()), states, 0, seen, asked, out)
@@ -133,7 +194,11 @@ def kind_of(one: Control) -> str:
     ("more", "message"),
     [
         ({"avr": {"type": "IEEET2"}}, "'SEXS', 'IEEET1'"),
-        ({"governor": {"type": "HYGOV"}}, "'TGOV1'"),
+        ({"governor": {"type": "GAST"}}, "'TGOV1', 'IEEEG1', 'HYGOV'"),
+        ({"governor": {"type": "IEEEG1", "K1": 0.0, "K3": 0.0}}, "K1, K3, K5 and K7 are 0"),
+        ({"governor": {"type": "IEEEG1", "T2": 0.1}}, "T1 = 0: must be above 0 with T2 = 0.1"),
+        ({"governor": {"type": "HYGOV", "G_min": 1.0}}, "G_min = 1: must be less than G_max, 1"),
+        ({"avr": {"type": "EXDC2", "T_C": 0.1}}, "T_B = 0: must be above 0 with T_C = 0.1"),
         ({"governor": {"T1": -0.5}}, "greater than 0"),
         ({"governor": {"V_min": 1.5}}, "V_min = 1.5: must be less than V_max, 1.2"),
         ({"governor": {}, "droop": 0.04}, "droop = 0.04: leave it out, the governor has its own"),

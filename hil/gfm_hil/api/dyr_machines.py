@@ -1,6 +1,7 @@
 """Machines and their controls of a dynamic data file of PSS/E (.dyr)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,8 @@ class Machines(NamedTuple):
 
 
 def read_machines(path: str | Path) -> Machines:
-    """Read the records of GENROU, and of its controls SEXS, IEEET1, TGOV1, PSS1A and IEEEST.
+    """Read the records of GENROU, and of its controls: the exciters SEXS, IEEET1 and EXDC2, the
+    governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST.
 
     Raises:
         UserError: the file cannot be read, has no machine, or a record is none; the message has the
@@ -70,13 +72,27 @@ def _sexs(p: Numbers) -> Made:
     return _lagging({"type": "SEXS", "T_R": 0.0, "T_A": T_A, **p}, "T_R", "T_B", "T_E")
 
 
-def _ieeet1(p: Numbers) -> Made:
+def _rotating(type: str, p: Numbers) -> Made:
     p.pop("switch")
-    return _lagging({"type": "IEEET1", **p}, "T_R", "T_A", "T_E", "T_F")
+    content, notes = _lagging({"type": type, **p}, "T_R", "T_A", "T_E", "T_F")
+    if p["E_1"] == 0.0 and p["S_E2"] > 0.0:  # no two points of it
+        content["S_E1"] = content["S_E2"] = 0.0
+        notes.append("its saturation has no first point and is left out")
+    return content, notes
 
 
 def _tgov1(p: Numbers) -> Made:
     return _lagging({"type": "TGOV1", **p}, "T1", "T3")
+
+
+def _ieeeg1(p: Numbers) -> Made:
+    shafts = [p.pop(name) for name in ("bus", "machine", "K2", "K4", "K6", "K8")][2:]
+    content, notes = _lagging({"type": "IEEEG1", **p}, "T3")
+    return content, notes + ["its shaft of low pressure is left out"] * any(shafts)
+
+
+def _hygov(p: Numbers) -> Made:
+    return _lagging({"type": "HYGOV", **p}, "T_r", "T_f", "T_g", "T_W")
 
 
 def _stabiliser(p: Numbers) -> Made:
@@ -98,6 +114,7 @@ def _lagging(content: dict[str, Any], *lags: str) -> Made:
     return content | dict.fromkeys(zero, _SHORT), [f"{n} = {_SHORT:g} s instead of 0" for n in zero]
 
 
+_SATURATION = ("switch", "E_1", "S_E1", "E_2", "S_E2")
 _LEADS = ("T1", "T2", "T3", "T4", "T5", "T6", "K_S", "V_STmax", "V_STmin", "V_CU", "V_CL")
 #: by model: which part of a machine it is, its numbers in the order of a record, and what makes it
 _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
@@ -110,9 +127,25 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
     "SEXS": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max"), _sexs),
     "IEEET1": (
         "avr",
-        ("T_R", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F", "switch", "E_1",
-         "S_E1", "E_2", "S_E2"),
-        _ieeet1,
+        ("T_R", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F", *_SATURATION),
+        partial(_rotating, "IEEET1"),
+    ),
+    "EXDC2": (
+        "avr",
+        ("T_R", "K_A", "T_A", "T_B", "T_C", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F",
+         *_SATURATION),
+        partial(_rotating, "EXDC2"),
+    ),
+    "IEEEG1": (
+        "governor",
+        ("bus", "machine", "K", "T1", "T2", "T3", "U_o", "U_c", "P_max", "P_min", "T4", "K1", "K2",
+         "T5", "K3", "K4", "T6", "K5", "K6", "T7", "K7", "K8"),
+        _ieeeg1,
+    ),
+    "HYGOV": (
+        "governor",
+        ("R", "r", "T_r", "T_f", "T_g", "VELM", "G_max", "G_min", "T_W", "A_t", "D_turb", "q_NL"),
+        _hygov,
     ),
     "TGOV1": ("governor", ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"), _tgov1),
     "PSS1A": ("pss", ("mode", "bus", "A1", "A2", *_LEADS), _stabiliser),

@@ -389,15 +389,15 @@ class SynchronousMachine(Rotating):
         for role, at, one in self._controls():
             states, record[f"{role}_set"] = one.rest(*seen[role])
             record["x"][at : at + len(states)] = states
-            self._check_limits(role, one, states)
+            self._check_limits(role, one, states, seen[role][1])
         psi = complex(E_q - (self.X_d1 - self.X_2) * i_d, -E_d - (self.X_q1 - self.X_2) * i_q)
         record["psi_middle"], record["psi_slope"] = psi, 0j
         record["omega"] = record["omega_middle"] = omega
         record["E"] = record["E_middle"] = 1j * omega * psi
         return complex(record["E"]) * unit
 
-    def _check_limits(self, role: str, one: Control, states: Sequence[float]) -> None:
-        for place, (least, most) in one.limits().items():
+    def _check_limits(self, role: str, one: Control, states: Sequence[float], seen: float) -> None:
+        for place, (least, most) in one.limits_at(seen).items():
             if not least < states[place] < most:
                 name = one.states[place][0]
                 raise NoEquilibrium(

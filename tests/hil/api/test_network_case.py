@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import gfmhil
+from gfm_hil.api.dyr_machines import read_machines
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
+from gfm_plant.components import SynchronousMachine
 
 pandapower = pytest.importorskip("pandapower")
 networks = pytest.importorskip("pandapower.networks")
@@ -203,8 +205,30 @@ DYNAMICS = """\
   6.4 0.0 0.8958 0.8645 0.1198 0.1969 0.089 0.0521 0.1 0.2 /
 2 'SEXS' 1 0.1 10.0 100.0 0.05 0.0 5.0 /
 2 'IEEEST' 1 1 0 0 0 0 0 0 0 0.05 0.02 3.0 5.4 10.0 5.0 20.0 0.2 -0.2 0 0 /
-2 'EXDC2' 1 0 0 /
+2 'HYGOV' 1 0.05 0.5 5.0 0.05 0.2 0.2 1.0 0.0 1.0 1.2 0.5 0.08 /
+2 'ESST3A' 1 0 0 /
 """
+
+
+#: two machines of a shipped file of PSS/E for IEEE's 14 and Kundur's buses
+PUBLISHED = """\
+1 'GENROU' 1 6.5 0.06 0.2 0.05 6.5 0.0 1.8 1.75 0.6 0.8 0.28 0.15 0.09 0.38 /
+1 'EXDC2 ' 1 0.02 20.0 0.02 1.0 1.0 5.2 -4.16 1.0 0.83 0.0754 1.246 0.0 0.0 0.0 1.0 1.0 /
+1 'IEEEG1' 1 0 0 20.0 0.1 0.0 0.2 1.0 -1.0 0.95 0.0 0.1 0.0 0.0 0.0 0.0 0.0 0.0 0.3 0.0 8.72 0.7 0.0 /
+"""  # noqa: E501
+
+
+def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
+    file = tmp_path / "published.dyr"
+    file.write_text(PUBLISHED)
+    machines, ignored = read_machines(file)
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **machines["1"])
+    assert (one.avr.T_B, one.avr.V_Rmin, one.avr.T_F, one.avr.saturation()) == (
+        1.0, -4.16, 1.246, (0.0, 0.0),
+    )  # fmt: skip
+    assert one.governor.gain() == 1.0 and (one.governor.T7, one.governor.P_max) == (8.72, 0.95)
+    assert (one.S_10, one.S_12) == (0.09, 0.38)
+    assert ignored == ["EXDC2 at bus 1: its saturation has no first point and is left out."]
 
 
 def test_machines_of_a_dynamics_file_run(tmp_path):
@@ -224,10 +248,11 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
         "D_t": 0.0,
     }  # fmt: skip
     assert (one["S_12"], two["S_10"], two["S_12"]) == (0.0, 0.1, 0.2)
-    assert (two["avr"]["T_A"], two["avr"]["K"], "governor" in two) == (1.0, 100.0, False)
+    assert (two["avr"]["T_A"], two["avr"]["K"]) == (1.0, 100.0)
+    assert [two["governor"][key] for key in ("type", "T_W", "q_NL")] == ["HYGOV", 1.0, 0.08]
     # its washout 20 · 10 s/(1 + 5 s), as ours is written
     assert (two["pss"]["K_S"], two["pss"]["T5"], two["pss"]["T6"]) == (40.0, 5.0, 0.0)
-    for line in ("T_R = 0.001 s instead of 0", "EXDC2 at bus 2 is"):
+    for line in ("T_R = 0.001 s instead of 0", "ESST3A at bus 2 is"):
         assert sum(line in said for said in case.ignored) in (1, 2), line
     run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.5)
     p = run["C3"].signals["p"]

@@ -8,16 +8,19 @@ from typing import Annotated, Any, Union
 
 from pydantic import BeforeValidator, Field
 
-from gfm_plant.components.controls.control import Control
+from gfm_plant.components.controls.control import Control, Exciter, Governor, Stabiliser
+from gfm_plant.components.controls.exdc2 import Exdc2
+from gfm_plant.components.controls.hygov import Hygov
+from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
 from gfm_plant.components.controls.pss1a import Pss1a
 from gfm_plant.components.controls.sexs import Sexs
 from gfm_plant.components.controls.tgov1 import Tgov1
 from gfm_runtime.compiled import inlined_as
 
-EXCITERS = (Sexs, Ieeet1)
-GOVERNORS = (Tgov1,)
-STABILISERS = (Pss1a,)
+EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2)
+GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov)
+STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a,)
 
 
 def _one_of(kinds: Sequence[type[Control]]) -> Any:

@@ -48,6 +48,10 @@ class Control(Options):
         """Between which values a state stays, by its place: a limit without wind-up."""
         return {}
 
+    def limits_at(self, seen: float) -> Mapping[int, tuple[float, float]]:
+        """The limits at what it sees at a rest, those that follow it included."""
+        return self.limits()
+
     def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
         """Its states, and what it is asked for, where nothing moves."""
         raise NotImplementedError

@@ -38,7 +38,7 @@ class Ieeet1(Exciter):
     defaults are those of the WSCC's system of nine buses (Anderson and Fouad), without its
     saturation."""
 
-    states: ClassVar = (
+    states: ClassVar[Sequence[tuple[str, str, str]]] = (
         ("V_m", "p.u.", "voltage that it has measured"),
         ("V_R", "p.u.", "output of the regulator"),
         ("E_fd", "p.u.", "excitation"),
