@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -33,6 +33,7 @@ _DC_STEP = 0.2  # largest rate of the DC source's control times a step of the DC
 _PIECE = 0.5  # rad; largest angle through which a mode turns in half an interval of Simpson's rule
 _LOOK = 10e-6  # s; how often a peak-current limit looks at the current
 _ROUNDS = 100  # of the search for the currents of components
+_NEAR = 1e-9  # p.u.; between two rounds at its end
 _ALL = ("abc", 1)  # phases of a breaker that begins to open
 _MOST = 500  # steps of the DC link, or intervals of Simpson's rule, in a period
 
@@ -129,6 +130,7 @@ class Network:
         x: NDArray[np.float64],
         u: NDArray[np.float64],
         rests: Sequence[tuple[NDArray[np.float64], float]] = (),
+        voltages: Mapping[str, complex] | None = None,
     ) -> None:
         """Put a plant fresh from `make_plant` into an equilibrium.
 
@@ -138,6 +140,8 @@ class Network:
                 bridge's voltage. What closed lines connect turns at one speed.
             rests: unknowns of each component with a source, see ``Fed.steady``, and the speed of
                 its island, p.u.; none if they have no unknowns and turn with the first converter.
+            voltages: of the nodes there, p.u.; they count where a component's current rises so
+                steeply with its voltage that the search for both does not end.
         """
         x, u = np.atleast_2d(x), np.atleast_2d(u)
         u = np.pad(u[:, :COMPARE], ((0, 0), (0, COMPARE - u[:, :COMPARE].shape[1])))
@@ -165,11 +169,19 @@ class Network:
 
         w = rests_at(volts, turns)
         currents = [item for item in fed if not item[1].is_voltage]
+
+        def settle(seen: Sequence[Any]) -> NDArray[np.complex128]:
+            for (name, one, record, z, omega), v in zip(currents, seen, strict=True):
+                i = one.settle(record, v, omega, omega_b, z)
+                volts.update(zip(one.sources(name), np.atleast_1d(i).tolist(), strict=True))
+            return rests_at(volts, turns)
+
+        before = w
         for _ in range(_ROUNDS if currents else 0):  # they follow from the voltages
-            for name, one, record, z, omega in currents:
-                i = one.settle(record, w[record["sees"]].tolist(), omega, omega_b, z)
-                volts |= zip(one.sources(name), np.atleast_1d(i).tolist(), strict=True)
-            w = rests_at(volts, turns)
+            before, w = w, settle([w[record["sees"]].tolist() for _, _, record, _, _ in currents])
+        if voltages and not np.abs(w - before).max() < _NEAR:
+            known = [[voltages[node] for node in one.nodes] for _, one, _, _, _ in currents]
+            w = settle([v if len(v) > 1 else v[0] for v in known])
         for k, row in enumerate(x):  # as they are given: all digits
             i_f, v, i_o = (complex(*row[2 * j : 2 * j + 2]) * turn[k] for j in range(N_OWN))
             current = float(self.par[k]["current"])

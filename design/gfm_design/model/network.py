@@ -183,10 +183,10 @@ class NetworkLoop(LinearLoop):
             NoEquilibrium: there is no operating point, or a limit of an inner stage acts there.
         """
         refs = [np.asarray(ref, float) for ref in references]
-        points, components = operating_points(plant, laws, refs)
+        points, components, voltages = operating_points(plant, laws, refs)
         steady = plant.copy()
         x, u = (np.array([getattr(op, name) for op in points]) for name in ("x", "commands"))
-        steady.start(x, u, components)
+        steady.start(x, u, components, voltages)
         T_s = float(plant.net[0]["T_s"])
         members, delays, at_u, at_y = list[LinearConverter](), list[float](), 0, 0
         each = zip(plant.wiring.units, plant.par, laws, refs, points, strict=True)

@@ -101,7 +101,7 @@ def operating_point(
 
 def operating_points(
     plant: Network, laws: Sequence[DiscreteLaw], refs: Sequence[Vector]
-) -> tuple[list[OperatingPoint], list[tuple[Vector, float]]]:
+) -> tuple[list[OperatingPoint], list[tuple[Vector, float]], dict[str, complex]]:
     """Solve for the common operating point of several converters, each under its law.
 
     Unknowns are those of each converter, the voltages of the nodes, and those of components, such
@@ -115,15 +115,16 @@ def operating_points(
         laws, refs: of each converter, as for ``operating_point``.
 
     Returns:
-        That of each converter, its angle against the grid or, in an island, its first node; and of
-        each component with a source its unknowns and its speed, p.u., as `Network.start` takes
-        them.
+        That of each converter, its angle against the grid or, in an island, its first node; of each
+        component with a source its unknowns and its speed, p.u.; and the voltages of the nodes, as
+        `Network.start` takes them.
 
     Raises:
         NoEquilibrium: there is none, or Newton's method does not find it.
     """
     network = _NetworkEquilibrium(plant, laws, refs)
-    return network.found(network.solved())
+    z = network.solved()
+    return *network.found(z), network.voltages(z)
 
 
 def node_voltages(

@@ -1,4 +1,5 @@
-"""Machines and their controls of a dynamic data file of PSS/E (.dyr)."""
+"""Machines with their controls, and converters that follow the grid, of a dynamic data file of
+PSS/E (.dyr)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -16,15 +17,17 @@ Made = tuple[dict[str, Any], list[str]]
 
 
 class Machines(NamedTuple):
-    """What a file says of the machines."""
+    """What a file says of the generators, by the name of the bus."""
 
-    at: Mapping[str, dict[str, Any]]  #: by the name of the bus: keys of ``synchronous_machines``
+    at: Mapping[str, dict[str, Any]]  #: keys of ``synchronous_machines``
+    following: Mapping[str, dict[str, Any]]  #: keys of ``grid_following``
     ignored: Sequence[str]  #: what it says and this has not, or has otherwise
 
 
 def read_machines(path: str | Path) -> Machines:
     """Read the records of GENROU, and of its controls: the exciters SEXS, IEEET1 and EXDC2, the
-    governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST.
+    governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of REGCA1 with REECA1
+    or REECB1.
 
     Raises:
         UserError: the file cannot be read, has no machine, or a record is none; the message has the
@@ -36,7 +39,9 @@ def read_machines(path: str | Path) -> Machines:
         where = f"{path}, line {line}"
         if len(fields) < 3:
             raise UserError(f"{where}: must be a bus, a model in quotes, a machine and numbers")
-        bus, model = fields[0], fields[1].upper()
+        bus, model, given = fields[0], fields[1].upper(), fields[3:]
+        if model == "USRMDL" and len(given) > 6:
+            model, given = given[0].upper(), given[7:]
         if model not in _MODELS:
             ignored.append(f"{model} at bus {bus} is not known here and left out.")
             continue
@@ -44,16 +49,21 @@ def read_machines(path: str | Path) -> Machines:
         if key in found.setdefault(bus, {}):
             ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
             continue
-        if (count := len(fields) - 3) != len(names):
-            raise UserError(f"{where}: {model} has {len(names)} numbers, not {count}")
+        if len(given) != len(names):
+            raise UserError(f"{where}: {model} has {len(names)} numbers, not {len(given)}")
         numbers = {
-            name: number(f"{where}, {name}", text)
-            for name, text in zip(names, fields[3:], strict=True)
+            name: number(f"{where}, {name}", text) for name, text in zip(names, given, strict=True)
         }
         found[bus][key], notes = make(numbers)
         ignored += [f"{model} at bus {bus}: {note}." for note in notes]
-    machines = {}
+    machines, following = {}, {}
     for bus, parts in found.items():
+        control = parts.pop("control", {})
+        if (converter := parts.pop("converter", None)) is not None:
+            following[bus] = converter | control
+            if parts:
+                ignored.append(f"The machine at bus {bus} is left out beside a converter.")
+            continue
         own = parts.pop("machine", None)
         if own is None:
             ignored.append(f"The controls at bus {bus} are left out with their machine.")
@@ -62,9 +72,9 @@ def read_machines(path: str | Path) -> Machines:
             ignored.append(f"The stabiliser at bus {bus} is left out with its exciter.")
             parts.pop("pss")
         machines[bus] = own | parts
-    if not machines:
-        raise UserError(f"{path}: no record of GENROU")
-    return Machines(machines, list(dict.fromkeys(ignored)))
+    if not machines and not following:
+        raise UserError(f"{path}: no record of GENROU or REGCA1")
+    return Machines(machines, following, list(dict.fromkeys(ignored)))
 
 
 def _sexs(p: Numbers) -> Made:
@@ -108,12 +118,30 @@ def _stabiliser(p: Numbers) -> Made:
     return {"type": "PSS1A", **p}, notes
 
 
+def _regca1(p: Numbers) -> Made:
+    content, notes = _lagging({"T_i": p["Tg"]}, "T_i")
+    return content, [*notes, "a PLL and a lag Tg stand for it, without its logic by the voltage"]
+
+
+def _reec(p: Numbers) -> Made:
+    content, notes = _lagging({"I_max": p["Imax"], "k_V": p["Kqv"], "T_V": p["Trv"]}, "T_V")
+    content["band"] = max(p["dbd2"], -p["dbd1"])
+    if p["dbd2"] != -p["dbd1"]:
+        notes.append(f"dead band of {content['band']:g} on both sides")
+    if p["PQFLAG"]:
+        notes.append("reactive current comes first")
+    return content, [*notes, "its loops and tables are left out, P and Q are held"]
+
+
 def _lagging(content: dict[str, Any], *lags: str) -> Made:
     """With time constants that are positive, as ours must be."""
     zero = [name for name in lags if content[name] == 0.0]
     return content | dict.fromkeys(zero, _SHORT), [f"{n} = {_SHORT:g} s instead of 0" for n in zero]
 
 
+_REEC = ("Vdip", "Vup", "Trv", "dbd1", "dbd2", "Kqv", "Iqh1", "Iql1", "Vref0")
+_LOOPS = ("Tp", "Q_max", "Q_min", "V_max", "V_min", "Kqp", "Kqi", "Kvp", "Kvi")
+_POWER = ("Tiq", "dP_max", "dP_min", "P_max", "P_min", "Imax", "Tpord")
 _SATURATION = ("switch", "E_1", "S_E1", "E_2", "S_E2")
 _LEADS = ("T1", "T2", "T3", "T4", "T5", "T6", "K_S", "V_STmax", "V_STmin", "V_CU", "V_CL")
 #: by model: which part of a machine it is, its numbers in the order of a record, and what makes it
@@ -123,6 +151,23 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
          "S_10", "S_12"),
         lambda p: ({**p}, []),
+    ),
+    "REGCA1": (
+        "converter",
+        ("Lvplsw", "Tg", "Rrpwr", "Brkpt", "Zerox", "Lvpl1", "Volim", "Lvpnt1", "Lvpnt0", "Iolim",
+         "Tfltr", "Khv", "Iqrmax", "Iqrmin", "Accel"),
+        _regca1,
+    ),
+    "REECA1": (
+        "control",
+        ("bus", "PFFLAG", "VFLAG", "QFLAG", "PFLAG", "PQFLAG", *_REEC, "Iqfrz", "Thld", "Thld2",
+         *_LOOPS, "Vbias", *_POWER, *(f"{x}{k}" for x in ("Vq", "Vp") for k in range(8))),
+        _reec,
+    ),
+    "REECB1": (
+        "control",
+        ("bus", "PFFLAG", "VFLAG", "QFLAG", "PQFLAG", *_REEC, *_LOOPS, *_POWER),
+        _reec,
     ),
     "SEXS": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max"), _sexs),
     "IEEET1": (

@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,8 @@ def network_from(
             state there.
     """
     flow = read_pandapower(case, title)
+    machines = Machines({}, {}, ()) if dynamics is None else read_machines(dynamics)
+    flow = _with_following(flow, machines, f"{dynamics}")
     names = [bus.name for bus in flow.buses]
     laws = {
         str(bus): (one, 1.0) if isinstance(one, str) else (one[0], float(one[1]))
@@ -140,11 +142,25 @@ def network_from(
             )
     if slack not in ("machine", "grid"):
         raise UserError(f"slack = {slack!r}: must be machine or grid")
-    machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
-    for name in machines.at:
-        if name not in names:
-            raise UserError(f"{dynamics}: bus {name}: is no bus of {flow.title}")
     return _Build(flow, laws, slack == "grid", machines).case()
+
+
+def _with_following(flow: PowerFlow, machines: Machines, file: str) -> PowerFlow:
+    """A case whose generators that follow the grid by a dynamics file are static ones."""
+    buses, names = [*flow.buses], [bus.name for bus in flow.buses]
+    for name in (*machines.at, *machines.following):
+        if name not in names:
+            raise UserError(f"{file}: bus {name}: is no bus of {flow.title}")
+    for name in machines.following:
+        k = names.index(name)
+        bus = buses[k]
+        if k == flow.slack:
+            raise UserError(f"{file}: bus {name}: REGCA1 follows the grid, and this is the slack")
+        if bus.machine and bus.rating is not None:
+            S = bus.static_rating + bus.rating
+            static = bus.static + bus.machine
+            buses[k] = bus._replace(machine=0j, rating=None, static=static, static_rating=S)
+    return replace(flow, buses=buses)
 
 
 class _Build:
@@ -154,6 +170,7 @@ class _Build:
         self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool, machines: Machines
     ) -> None:
         self.flow, self.laws, self.machines = flow, laws, machines.at
+        self.following = machines.following
         whole = [bus.name for bus in flow.buses]
         short = [re.sub(r"(?i)^bus[\s_-]*(?=.)", "", name) for name in whole]
         self.names = short if len({*short}) == len(short) else whole  # in those of the parts
@@ -289,7 +306,10 @@ class _Build:
             return
         power = bus.static / bus.static_rating - 1j * _FILTER * abs(bus.V) ** 2
         node = {"node": self._node(k)}
-        values = {"S": S, "P": power.real, "Q": power.imag}
+        own = self.following.get(bus.name, {})
+        V, k_V, band = abs(bus.V), own.get("k_V", 0.0), own.get("band", 0.0)
+        supports = k_V * (max(1.0 - band - V, 0.0) - max(V - 1.0 - band, 0.0))  # p.u. of current
+        values = {"S": S, "P": power.real, "Q": power.imag - supports * V, **own}
         self._put("grid_following", f"F{self.names[k]}", node | values)
         self._put("capacitors", f"filter{self.names[k]}", node | {"Q": _FILTER * S})
 

@@ -169,14 +169,14 @@ def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
         if scenario.network is None:
             grid = scenario.plant.grid
             starts = [operating_point(plant.par, laws[0], refs[0], grid.omega_g, grid.V_g)]
-            rests = list[tuple[NDArray[np.float64], float]]()
+            rests, voltages = list[tuple[NDArray[np.float64], float]](), None
         else:
-            starts, rests = operating_points(plant, laws, refs)
+            starts, rests, voltages = operating_points(plant, laws, refs)
         for k, bench in enumerate(benches):
             for law in bench.controller.discrete:  # to which an event may change
                 check_dc_side(plant.par[k : k + 1], law)
         x, u = (np.array([getattr(s, name) for s in starts]) for name in ("x", "commands"))
-        plant.start(x, u, rests)
+        plant.start(x, u, rests, voltages)
         begin_set_points(plant, np.stack(refs)[:, SET_REF])
     except NoEquilibrium as problem:
         where = "references, plant.grid" if scenario.network is None else "network"

@@ -221,7 +221,7 @@ PUBLISHED = """\
 def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(PUBLISHED)
-    machines, ignored = read_machines(file)
+    machines, _, ignored = read_machines(file)
     one = SynchronousMachine(node="a", S=1.0, P=0.5, **machines["1"])
     assert (one.avr.T_B, one.avr.V_Rmin, one.avr.T_F, one.avr.saturation()) == (
         1.0, -4.16, 1.246, (0.0, 0.0),
@@ -229,6 +229,35 @@ def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
     assert one.governor.gain() == 1.0 and (one.governor.T7, one.governor.P_max) == (8.72, 0.95)
     assert (one.S_10, one.S_12) == (0.09, 0.38)
     assert ignored == ["EXDC2 at bus 1: its saturation has no first point and is left out."]
+
+
+#: a PV plant in the format of PSS/E, the second record as one of a user's library
+FOLLOWING = """\
+1 'GENROU' 1 8.96 0.04 0.31 0.06 23.64 0.0 1.46 0.969 0.3608 0.569 0.2 0.0836 0.0 0.0 /
+2 'REGCA1' 1 1 0.02 10.0 0.9 0.5 1.22 1.2 0.8 0.4 -1.3 0.02 0.7 99.0 -99.0 0.7 /
+2 'USRMDL' 1 'REECB1' 102 0 5 25 6 4 0 0 1 1 0
+  -99.0 99.0 0.01 -0.02 0.02 2.0 1.05 -1.05 1.0 0.02 0.4 -0.4 1.1 0.9 0.0 0.1 0.0 40.0
+  0.02 99.0 -99.0 1.0 0.0 1.1 0.04 /
+"""
+
+
+def test_converters_of_a_dynamics_file_follow_the_grid(tmp_path):
+    """With the support of the voltage, which is beyond the dead band in the power flow."""
+    file = tmp_path / "pv.dyr"
+    file.write_text(FOLLOWING)
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    network = case.content["network"]
+    assert [*network["synchronous_machines"]] == ["G1"] and [*network["grid_following"]] == ["F2"]
+    own = network["grid_following"]["F2"]
+    assert {key: own[key] for key in ("T_i", "I_max", "k_V", "band", "T_V")} == {
+        "T_i": 0.02, "I_max": 1.1, "k_V": 2.0, "band": 0.02, "T_V": 0.01,
+    }  # fmt: skip
+    assert any("REECB1 at bus 2: its loops" in line for line in case.ignored)
+    run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.2)
+    assert run.status == "completed" and np.ptp(run["C3"].signals["p"]) < 1e-6
+    file.write_text(FOLLOWING.replace("2 '", "1 '"))
+    with pytest.raises(UserError, match="bus 1: REGCA1 follows the grid, and this is the slack"):
+        gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
 
 
 def test_machines_of_a_dynamics_file_run(tmp_path):
@@ -266,7 +295,7 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
         ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
         ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
         ("1 '", "77 '", "bus 77: is no bus of case9"),
-        ("GENROU", "GENSAL", "no record of GENROU"),
+        ("GENROU", "GENSAL", "no record of GENROU or REGCA1"),
     ],
 )
 def test_a_dynamics_file_that_is_none_is_one_line(old, new, line, tmp_path, capsys):
