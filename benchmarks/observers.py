@@ -165,6 +165,7 @@ def _run(place: Path, clients: int, seconds: float, rounds: int) -> tuple[Timing
             if not line:
                 raise SystemExit("the run did not start")
         pollers.start()
+        theirs.close()  # else we wait for ever for one that has failed
         ours.recv()
         done = []
         for round_ in range(rounds):
