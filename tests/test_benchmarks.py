@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone]
+pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,6 +29,7 @@ def test_versus_motulator():
     assert found["gfmhil"]["median"] > found["motulator"]["median"] > 0
 
 
+@pytest.mark.alone
 @pytest.mark.full
 def test_observers():
     words = ["--clients", "3", "--rounds", "1", "--seconds", "0.3"]
@@ -38,6 +39,7 @@ def test_observers():
     assert none["answers_per_s"] == 0 < many["answers_per_s"]
 
 
+@pytest.mark.alone
 @pytest.mark.full
 def test_prevent_idle():
     rows = rows_of("prevent_idle", "--links", "shm", "--rounds", "1", "--seconds", "0.3")

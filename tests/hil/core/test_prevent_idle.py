@@ -11,7 +11,7 @@ from gfm_hil.realtime.prevent_idle import prevent_idle
 
 from ...support.processes import wait_for
 
-pytestmark = [pytest.mark.processes, pytest.mark.alone]
+pytestmark = pytest.mark.processes
 
 HERE = sorted(os.sched_getaffinity(0))[0]
 _IDLE = 5  # SCHED_IDLE

@@ -22,7 +22,6 @@ from ...support.xcp import CONNECT, datagram
 pytestmark = pytest.mark.processes
 
 
-@pytest.mark.alone
 @pytest.mark.attack(
     "23.6", "`run --scope --modbus --stream`, as in normal use",
     "nine lines of a traceback: a dictionary changed its size",
