@@ -8,7 +8,8 @@ tiers are marked; the last two run one test at a time unless ``-n`` says otherwi
 * ``processes``: real processes, sockets, real time,
 * ``systems``: a browser, user-mode Linux, systemd, a C compiler, kills, soaks.
 
-The mark ``alone`` is for tests of the last two that fail beside another one on two processors.
+The mark ``alone`` is for tests of the last two that fail beside another one on two processors, or
+let it fail.
 ``--tier`` chooses tiers; a path, ``-k`` or ``-m`` on the command line chooses from all of them.
 """
 
@@ -52,6 +53,7 @@ _MOST_WORKERS = 8  # more would compile the same functions once more each
 _LONGEST = (
     "test_wheel.py", "runtime/test_firmware_c.py", "hil/controllers/test_shared_start.py",
     "hil/engine/test_compiling.py", "hil/studies/test_conformity.py",
+    "hil/bench/test_peer.py", "hil/ports/test_modbus.py",
     "hil/engine/test_left_behind.py", "hil/recording/test_recover.py",
     "hil/engine/test_network_links.py", "hil/api/test_testing.py",
     "hil/controllers/test_controllers.py", "hil/controllers/test_pil.py",
