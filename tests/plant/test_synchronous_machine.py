@@ -314,6 +314,9 @@ def test_a_rest_that_the_regulator_cannot_hold():
         ({"X_2": 0.4}, r"X_d1 = 0.3: must be above that before it in X_l <= X_2 <= X_d1 <= X_d"),
         ({"X_l": 0.26}, r"X_2 = 0.25: must be above"),
         ({"avr": {"E_min": 6.0}}, r"E_min = 6: must be less than E_max, 5"),
+        # the parabola through these would begin below a flux of 0
+        ({"S_10": 0.2, "S_12": 0.2}, r"S_10 = 0.2: must be less than S_12 / 1.2 = 0.166667"),
+        ({"S_10": 0.1}, r"S_10 = 0.1: must be less than S_12 / 1.2 = 0 \(S_12 = 0\)"),
     ],
 )
 def test_data_of_no_machine(more, message):

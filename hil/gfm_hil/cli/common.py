@@ -300,7 +300,10 @@ def add_workers(command: argparse.ArgumentParser, default: str) -> None:
 
 def workers_of(options: argparse.Namespace, default: int) -> int | str:
     """How many processes a command is to use, or the address of a cluster."""
-    return options.dask or (default if options.workers is None else options.workers)
+    if options.dask is not None:
+        address: str = options.dask
+        return address
+    return default if options.workers is None else int(options.workers)
 
 
 def print_parts(parts: Iterable[str | Table]) -> None:

@@ -163,14 +163,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if re.fullmatch("--[a-zA-Z_-]+=--", text):  # of which argparse makes an empty list
             why = "-- cannot be a value; for a file of that name write ./--"
             return _refuse(OSError(errno.EINVAL, why, text))
-    with garbage_kept():  # a command's modules make a million objects, which stay
-        top = parser(given[0] if given else None)
     if given and not given[0].startswith("-") and given[0] not in COMMANDS:
         from gfm_hil.core.errors import UserError
         from gfm_runtime.errors import allowed
 
         return _refuse(UserError(f"{given[0]}: no command; {allowed(given[0], COMMANDS)}"))
     try:
+        with garbage_kept():  # a command's modules make a million objects, which stay
+            top = parser(given[0] if given else None)
         if not given:
             top.print_help()
             return 0

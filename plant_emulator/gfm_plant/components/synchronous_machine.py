@@ -293,8 +293,13 @@ class SynchronousMachine(Rotating):
 
     @model_validator(mode="after")
     def _saturates(self) -> Self:
-        if self.S_10 > self.S_12:
-            raise ValueError(f"S_10 = {self.S_10:g}: must be at most S_12, {self.S_12:g}")
+        # where they are equal the parabola begins at a flux of 0; S would be infinite there beyond
+        most = self.S_12 / 1.2
+        if self.S_10 > 0.0 and self.S_10 >= most:
+            raise ValueError(
+                f"S_10 = {self.S_10:g}: must be less than S_12 / 1.2 = {most:g} (S_12 ="
+                f" {self.S_12:g}), or the iron would saturate without a flux"
+            )
         return self
 
     @model_validator(mode="after")

@@ -64,6 +64,15 @@ TRIP = {
 }
 
 
+def test_ctrl_c_while_a_command_still_imports_is_no_traceback(monkeypatch, capsys):
+    def stopped(name: str | None) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(main.__globals__, "parser", stopped)
+    assert main(["conform", "--law", "vsg-2"]) == 130
+    assert capsys.readouterr() == ("", "")
+
+
 def assert_fits(text: str) -> None:
     """Check that the text fits 80 columns: no line is longer and no cell is cut."""
     assert max(map(len, text.splitlines())) <= 80

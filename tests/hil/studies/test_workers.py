@@ -107,3 +107,8 @@ def test_a_cluster_wants_its_package(tmp_path, monkeypatch, refused):
         said = refused(*command, "--dask", "tcp://127.0.0.1:9", "-o", str(tmp_path / "out"))
         assert "pip install 'gfmhil[dask]'" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_an_address_that_is_empty_is_no_word_for_this_machine(refused):
+    said = refused("campaign", "rig_mimo_gfm", "--dask", "", "-o", "x")  # as of a variable not set
+    assert "--dask : no scheduler there" in said
