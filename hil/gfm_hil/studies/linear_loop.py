@@ -38,21 +38,30 @@ def title_of(loop: ClosedLoop) -> str:
     return loop.origin.law.law.name if loop.origin else "loop"
 
 
-def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[ClosedLoop, str]:
-    """The loop of the scenario's first law, and its label; in a network that of ``converter``, or
-    of the converter to which this run folder belongs. Raises NoEquilibrium, UserError: there is no
-    operating point; or no converter is named, or one that the network does not have."""
+def converter_of_loop(scenario: Scenario, converter: str | None) -> str | None:
+    """The converter of a network whose loop it is: ``converter``, or the one to which this run
+    folder belongs; None without a network. Raises UserError: a network, and none is named."""
     if scenario.network is None:
-        law, label = initial_law(scenario)
-        loop = ClosedLoop.of(law, scenario.plant, scenario.references.vector())
-        loop.where = scenario.title
-        return loop, label
+        return None
     name = converter or scenario.converter
     if name is None:
         raise UserError(
             f"network: this takes the loop of one converter; --converter names it, one of"
             f" {scenario.converters}"
         )
+    return name
+
+
+def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[ClosedLoop, str]:
+    """The loop of the scenario's first law, and its label; in a network that of ``converter``, or
+    of the converter to which this run folder belongs. Raises NoEquilibrium, UserError: there is no
+    operating point; or no converter is named, or one that the network does not have."""
+    name = converter_of_loop(scenario, converter)
+    if name is None:
+        law, label = initial_law(scenario)
+        loop = ClosedLoop.of(law, scenario.plant, scenario.references.vector())
+        loop.where = scenario.title
+        return loop, label
     try:
         loop = network_loop(scenario).converter(name)
     except ValueError as problem:

@@ -16,6 +16,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.results.table import Table
 from gfm_hil.scenario import load_scenario
 from gfm_hil.studies.latency import as_json, tolerance_table, used_table
+from gfm_hil.studies.linear_loop import converter_of_loop
 
 _ALL = "all"
 _PARTS = 4  # of the bar, a law
@@ -51,13 +52,14 @@ def call(options: argparse.Namespace) -> int:
     if named is None:
         runs = (path for path in options.measured if (path / "scenario.toml").exists())
         named = str(next((path / "scenario.toml" for path in runs), "pref_step"))
-    scenario = load_scenario(named, inner=options.inner)
+    words = {"inner": "--inner", "converter": "--converter"}
+    scenario = load_scenario(named, words, converter=options.converter, inner=options.inner)
     for one in each:
         if abs(one.T_s - scenario.T_s) > 1e-12:
             raise UserError(
                 f"--from {one.name}: has T_s = {one.T_s:g} s, and the scenario {scenario.T_s:g} s"
             )
-    converter = options.converter or scenario.converter  # a converter's folder knows its own
+    converter = converter_of_loop(scenario, options.converter)
     chosen = options.law or [scenario.each[converter].law if converter else scenario.law]
     names = [*laws()] if chosen == [_ALL] else chosen
     found: dict[str, LatencyTolerance | UnstableLoop] = {}
