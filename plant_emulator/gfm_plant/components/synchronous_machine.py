@@ -293,9 +293,9 @@ class SynchronousMachine(Rotating):
 
     @model_validator(mode="after")
     def _saturates(self) -> Self:
-        # where they are equal the parabola begins at a flux of 0; S would be infinite there beyond
+        # from S_12 / 1.2 on, the parabola begins at a flux of 0 or below, and S has no bound there
         most = self.S_12 / 1.2
-        if self.S_10 > 0.0 and self.S_10 >= most:
+        if self.S_10 > 0.0 and most <= self.S_10:
             raise ValueError(
                 f"S_10 = {self.S_10:g}: must be less than S_12 / 1.2 = {most:g} (S_12 ="
                 f" {self.S_12:g}), or the iron would saturate without a flux"
