@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import ClosedLoop, frequencies_near
+from gfm_design.model.closed_loop import U_CARRIED, ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.api.transients import SCR
@@ -37,7 +37,7 @@ from gfm_hil.studies.certificate import CertifiedLaws
 from gfm_hil.studies.clearing import OF_ANGLE, ClearingTime
 from gfm_hil.studies.linear_loop import title_of
 from gfm_hil.studies.margin_figures import draw_sigma
-from gfm_runtime.signals import U_NAMES, Y_NAMES
+from gfm_runtime.signals import Y_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -551,7 +551,7 @@ def _gains(
 ) -> Iterable[tuple[str, Vector, NDArray[np.complex128]]]:
     """L at some channels, each with its name and the frequencies, Hz."""
     hz = _hz(loop)
-    for name in at or [U_NAMES[j] for j in loop.commands]:
+    for name in at or [U_CARRIED[j] for j in loop.commands]:
         try:
             yield name, hz, loop.loop_gain(name, 2 * np.pi * hz)
         except ValueError as problem:

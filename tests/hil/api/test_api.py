@@ -118,6 +118,10 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
     assert np.allclose(turned, np.round(turned)) and np.abs(np.diff(phase)).max() < 180
     labels = [line.get_label() for line in plot.nyquist(loop).lines]
     assert labels[:2] == ["omega_u", "E_u"]  # the regulated source ignores i_u
+    staged = gfmhil.Law.load("vsg-2").closed_loop("deep_sag")  # a stage commands both axes of E
+    for figure in (plot.bode(staged)[0], plot.nyquist(staged)):
+        labels = [line.get_label() for line in figure.lines]
+        assert labels[1:3] == ["E_u", "E_q"]
     _, y = loop.step_response("grid.V_g", 0.1)
     for axes, column in zip(plot.step(loop, "grid.V_g", 0.1), y.T, strict=True):
         assert np.array_equal(axes.lines[0].get_ydata(), column)
