@@ -43,7 +43,10 @@ from gfm_runtime.assembly import Controller
 from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, SET_REF, Vector, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
-ONE_CONVERTER = "network: this takes one converter; for several, gfmhil run or gfmhil.run_network"
+ONE_CONVERTER = (
+    "network: this takes one converter on its own grid; for a network, gfmhil run or"
+    " gfmhil.run_network"
+)
 
 
 @dataclass

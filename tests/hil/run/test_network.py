@@ -368,7 +368,7 @@ def test_a_campaign_in_a_network_tests_one_of_its_converters(tmp_path):
 
 
 def test_what_takes_one_converter_says_so():
-    with pytest.raises(UserError, match="network: this takes one converter"):
+    with pytest.raises(UserError, match="network: this takes one converter on its own grid"):
         gfmhil.run(content())
     with pytest.raises(UserError, match="network: the scenario has none"):
         gfmhil.run_network("pref_step")
