@@ -24,7 +24,7 @@ class Cluster(Pool):
         self.workers = sum(client.nthreads().values())
         self.in_hand = 2 * self.workers
         if not self.workers:
-            raise UserError(f"--dask {address}: the cluster has no workers")
+            raise UserError(f"cluster {address!r}: it has no workers")
 
     def submit(self, function: Callable[..., Result], *args: Any) -> Future[Result]:
         future: Future[Result] = self._executor.submit(function, *args)
@@ -35,12 +35,12 @@ class Cluster(Pool):
         for worker, theirs in self._on_each(partial(_versioned, digest)):
             if isinstance(theirs, Exception):
                 raise UserError(
-                    f"--dask {self._address}: {worker}: {theirs} (give paths in full, in folders"
+                    f"cluster {self._address!r}: {worker}: {theirs} (give paths in full, in folders"
                     " that all machines of the cluster share)"
                 )
             if theirs != mine:
                 words = "has another gfmhil, or other files of what is to be run"
-                raise UserError(f"--dask {self._address}: {worker} {words}")
+                raise UserError(f"cluster {self._address!r}: {worker} {words}")
 
     def check_shared(self, folder: Path) -> None:
         there = next(place for place in [folder, *folder.parents] if place.is_dir())
@@ -48,8 +48,8 @@ class Cluster(Pool):
             for worker, sees in self._on_each(Path(mark.name).is_file):
                 if sees is not True:
                     raise UserError(
-                        f"--dask {self._address}: {worker} does not see {there}: the report must be"
-                        " in a folder that all machines of the cluster share"
+                        f"cluster {self._address!r}: {worker} does not see {there}: the report"
+                        " must be in a folder that all machines of the cluster share"
                     )
 
     def _on_each(self, function: Callable[[], object]) -> list[tuple[str, object]]:
@@ -68,11 +68,11 @@ def cluster(address: str) -> Iterator[Cluster]:
     try:
         from distributed import Client
     except ImportError:
-        words = "--dask: needs the package distributed: pip install 'gfmhil[dask]'"
+        words = "a Dask cluster needs the package distributed: pip install 'gfmhil[dask]'"
         raise UserError(words) from None
     try:
         client: Any = Client(address, timeout="10s")
     except (OSError, ValueError) as problem:
-        raise UserError(f"--dask {address}: no scheduler there: {problem}") from None
+        raise UserError(f"cluster {address!r}: no scheduler there: {problem}") from None
     with client:
         yield Cluster(address, client)

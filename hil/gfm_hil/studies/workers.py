@@ -59,8 +59,11 @@ SILENT = Watch()
 def check_workers(workers: int | str) -> None:
     """Raise UserError unless so many processes can be; the address of a cluster is not looked
     up."""
-    if isinstance(workers, int) and not 1 <= workers <= MOST:
-        raise UserError(f"workers = {workers}: must lie in [1, {MOST}]")
+    if isinstance(workers, str):
+        return
+    if not isinstance(workers, int) or not 1 <= workers <= MOST:
+        words = f"must lie in [1, {MOST}], or be the address of a cluster"
+        raise UserError(f"workers = {workers}: {words}")
 
 
 class Pool:

@@ -111,4 +111,4 @@ def test_a_cluster_wants_its_package(tmp_path, monkeypatch, refused):
 
 def test_an_address_that_is_empty_is_no_word_for_this_machine(refused):
     said = refused("campaign", "rig_mimo_gfm", "--dask", "", "-o", "x")  # as of a variable not set
-    assert "--dask : no scheduler there" in said
+    assert "cluster '': no scheduler there" in said
