@@ -125,7 +125,7 @@ def _regca1(p: Numbers) -> Made:
 
 def _reec(p: Numbers) -> Made:
     content, notes = _lagging({"I_max": p["Imax"], "k_V": p["Kqv"], "T_V": p["Trv"]}, "T_V")
-    content["band"] = max(p["dbd2"], -p["dbd1"])
+    content["band"] = max(p["dbd2"], -p["dbd1"], 0.0)
     if p["dbd2"] != -p["dbd1"]:
         notes.append(f"dead band of {content['band']:g} on both sides")
     if p["PQFLAG"]:

@@ -28,7 +28,7 @@ from gfm_hil.studies.conformity.result import Conformity
 from gfm_hil.studies.conformity.sets import ALL, load_cases, load_under_test, under_test_file
 from gfm_hil.studies.envelopes import Unit
 from gfm_hil.studies.scan import FrequencyScan, measure_admittance
-from gfm_hil.studies.workers import SILENT, Watch, check_workers
+from gfm_hil.studies.workers import SILENT, Watch
 from gfm_runtime import law_file
 from gfm_runtime.inner_file import named_inner
 
@@ -119,7 +119,6 @@ def conform(
         WorkerLost: workers died of the same run, or one raised an error.
         KeyboardInterrupt: the watch stopped it.
     """
-    check_workers(workers)
     over = _network(network, judged, controller)
     given = [law] if isinstance(law, str | Path | Law) else list(law)
     external = external_controller(controller, ports)

@@ -56,16 +56,6 @@ class Watch:
 SILENT = Watch()
 
 
-def check_workers(workers: int | str) -> None:
-    """Raise UserError unless so many processes can be; the address of a cluster is not looked
-    up."""
-    if isinstance(workers, str):
-        return
-    if not isinstance(workers, int) or not 1 <= workers <= MOST:
-        words = f"must lie in [1, {MOST}], or be the address of a cluster"
-        raise UserError(f"workers = {workers}: {words}")
-
-
 class Pool:
     """Where the tasks of a study are worked on: in this process, one after the other.
 
@@ -215,12 +205,14 @@ def _set_up() -> None:
 def pool_of(workers: int | str) -> Iterator[Pool]:
     """So many processes, of which 1 is this one, or the Dask cluster at an address. Raises
     UserError: so many cannot be, or there is no such cluster."""
-    check_workers(workers)
     if isinstance(workers, str):
         from gfm_hil.studies.cluster import cluster
 
         with cluster(workers) as there:
             yield there
+    elif not isinstance(workers, int) or not 1 <= workers <= MOST:
+        words = f"must lie in [1, {MOST}], or be the address of a cluster"
+        raise UserError(f"workers = {workers}: {words}")
     elif workers == 1:
         yield Pool()
     else:

@@ -210,7 +210,7 @@ DYNAMICS = """\
 """
 
 
-#: two machines of a shipped file of PSS/E for IEEE's 14 and Kundur's buses
+#: of ANDES's ieee14.dyr and kundur_full.dyr
 PUBLISHED = """\
 1 'GENROU' 1 6.5 0.06 0.2 0.05 6.5 0.0 1.8 1.75 0.6 0.8 0.28 0.15 0.09 0.38 /
 1 'EXDC2 ' 1 0.02 20.0 0.02 1.0 1.0 5.2 -4.16 1.0 0.83 0.0754 1.246 0.0 0.0 0.0 1.0 1.0 /

@@ -27,15 +27,7 @@ from gfm_hil.studies.campaign.worker import (
     record,
     run_chunk,
 )
-from gfm_hil.studies.workers import (
-    SILENT,
-    Pool,
-    Watch,
-    WorkerLost,
-    check_workers,
-    pool_of,
-    run_tasks,
-)
+from gfm_hil.studies.workers import SILENT, Pool, Watch, WorkerLost, pool_of, run_tasks
 
 CHUNK = 32  # runs a task: half a second, so that little is lost and little is waited for
 _FILE = "runs.jsonl"
@@ -128,7 +120,6 @@ def run_campaign(
     """As ``gfmhil.campaign``, with law files by name. Raises UserError: one line a mistake; the
     folder is in use. Raises WorkerLost: workers died of the same runs, or one raised an error; its
     ``result`` has all others."""
-    check_workers(workers)
     if resume and folder is None:
         raise UserError("resume: goes with the folder to go on with (--out)")
     began, lost, store = time.monotonic(), None, None

@@ -36,7 +36,7 @@ def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> floa
 
 
 class Hygov(Governor):
-    """A governor with a hydraulic turbine, HYGOV. The defaults are usual ones."""
+    """A governor with a hydraulic turbine, HYGOV. The defaults are our choice."""
 
     states: ClassVar = (
         ("e", "p.u.", "error behind its filter"),
