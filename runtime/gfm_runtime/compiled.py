@@ -108,11 +108,19 @@ class _Cache(FunctionCache):
     links = False  # numba compiles a caller, into which it links the function
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
+        self._function = function
+
+    def __getattr__(self, name: str) -> Any:
+        """At its first use, find where it is on disk: a process uses few of our functions."""
+        if name == "_function" or "_enabled" in vars(self):
+            raise AttributeError(name)
+        super().__init__(self._function)
         source = self._impl.locator.get_source_stamp()
-        self._from = Path(inspect.getfile(function)).parent.name, self._impl.filename_base, source
+        place = Path(inspect.getfile(self._function)).parent.name
+        self._from = place, self._impl.filename_base, source
         stamp = (source, sources())
         self._cache_file = _Index(self._cache_path, self._impl.filename_base, stamp)
+        return getattr(self, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """As numba asks for it: from the wheel, or from its own cache.

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from gfm_runtime.children import GRACE_S, KEPT, end_now, guarded
+from gfm_runtime import children
+from gfm_runtime.children import GRACE_S, KEPT, Copy, end_now, guarded, module, start
 
 pytestmark = pytest.mark.processes
 
@@ -100,3 +101,69 @@ def test_a_program_gets_the_signals_of_its_guard():
         assert process.stdout is not None and process.stdout.readline() == b"1\n"
         process.send_signal(signal.SIGINT)
         assert process.stdout.read() == b"2\n"
+
+
+ENDS = r"""
+import os, signal, subprocess, sys, time
+print("begins", flush=True)
+how = sys.argv[1]
+if how == "raises":
+    raise RuntimeError("why")
+elif how == "exits":
+    sys.exit(5)
+elif how == "says why":
+    sys.exit("why")
+elif how == "is killed":
+    os.kill(os.getpid(), signal.SIGKILL)
+elif how == "leaves a program":
+    subprocess.Popen([sys.executable, "-c", sys.argv[2]])
+    time.sleep(1)
+elif how == "is interrupted":
+    os.kill(os.getppid(), signal.SIGINT)
+    try:
+        time.sleep(1000)
+    except KeyboardInterrupt:
+        sys.exit("interrupted")
+"""
+
+
+@pytest.mark.parametrize("anew", [False, True], ids=["copy", "new"])
+@pytest.mark.parametrize(
+    ("how", "code", "last"),
+    [
+        ("returns", 0, "begins"),
+        ("raises", 1, "RuntimeError: why"),
+        ("exits", 5, "begins"),
+        ("says why", 1, "why"),
+        ("is killed", -signal.SIGKILL, "begins"),
+        ("is interrupted", 1, "interrupted"),
+        ("leaves a program", 0, "forked"),
+    ],
+)
+def test_a_module_of_ours_ends_as_a_program(how, code, last, anew, tmp_path, monkeypatch):
+    """Whether it is a copy of this process, or a new interpreter."""
+    (tmp_path / "gfm_ends.py").write_text(ENDS, encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.setattr(children, "may_fork", lambda: not anew)
+    log = tmp_path / "log"
+    with log.open("w") as output:
+        program = start(module("gfm_ends", how, STUBBORN), output.fileno())
+    assert isinstance(program, Copy) is not anew
+    assert program.wait() == program.poll() == program.returncode == code
+    program.send_signal(signal.SIGKILL)  # in vain: it has ended
+    said = log.read_text().split("\n")
+    assert said[0] == "begins" and said[-2].startswith(last)
+    assert gone([int(line.split()[1]) for line in said if line.startswith(("program", "forked"))])
+
+
+def test_a_process_with_another_thread_is_not_copied():
+    script = """
+import threading
+from gfm_runtime.children import may_fork
+print(may_fork())
+threading.Thread(target=threading.Event().wait, daemon=True).start()
+print(may_fork())"""
+    said = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, check=True).stdout
+    assert said == b"True\nFalse\n"

@@ -1,5 +1,6 @@
 """Starts `gfmhil` as a process, finds its roles' processes, waits for their recording."""
 
+import contextlib
 import json
 import signal
 import socket
@@ -7,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,23 @@ from gfm_hil.scenario import toml_text
 
 def places(folder: Path) -> set[Path]:
     """What a run in progress has outside its folder: memory, the folder of a socket."""
-    words = Path(f"/proc/{roles_of(folder)['plant']}/cmdline").read_bytes().decode().split("\0")
-    kind, _, name = words[words.index("--endpoint") + 1].partition("://")
-    found = {private_folder() / f"link-{name}" if kind == "shm" else Path(name).parent}
+    plant = Path(f"/proc/{roles_of(folder)['plant']}")
+    command = Path(f"/proc/{parent_of(parent_of(plant.name))}")  # of its guard
+    mapped = {Path(line.split()[-1]) for line in (plant / "maps").read_text().splitlines()}
+    found = {path for path in mapped if path.match(f"{private_folder()}/link-*")}
+    found = found or {path for path in opened(command) if path.match("gfmhil-run-*")}
     if (folder / "parts").is_symlink():
         found.add((folder / "parts").resolve())
     return found
+
+
+def parent_of(process: int | str) -> int:
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def opened(process: Path) -> set[Path]:
+    """The files that a process has open."""
+    return {file.readlink() for file in (process / "fd").iterdir() if file.is_symlink()}
 
 
 PATIENCE_S = 400.0  # the first to need a loop compiles it
@@ -50,7 +61,7 @@ def wait_for(what: Callable[[], Any], process: subprocess.Popen[str] | None = No
     return found
 
 
-@contextmanager
+@contextlib.contextmanager
 def running(
     folder: Path, scenario: str, *options: str, converters: Sequence[str] = ("",)
 ) -> Iterator[subprocess.Popen[str]]:
@@ -90,15 +101,15 @@ def roles_of(folder: Path) -> dict[str, int]:
     """Process ids of the sides that record into ``folder``."""
     found = {}
     for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                words = (entry / "cmdline").read_bytes().decode().split("\0")
-                state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
-            except OSError:
-                continue
-            if str(folder) in words and state != "Z":
-                found.update({role: int(entry.name) for role in ROLES if role in words})
+        with contextlib.suppress(OSError):  # it has ended
+            name = (entry / "comm").read_text().strip() if entry.name.isdigit() else ""
+            if name in NAMES and folder.resolve() / ".lock" in opened(entry):
+                found[NAMES[name]] = int(entry.name)
     return found
+
+
+#: of the sides' processes, as top and ps show them
+NAMES = {f"gfm {role}": role for role in ROLES}
 
 
 def kill(process: subprocess.Popen[str]) -> None:

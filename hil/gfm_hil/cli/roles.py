@@ -13,6 +13,7 @@ from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_part, run_side
 from gfm_hil.scenario import Scenario
 from gfm_plant import load_converter
+from gfm_runtime.children import name_process
 from gfm_runtime.errors import meant
 
 
@@ -31,6 +32,7 @@ def add(command: argparse.ArgumentParser) -> None:
 
 def call(options: argparse.Namespace) -> int:
     role: Role = options.command
+    name_process(f"gfm {role}")
     scenario = _of_one(role, common.resolve(options, named=True), options.converter)
     if scenario.in_process:
         raise UserError(f"link.type = 'inproc': a side alone needs a link: {link_names()}")

@@ -2,13 +2,12 @@
 
 import os
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any
 
-from gfm_runtime.children import end_with_parent
+from gfm_runtime.children import end_with_parent, may_fork
 
 _PATIENCE_S = 5.0  # for work whose block has failed
 
@@ -16,16 +15,12 @@ _PATIENCE_S = 5.0  # for work whose block has failed
 @contextmanager
 def beside(work: Callable[..., object], *arguments: Any) -> Iterator[None]:
     """Do work that only writes files, on another processor if one may be had, during a block; it is
-    done, or has ended, after the block.
-
-    A process with other threads is not forked: a lock that one of them has would never be released
-    in the copy. That of a progress bar only writes to the terminal, which ``work`` does not.
+    done, or has ended, after the block. A process with other threads is not forked.
 
     Raises:
         Exception: what ``work`` raises, after the block.
     """
-    others = (t for t in threading.enumerate() if type(t).__module__ != "rich.live")
-    if [*others] != [threading.main_thread()] or (os.cpu_count() or 1) < 2:
+    if not may_fork() or (os.cpu_count() or 1) < 2:
         yield
         work(*arguments)
         return

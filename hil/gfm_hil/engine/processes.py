@@ -2,8 +2,6 @@
 
 import contextlib
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +18,7 @@ from gfm_hil.recording.columns import bytes_per_tick
 from gfm_hil.recording.log import Outcome, read_events
 from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.scenario import Scenario
-from gfm_runtime.children import end_now, guarded
+from gfm_runtime import children
 
 #: told (ticks done, misses so far); may be called a few times a second
 Progress = Callable[[int, int], None]
@@ -53,10 +51,7 @@ class _Process:
     def start(self) -> None:
         """Start it, behind a guard that ends it with us and keeps its log short."""
         with self.log.open("wb") as log:
-            # a session of its own: Ctrl-C reaches the process through us, once
-            self.popen = subprocess.Popen(
-                guarded(self.command, bounded=True), stdout=log, stderr=log, start_new_session=True
-            )
+            self.popen = children.start(self.command, log.fileno())
 
     def send(self, number: signal.Signals) -> None:
         """Send it a signal while it lives."""
@@ -142,7 +137,7 @@ class Processes:
             finally:
                 for process in started:
                     if process.popen.poll() is None:
-                        end_now(process.popen)
+                        children.end_now(process.popen)
                         process.popen.wait()
         return began, self._judge()
 
@@ -181,9 +176,8 @@ class Processes:
     def _ours(self, role: Role, folder: Path) -> list[str]:
         """The command of a role of ours without its endpoints."""
         folder = folder.absolute()  # a name such as "--" must not look like an option
-        # -P: a file of the operator's folder must not stand in for a module
-        command = [sys.executable, "-P", "-m", "gfm_hil", role, str(folder / "scenario.toml")]
-        return [*command, "--out", str(folder), "--quiet", "--part"]
+        words = role, str(folder / "scenario.toml"), "--out", str(folder), "--quiet", "--part"
+        return children.module("gfm_hil", *words)
 
     def _plant_command(self, endpoints: dict[str, str]) -> list[str]:
         command = self._ours("plant", self.folder)
@@ -235,7 +229,7 @@ class Processes:
                 told, kill_at = True, now + _GRACE_S
             if now >= kill_at:
                 for process in self._all:
-                    end_now(process.popen)
+                    children.end_now(process.popen)
         return began
 
     def _ends_all(self, ended: _Process, part: RolePart | None) -> tuple[bool, bool]:

@@ -1,7 +1,6 @@
 """A whole run: one process or two, and a run folder in the end, however it ended."""
 
 import shutil
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -37,6 +36,7 @@ from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.run_folder import Report, check_free, cut_short, finish, in_use
 from gfm_hil.run.summary import origin, stages, summarise
 from gfm_hil.scenario import INPROC, Scenario, write_scenario
+from gfm_runtime.children import module
 
 Notice = Callable[[str], None]
 
@@ -107,10 +107,9 @@ def external_command(model: str, ports: Path | None) -> list[str]:
         model: ``dll:FILE``, ``fmu:FILE`` or ``c:FILE``.
         ports: file of the map of its ports.
     """
-    command = [sys.executable, "-P", "-m", "gfm_hil", "controller", "{scenario}"]
-    command += ["--endpoint", "{endpoint}", "--out", "{folder}", "--quiet"]
-    command += ["--part", "--model", model]
-    return command + (["--map", str(ports.absolute())] if ports else [])
+    words = ["controller", "{scenario}", "--endpoint", "{endpoint}", "--out", "{folder}"]
+    words += ["--quiet", "--part", "--model", model]
+    return module("gfm_hil", *words, *(["--map", str(ports.absolute())] if ports else []))
 
 
 def run_network(

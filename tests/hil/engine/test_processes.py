@@ -204,16 +204,19 @@ def test_in_lockstep_either_role_may_stand_still_for_seconds(begun):
 
 
 STANDS_STILL = """\
-import os, signal, sys
+import os, signal, sys, threading
 if "plant" in sys.orig_argv:
     os.kill(os.getpid(), signal.SIGSTOP)
+elif "run" in sys.orig_argv:
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
 """
 
 
 def test_a_plant_that_is_late_is_the_reason_and_not_the_signal_that_ends_it(
     start, tmp_path, monkeypatch
 ):
-    """The plant stands still before its first import, as one does that has to compile."""
+    """The plant stands still before its first import, as one does that has to compile. It is a
+    program of its own, no copy of the command, which has a second thread."""
     (tmp_path / "sitecustomize.py").write_text(STANDS_STILL, encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     link = {"start_timeout_s": 1.0, "peer_timeout_s": 1.0}
