@@ -61,8 +61,22 @@ def grid_of(scenario: Scenario) -> tuple[float, float] | None:
 def add_figure(command: argparse.ArgumentParser) -> None:
     """The option that names the file of a figure."""
     command.add_argument(
-        "-o", "--out", dest="figure", type=Path, metavar="FILE", help="figure: .png, .svg or .pdf"
-    )
+        "-o", "--out", dest="figure", type=_figure_file, metavar="FILE",
+        help="figure: .png, .svg or .pdf",
+    )  # fmt: skip
+
+
+_KINDS = (".png", ".svg", ".pdf")
+
+
+def _figure_file(text: str) -> Path:
+    """A file that a figure can be saved to, which a command should know before it computes."""
+    file = Path(text)
+    if file.suffix not in _KINDS:
+        raise argparse.ArgumentTypeError(f"{text}: must end in one of {', '.join(_KINDS)}")
+    if not file.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text}: there is no folder {file.parent}")
+    return file
 
 
 def save_figure(options: argparse.Namespace, draw: Callable[[], object]) -> None:
