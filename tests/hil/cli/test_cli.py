@@ -126,14 +126,14 @@ def test_a_start_file_runs_is_stable_and_is_never_overwritten(call, here):
     assert gfmhil.Law.load("mine.toml").name == "mine"
     assert max(gfmhil.Law.load("mine.toml").closed_loop("sag.toml").poles().real) < 0
     assert gfmhil.design.tune("mine.toml", starts=1, evaluations=20).law.name == "mine-tuned"
-    for law in ("vsg-2", "mine.toml"):
-        assert gfmhil.run("sag.toml", law).status == "completed"
     before = Path("mine.toml").read_bytes()
     assert call("new", "law", "mine")[::2] == (
         2, "gfmhil: mine.toml: is there already; choose another name, or delete it\n"
     )  # fmt: skip
     assert Path("mine.toml").read_bytes() == before
     assert call("new", "law", "../Mine")[0] == 2 and not list(here.parent.glob("*.toml"))
+    for law in ("vsg-2", "mine.toml"):
+        assert gfmhil.run("sag.toml", law).status == "completed"
 
 
 def test_other_start_files_run(call, here):
@@ -369,12 +369,20 @@ def test_an_unknown_option_of_a_command_inside_a_group_is_refused_in_one_line(ca
     assert capsys.readouterr().err.startswith("gfmhil: --to x: gfmhil bench loop does not know it")
 
 
-def test_a_value_that_an_option_does_not_take_is_refused_in_one_line(capsys):
+@pytest.mark.parametrize(
+    ("command", "option", "said"),
+    [
+        ("bench latency", "--for 3parsecs", "--for: '3parsecs': must be as 12h, 90m or 30s"),
+        ("design poles", "-o p.gif", "-o/--out: p.gif: must end in one of .png, .svg, .pdf"),
+        ("design sweep", "-o no/p.png", "-o/--out: no/p.png: there is no folder no"),
+    ],
+)
+def test_a_value_that_an_option_does_not_take_is_refused_in_one_line(command, option, said, capsys):
     with pytest.raises(SystemExit) as end:
-        main(["bench", "latency", "--for", "3parsecs"])
-    said = "gfmhil bench latency: argument --for: '3parsecs': must be as 12h, 90m or 30s"
+        main([*command.split(), *option.split()])
     assert end.value.code == 2
-    assert capsys.readouterr().err == f"{said} (gfmhil bench latency --help)\n"
+    line = f"gfmhil {command}: argument {said} (gfmhil {command} --help)\n"
+    assert capsys.readouterr().err == line
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():
