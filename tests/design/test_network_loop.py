@@ -128,6 +128,11 @@ def with_controls(place: Path | None = None) -> Scenario:
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine | controls}})
 
 
+def with_static_exciter(place: Path | None = None) -> Scenario:
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "avr": {"type": "EXST1", "K_C": 0.1}}
+    return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
+
+
 def with_following(place: Path | None = None) -> Scenario:
     neighbour = {"G": {"node": "far", "S": 0.8, "P": 0.4, "Q": 0.1, "k_V": 3.0, "band": 0.0}}
     banks = {"bank": {"node": "far", "Q": 0.1}}
@@ -191,6 +196,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_machine,
         with_synchronous_machine,
         with_controls,
+        with_static_exciter,
         with_following,
         with_motor,
         with_waves,

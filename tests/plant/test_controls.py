@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 
 from gfm_plant.components import SynchronousMachine
 from gfm_plant.components.controls import EXCITERS, GOVERNORS, STABILISERS
-from gfm_plant.components.controls.control import Control
+from gfm_plant.components.controls.control import Control, Exciter, Terminals
 from gfm_plant.components.controls.exdc2 import Exdc2
+from gfm_plant.components.controls.exst1 import Exst1
 from gfm_plant.components.controls.hygov import Hygov
 from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
@@ -32,26 +33,33 @@ def product(*blocks: tuple[list[float], list[float]]) -> Polynomials:
     return num, den
 
 
+def sees(one: Control, seen: float, output: float) -> Any:
+    """What a control sees: of an exciter the voltage, and its own output as the field's current."""
+    return Terminals(seen, output) if isinstance(one, Exciter) else seen
+
+
 def stepped(one: Control, output: float, seen: float, by: float, t: np.ndarray) -> np.ndarray:
     """Its output after a step of what it sees, from a rest."""
-    states, asked = one.rest(output, seen)
+    rest, then = sees(one, seen, output), sees(one, seen + by, output)
+    states, asked = one.rest(output, rest)
     p, rates = np.array(one.numbers()), type(one).rates.py_func
 
     def slope(_: float, x: np.ndarray) -> np.ndarray:
         out = np.zeros(len(x))
-        rates(p, x, 0, seen + by, asked, out)
+        rates(p, x, 0, then, asked, out)
         return out
 
-    assert rates(p, np.array(states), 0, seen, asked, np.zeros(len(states))) == pytest.approx(
+    assert rates(p, np.array(states), 0, rest, asked, np.zeros(len(states))) == pytest.approx(
         output
     )
     way = solve_ivp(slope, (0, t[-1]), states, "DOP853", t, rtol=1e-10, atol=1e-12)
-    return np.array([rates(p, x, 0, seen + by, asked, np.zeros(len(x))) - output for x in way.y.T])
+    return np.array([rates(p, x, 0, then, asked, np.zeros(len(x))) - output for x in way.y.T])
 
 
 SEXS = Sexs(K=50.0, T_A=0.4, T_B=1.5, E_min=-5.0)
 IEEET1 = Ieeet1(V_Rmin=-8.0, V_Rmax=8.0)
 EXDC2 = Exdc2(T_B=1.2, T_C=0.3, V_Rmin=-8.0, V_Rmax=8.0)
+EXST1 = Exst1(T_C=0.3, T_B=1.2, K_F=0.05)
 IEEEG1 = Ieeeg1(T1=0.1, T2=0.05, T6=0.4, K1=0.2, K3=0.3, K5=0.3, K7=0.1)  # T7 left out
 HYGOV = Hygov(D_turb=0.0)
 TGOV1 = Tgov1(D_t=0.3)
@@ -77,6 +85,13 @@ PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
              np.polyadd(product(([1], [1.2, 1]), ([1], [0.2, 1]), ([1], [0.314, 1]),
                                 ([1], [0.35, 1]))[1],
                         np.polymul([0.3, 1], [20.0 * 0.063, 0.0]))),
+        ]),
+        # its feedback K_F s/(1 + T_F s) around lead, lag and regulator
+        (EXST1, 1.8, 1.02, [
+            ([-1.0], [0.02, 1]),
+            (product(([50.0], [1]), ([0.3, 1], [1]), ([1.0, 1], [1]))[0],
+             np.polyadd(product(([1], [1.2, 1]), ([1], [0.02, 1]), ([1], [1.0, 1]))[1],
+                        np.polymul([0.3, 1], [50.0 * 0.05, 0.0]))),
         ]),
         (Pss1a(T6=0.0, A1=0.0, A2=0.0), 0.0, 0.0, [
             ([200.0, 0], [10.0, 1]), ([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]),
@@ -144,11 +159,35 @@ def test_a_hydraulic_governor_by_its_linear_model():
 
 def test_the_limits_of_a_commutator_exciter_follow_the_voltage():
     one = Exdc2(V_Rmax=2.0, V_Rmin=-2.0)
-    _, asked = one.rest(1.5, 1.0)
+    _, asked = one.rest(1.5, Terminals(1.0, 1.5))
     out, p = np.zeros(5), np.array(one.numbers())
-    Exdc2.rates.py_func(p, np.array([0.5, 2.0, 1.5, 1.5, 0.1]), 0, 0.5, asked, out)
+    halved = Terminals(0.5, 1.5)
+    Exdc2.rates.py_func(p, np.array([0.5, 2.0, 1.5, 1.5, 0.1]), 0, halved, asked, out)
     assert out[1] == 0.0  # at 0.5 p.u. it is beyond its limit, and rises no further
     assert out[2] == pytest.approx((0.5 * 2.0 - 1.5) / 0.314)
+
+
+@pytest.mark.parametrize(
+    ("V", "I_fd", "asked", "ceiling"), [(0.9, 1.5, 2.0, 4.35), (0.5, 3.0, 0.0, -2.8)]
+)
+def test_a_static_exciter_is_at_its_ceiling_without_wind_up(V, I_fd, asked, ceiling):
+    """V V_Rmax - K_C I_fd and V V_Rmin - K_C I_fd: it comes there, and leaves it at once."""
+    one = Exst1(V_Rmax=5.0, V_Rmin=-5.0, K_C=0.1, T_B=0.0, K_F=0.0)
+    p, rates = np.array(one.numbers()), Exst1.rates.py_func
+    out, x = np.zeros(4), np.array([V, 0.0, 1.0, 1.0])
+    for _ in range(2000):
+        E_fd = rates(p, x, 0, Terminals(V, I_fd), asked, out)
+        x += 1e-5 * out
+    assert E_fd == pytest.approx(ceiling)
+    rates(p, x, 0, Terminals(V, I_fd), V, out)  # the error is gone
+    assert out[2] * ceiling < 0.0 and abs(x[2] - ceiling) < 0.1
+
+
+def test_the_error_of_a_static_exciter_is_limited():
+    one = Exst1(V_Imax=0.03, K_F=0.0)
+    t = np.linspace(0.0, 2.0, 20)
+    found = stepped(one, 1.0, 1.0, -0.2, t)  # from an error of 1/50 to 0.03
+    assert found[-1] == pytest.approx(50.0 * 0.03 - 1.0)
 
 
 def test_the_saturation_passes_both_points():
@@ -161,9 +200,9 @@ def test_the_saturation_passes_both_points():
 
 def test_a_rest_does_not_move():
     saturated = Ieeet1(E_1=2.8, S_E1=0.04, E_2=3.73, S_E2=0.33)
-    for one in (SEXS, IEEET1, EXDC2, saturated, TGOV1, IEEEG1, HYGOV, PSS1A, PLAIN):
-        output, seen = (0.0, 0.01) if isinstance(one, Pss1a) else (3.0, 0.01)
-        seen = 1.0 if isinstance(one, Exdc2) else seen
+    for one in (SEXS, IEEET1, EXDC2, EXST1, saturated, TGOV1, IEEEG1, HYGOV, PSS1A, PLAIN):
+        output = 0.0 if isinstance(one, Pss1a) else 3.0
+        seen = sees(one, 1.0 if isinstance(one, Exciter) else 0.01, output)
         states, asked = one.rest(output, seen)
         out = np.zeros(len(states))
         found = type(one).rates.py_func(np.array(one.numbers()), states, 0, seen, asked, out)
@@ -180,7 +219,7 @@ def test_every_control_is_complete():
     for kind in (*EXCITERS, *GOVERNORS, *STABILISERS):
         one = kind()
         assert one.lags() and all(lag > 0 for lag in one.lags().values())
-        assert set(one.limits()) <= set(range(len(one.rest(1.0, 1.0)[0])))
+        assert set(one.limits()) <= set(range(len(one.rest(1.0, sees(one, 1.0, 1.0))[0])))
         named = {"avr": {}, kind_of(one): {"type": kind.kind()}}
         assert kind_of(one) in dict(SynchronousMachine(**MACHINE, **named))
 
@@ -199,6 +238,8 @@ def kind_of(one: Control) -> str:
         ({"governor": {"type": "IEEEG1", "T2": 0.1}}, "T1 = 0: must be above 0 with T2 = 0.1"),
         ({"governor": {"type": "HYGOV", "G_min": 1.0}}, "G_min = 1: must be less than G_max, 1"),
         ({"avr": {"type": "EXDC2", "T_C": 0.1}}, "T_B = 0: must be above 0 with T_C = 0.1"),
+        ({"avr": {"type": "EXST1", "V_Rmin": 1e4}}, "V_Rmin = 10000: must be less than V_Rmax"),
+        ({"avr": {"type": "EXST1", "V_Imax": 0.0, "V_Imin": 0.0}}, "V_Imin = 0: must be less than"),
         ({"governor": {"T1": -0.5}}, "greater than 0"),
         ({"governor": {"V_min": 1.5}}, "V_min = 1.5: must be less than V_max, 1.2"),
         ({"governor": {}, "droop": 0.04}, "droop = 0.04: leave it out, the governor has its own"),

@@ -25,9 +25,9 @@ class Machines(NamedTuple):
 
 
 def read_machines(path: str | Path) -> Machines:
-    """Read the records of GENROU, and of its controls: the exciters SEXS, IEEET1 and EXDC2, the
-    governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of REGCA1 with REECA1
-    or REECB1.
+    """Read the records of GENROU, and of its controls: the exciters SEXS, IEEET1, EXDC2
+    and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of
+    REGCA1 with REECA1 or REECB1.
 
     Raises:
         UserError: the file cannot be read, has no machine, or a record is none; the message has the
@@ -89,6 +89,10 @@ def _rotating(type: str, p: Numbers) -> Made:
         content["S_E1"] = content["S_E2"] = 0.0
         notes.append("its saturation has no first point and is left out")
     return content, notes
+
+
+def _exst1(p: Numbers) -> Made:
+    return _lagging({"type": "EXST1", **p}, "T_R", "T_A", "T_F")
 
 
 def _tgov1(p: Numbers) -> Made:
@@ -180,6 +184,12 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         ("T_R", "K_A", "T_A", "T_B", "T_C", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F",
          *_SATURATION),
         partial(_rotating, "EXDC2"),
+    ),
+    "EXST1": (
+        "avr",
+        ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_C", "K_F",
+         "T_F"),
+        _exst1,
     ),
     "IEEEG1": (
         "governor",

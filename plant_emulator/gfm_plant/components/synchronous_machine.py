@@ -28,7 +28,7 @@ torque of a turbine with a governor its value in the middle, extrapolated.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
@@ -51,7 +51,7 @@ from gfm_plant.components.controls import (
     govern,
     stabilise,
 )
-from gfm_plant.components.controls.control import Control, parabola
+from gfm_plant.components.controls.control import Control, Terminals, parabola
 from gfm_plant.components.machine import SPEED, Rotating
 from gfm_plant.components.part import LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
@@ -112,13 +112,23 @@ def _windings(one: Any, x: Any, E_fd: float, i: complex, psi: complex, S: float,
 
 
 @compiled
+def _field_current(one: Any, x: Any, i: complex, psi: complex, S: float) -> float:
+    """Return the current of the field, X_ad I_fd, as it stands in d/dt of E_q'."""
+    g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
+    I_fd: float = x[E_Q] + one.X_dd * (i.real - one.k_d * g_d) + S * psi.real
+    return I_fd
+
+
+@compiled
 def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     """Write d/dt of the states x, (N_STATES,), 1/s, at a terminal voltage of size V, a speed of
     1 + w and a current i; returns the torque of the turbine, if it has a governor."""
     V_s = stabilise(one.pss, one.pss_p, x, PSS, w, one.pss_set, out)
-    E_fd = excite(one.avr, one.avr_p, x, AVR, V, one.avr_set + V_s, out)
     psi = _flux(one, x)
-    _windings(one, x, E_fd, i, psi, _saturation(one, psi), out)
+    S = _saturation(one, psi)
+    seen = Terminals(V, _field_current(one, x, i, psi, S))
+    E_fd = excite(one.avr, one.avr_p, x, AVR, seen, one.avr_set + V_s, out)
+    _windings(one, x, E_fd, i, psi, S, out)
     turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, w, one.governor_set, out)
     return turbine
 
@@ -390,7 +400,11 @@ class SynchronousMachine(Rotating):
         torque = ((v + self.R * i) * i.conjugate()).real / omega + self.D * (omega - 1.0)
         record["x"], record["avr_set"] = 0.0, E_fd
         record["x"][:AVR] = E_q, E_d, psi_kd, psi_kq
-        seen = {"avr": (E_fd, abs(v)), "governor": (torque, omega - 1.0), "pss": (0.0, omega - 1.0)}
+        seen: Mapping[str, tuple[float, Any]] = {
+            "avr": (E_fd, Terminals(abs(v), E_fd)),
+            "governor": (torque, omega - 1.0),
+            "pss": (0.0, omega - 1.0),
+        }
         for role, at, one in self._controls():
             states, record[f"{role}_set"] = one.rest(*seen[role])
             record["x"][at : at + len(states)] = states
@@ -401,7 +415,7 @@ class SynchronousMachine(Rotating):
         record["E"] = record["E_middle"] = 1j * omega * psi
         return complex(record["E"]) * unit
 
-    def _check_limits(self, role: str, one: Control, states: Sequence[float], seen: float) -> None:
+    def _check_limits(self, role: str, one: Control, states: Sequence[float], seen: Any) -> None:
         for place, (least, most) in one.limits_at(seen).items():
             if not least < states[place] < most:
                 name = one.states[place][0]
@@ -422,8 +436,8 @@ class SynchronousMachine(Rotating):
         unit = source / complex(one.E)
         own, per_power = swing_matrix(self.H, self.D, self.droop, self.T_gov, 1.0)
         resting = seen * unit.conjugate() / self.S
-        ahead = complex(one.E) - complex(self.R, one.omega * self.X_2) * resting
-        ahead *= self.X_2 / (omega_b * abs(ahead))
+        terminal = complex(one.E) - complex(self.R, one.omega * self.X_2) * resting
+        ahead = terminal * (self.X_2 / (omega_b * abs(terminal)))
         if self.governor is not None:
             own[1] = 0.0
         n = 3 + N_STATES  # angle, speed, power of the turbine without a governor, x
@@ -436,7 +450,7 @@ class SynchronousMachine(Rotating):
             w, x, rate = one.omega - 1.0 + nudge[1], one.x + nudge[3:n], np.zeros(N_STATES)
             if self.avr is not None:
                 x[AVR] -= (ahead.conjugate() * (i - resting)).real / self.avr.T_R
-            self._rates(one, x, 0.0, w, i, rate)
+            self._rates(one, x, abs(terminal), w, i, rate)  # only V_m and limits depend on V
             psi = _flux.py_func(one, x)
             E = 1j * (1.0 + w) * psi + _flux.py_func(one, rate) / omega_b
             V = abs(E - complex(self.R, (1.0 + w) * self.X_2) * i)
@@ -459,7 +473,7 @@ class SynchronousMachine(Rotating):
     def _rates(self, one: Any, x: Matrix, V: float, w: float, i: complex, out: Matrix) -> float:
         """As the compiled ``_rates``, of these controls."""
 
-        def output(role: str, seen: float, asked: float) -> float:
+        def output(role: str, seen: Any, asked: float) -> float:
             if (control := getattr(self, role)) is None:
                 return asked
             numbers, at = getattr(one, f"{role}_p"), ROLES[role][0]
@@ -469,5 +483,6 @@ class SynchronousMachine(Rotating):
         V_s = output("pss", w, one.pss_set)
         psi = _flux.py_func(one, x)
         S = _saturation.py_func(one, psi)
-        _windings.py_func(one, x, output("avr", V, one.avr_set + V_s), i, psi, S, out)
+        seen = Terminals(V, _field_current.py_func(one, x, i, psi, S))
+        _windings.py_func(one, x, output("avr", seen, one.avr_set + V_s), i, psi, S, out)
         return output("governor", w, one.governor_set)

@@ -218,6 +218,25 @@ PUBLISHED = """\
 """  # noqa: E501
 
 
+@pytest.mark.parametrize(
+    ("record", "known", "notes"),
+    [
+        # of ANDES's ieee14.dyr
+        (
+            "EXST1 ' 1 0.02 99.0 -99.0 0.0 0.02 50.0 0.02 9999.0 -9999.0 0.0 0.01 1.0 /",
+            {"V_Imin": -99.0, "T_B": 0.02, "K_A": 50.0, "V_Rmax": 9999.0, "K_F": 0.01, "T_F": 1.0},
+            [],
+        )
+    ],
+)
+def test_published_controls(record, known, notes, tmp_path):
+    file = tmp_path / "published.dyr"
+    file.write_text(f"{PUBLISHED.splitlines()[0]}\n1 '{record}\n")
+    machines, _, ignored = read_machines(file)
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **machines["1"])
+    assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
+
+
 def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(PUBLISHED)

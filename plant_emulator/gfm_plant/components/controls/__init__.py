@@ -8,8 +8,9 @@ from typing import Annotated, Any, Union
 
 from pydantic import BeforeValidator, Field
 
-from gfm_plant.components.controls.control import Control, Exciter, Governor, Stabiliser
+from gfm_plant.components.controls.control import Control, Exciter, Governor, Stabiliser, Terminals
 from gfm_plant.components.controls.exdc2 import Exdc2
+from gfm_plant.components.controls.exst1 import Exst1
 from gfm_plant.components.controls.hygov import Hygov
 from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
@@ -18,7 +19,7 @@ from gfm_plant.components.controls.sexs import Sexs
 from gfm_plant.components.controls.tgov1 import Tgov1
 from gfm_runtime.compiled import inlined_as
 
-EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2)
+EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1)
 GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov)
 STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a,)
 
@@ -45,7 +46,7 @@ def _chosen(role: str, kinds: Sequence[type[Control]]) -> Any:
     """A compiled function (kind, p, x, at, seen, asked, out) that calls the ``rates`` of a kind, of
     which the first is 1; of 0 the output is what is asked for."""
 
-    def none(kind: int, p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+    def none(kind: int, p: Any, x: Any, at: int, seen: Any, asked: float, out: Any) -> float:
         return asked
 
     chain = inlined_as(role, none)
@@ -55,7 +56,7 @@ def _chosen(role: str, kinds: Sequence[type[Control]]) -> Any:
 
 
 def _link(role: str, call: Callable[..., float], k: int, others: Callable[..., float]) -> Any:
-    def link(kind: int, p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+    def link(kind: int, p: Any, x: Any, at: int, seen: Any, asked: float, out: Any) -> float:
         if kind == k:
             return call(p, x, at, seen, asked, out)
         return others(kind, p, x, at, seen, asked, out)
@@ -67,11 +68,12 @@ excite, govern = _chosen("excite", EXCITERS), _chosen("govern", GOVERNORS)
 stabilise = _chosen("stabilise", STABILISERS)
 
 
-def _most(kinds: Sequence[type[Control]]) -> int:
-    return max(len(kind().rest(0.0, 0.0)[0]) for kind in kinds)
+def _most(kinds: Sequence[type[Control]], seen: Any) -> int:
+    return max(len(kind().rest(1.0, seen)[0]) for kind in kinds)
 
 
 _EACH = (*EXCITERS, *GOVERNORS, *STABILISERS)
 #: numbers and states of one of each role, at most
 MOST_NUMBERS = max(len(kind().numbers()) for kind in _EACH)
-OF_EXCITER, OF_GOVERNOR, OF_STABILISER = map(_most, (EXCITERS, GOVERNORS, STABILISERS))
+OF_EXCITER = _most(EXCITERS, Terminals(1.0, 1.0))
+OF_GOVERNOR, OF_STABILISER = _most(GOVERNORS, 0.0), _most(STABILISERS, 0.0)

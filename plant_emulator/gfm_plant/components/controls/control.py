@@ -3,7 +3,7 @@ its turbine, or a stabiliser."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from gfm_plant.parameters import Options
 
@@ -18,11 +18,19 @@ def parabola(E_1: float, S_1: float, E_2: float, S_2: float) -> tuple[float, flo
     return E_2 - second / rise, rise**2
 
 
+class Terminals(NamedTuple):
+    """What an exciter sees of its machine, p.u."""
+
+    V: float  #: size of the terminals' voltage
+    I_fd: float  #: current of the field, X_ad I_fd: E_fd where nothing moves
+
+
 class Control(Options):
     """Base of all controls; the options of one are its standard parameters, in p.u. of the
     machine's rating and s.
 
-    Its ``rates`` is a compiled function (p, x, at, seen, asked, out) -> output. p are its
+    Its ``rates`` is a compiled function (p, x, at, seen, asked, out) -> output. What it sees is a
+    number, of an exciter ``Terminals``. p are its
     ``numbers``, its states are x from ``at`` on, and their d/dt, 1/s, go to the same places of out.
     A time constant of 0 that it allows leaves its block out, whose states then do not move.
     """
@@ -48,18 +56,18 @@ class Control(Options):
         """Between which values a state stays, by its place: a limit without wind-up."""
         return {}
 
-    def limits_at(self, seen: float) -> Mapping[int, tuple[float, float]]:
+    def limits_at(self, seen: Any) -> Mapping[int, tuple[float, float]]:
         """The limits at what it sees at a rest, those that follow it included."""
         return self.limits()
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+    def rest(self, output: float, seen: Any) -> tuple[Sequence[float], float]:
         """Its states, and what it is asked for, where nothing moves."""
         raise NotImplementedError
 
 
 class Exciter(Control):
-    """A voltage regulator with its exciter: sees the size of the terminals' voltage, is asked for a
-    voltage, gives E_fd. Its first state is that voltage as measured, with the lag T_R."""
+    """A voltage regulator with its exciter: sees ``Terminals``, is asked for a voltage, gives E_fd.
+    Its first state is the size of the terminals' voltage as measured, with the lag T_R."""
 
     T_R: float
 

@@ -14,26 +14,27 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from gfm_plant.components.controls.control import Terminals
 from gfm_plant.components.controls.ieeet1 import Ieeet1
 from gfm_plant.parameters import NonNegative
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Terminals, asked: float, out: Any) -> float:
     T_R, K_A, T_A, K_E, T_E = p[0], p[1], p[2], p[3], p[4]
     K_F, T_F, a, b, T_B, T_C = p[5], p[6], p[7], p[8], p[9], p[10]
     V_m, V_R, E_fd, behind, y = x[at], x[at + 1], x[at + 2], x[at + 3], x[at + 4]
     above = max(E_fd - a, 0.0)
     back = (E_fd - behind) / T_F
     u = asked - V_m - K_F * back
-    out[at] = (seen - V_m) / T_R
+    out[at] = (seen.V - V_m) / T_R
     if T_B > 0.0:
         out[at + 4] = (u - y) / T_B
         u = y + T_C / T_B * (u - y)
     rate = (K_A * u - V_R) / T_A
     # a limit without wind-up, which moves
-    limited = min(max(V_R, p[11] * seen), p[12] * seen)
+    limited = min(max(V_R, p[11] * seen.V), p[12] * seen.V)
     out[at + 1] = rate if limited == V_R or (rate > 0.0) == (limited > V_R) else 0.0
     out[at + 2] = (limited - K_E * E_fd - b * above * above) / T_E
     out[at + 3] = back
@@ -66,9 +67,9 @@ class Exdc2(Ieeet1):
     def limits(self) -> Mapping[int, tuple[float, float]]:
         return {}
 
-    def limits_at(self, seen: float) -> Mapping[int, tuple[float, float]]:
-        return {1: (self.V_Rmin * seen, self.V_Rmax * seen)}
+    def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
+        return {1: (self.V_Rmin * seen.V, self.V_Rmax * seen.V)}
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+    def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
         states, asked = super().rest(output, seen)
-        return (*states, asked - seen), asked
+        return (*states, asked - seen.V), asked

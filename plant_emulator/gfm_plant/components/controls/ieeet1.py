@@ -13,19 +13,19 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from gfm_plant.components.controls.control import Exciter, parabola
+from gfm_plant.components.controls.control import Exciter, Terminals, parabola
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Terminals, asked: float, out: Any) -> float:
     T_R, K_A, T_A, K_E, T_E = p[0], p[1], p[2], p[3], p[4]
     K_F, T_F, a, b = p[5], p[6], p[7], p[8]
     V_m, V_R, E_fd, behind = x[at], x[at + 1], x[at + 2], x[at + 3]
     above = max(E_fd - a, 0.0)
     back = (E_fd - behind) / T_F
-    out[at] = (seen - V_m) / T_R
+    out[at] = (seen.V - V_m) / T_R
     out[at + 1] = (K_A * (asked - V_m - K_F * back) - V_R) / T_A
     out[at + 2] = (V_R - K_E * E_fd - b * above * above) / T_E
     out[at + 3] = back
@@ -92,6 +92,6 @@ class Ieeet1(Exciter):
     def limits(self) -> Mapping[int, tuple[float, float]]:
         return {1: (self.V_Rmin, self.V_Rmax)}
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+    def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
         V_R = self.field(output)
-        return (seen, V_R, output, output), seen + V_R / self.K_A
+        return (seen.V, V_R, output, output), seen.V + V_R / self.K_A

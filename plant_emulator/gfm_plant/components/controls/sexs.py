@@ -9,17 +9,17 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from gfm_plant.components.controls.control import Exciter
+from gfm_plant.components.controls.control import Exciter, Terminals
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Terminals, asked: float, out: Any) -> float:
     K, T_R, T_A, T_B, T_E = p[0], p[1], p[2], p[3], p[4]
     V_m, lead, E_fd = x[at], x[at + 1], x[at + 2]
     off = asked - V_m
-    out[at], out[at + 1] = (seen - V_m) / T_R, (off - lead) / T_B
+    out[at], out[at + 1] = (seen.V - V_m) / T_R, (off - lead) / T_B
     ahead = lead + T_A / T_B * (off - lead)
     out[at + 2] = (K * ahead - E_fd) / T_E
     return E_fd
@@ -60,6 +60,6 @@ class Sexs(Exciter):
     def limits(self) -> Mapping[int, tuple[float, float]]:
         return {2: (self.E_min, self.E_max)}
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
+    def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
         ahead = output / self.K
-        return (seen, ahead, output), seen + ahead
+        return (seen.V, ahead, output), seen.V + ahead
