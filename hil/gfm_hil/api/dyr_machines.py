@@ -6,10 +6,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gfm_hil.api.dyr import number, records
-from gfm_hil.core.errors import UserError
+from pydantic import ValidationError
 
-_SHORT = 1e-3  # s; takes the place of a time constant of 0 where ours must be positive
+from gfm_hil.api.dyr import number, records
+from gfm_hil.core.errors import UserError, lines
+from gfm_plant.components import COMPONENTS
+
+_SHORT = 1e-3  # s; the shortest time constant at a sampling period of 0.1 ms
+_CONSTANT = 1e12  # p.u./p.u.; the droop of a turbine whose power is constant
+_INFINITE = 1e6  # s; the inertia constant of an infinite bus
 
 Numbers = dict[str, float]
 #: keys of a table, and what is otherwise than in the record
@@ -17,64 +22,101 @@ Made = tuple[dict[str, Any], list[str]]
 
 
 class Machines(NamedTuple):
-    """What a file says of the generators, by the name of the bus."""
+    """What a file says of the generators."""
 
-    at: Mapping[str, dict[str, Any]]  #: keys of ``synchronous_machines``
-    following: Mapping[str, dict[str, Any]]  #: keys of ``grid_following``
+    #: by table of a network, and by the name of the bus, keys of a part of that table
+    tables: Mapping[str, Mapping[str, dict[str, Any]]]
     ignored: Sequence[str]  #: what it says and this has not, or has otherwise
+    file: str = ""
+
+
+class _Record(NamedTuple):
+    where: str  # file, line, model and bus
+    content: dict[str, Any]
 
 
 def read_machines(path: str | Path) -> Machines:
-    """Read the records of GENROU, and of its controls: the exciters SEXS, IEEET1, EXDC2
-    and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of
+    """Read the records of GENROU and GENCLS, and of their controls: the exciters SEXS, IEEET1,
+    EXDC2 and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of
     REGCA1 with REECA1 or REECB1.
 
     Raises:
-        UserError: the file cannot be read, has no machine, or a record is none; the message has the
-            file, the line and the field.
+        UserError: the file cannot be read, has no machine, a record is none, or has a value that
+            its part refuses; the message has the file, the line, the bus and the field.
     """
-    found: dict[str, dict[str, Any]] = {}
+    buses: dict[str, dict[str, _Record]] = {}
     ignored: list[str] = []
     for line, fields in records(path):
         where = f"{path}, line {line}"
         if len(fields) < 3:
             raise UserError(f"{where}: must be a bus, a model in quotes, a machine and numbers")
-        bus, model, given = fields[0], fields[1].upper(), fields[3:]
-        if model == "USRMDL" and len(given) > 6:
-            model, given = given[0].upper(), given[7:]
+        bus, model, texts = fields[0], fields[1].upper(), fields[3:]
+        if model == "USRMDL" and len(texts) > 6:
+            model, texts = texts[0].upper(), texts[7:]
         if model not in _MODELS:
             ignored.append(f"{model} at bus {bus} is not known here and left out.")
             continue
-        key, names, make = _MODELS[model]
-        if key in found.setdefault(bus, {}):
+        role, names, make = _MODELS[model]
+        if role in buses.setdefault(bus, {}):
             ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
             continue
-        if len(given) != len(names):
-            raise UserError(f"{where}: {model} has {len(names)} numbers, not {len(given)}")
+        if len(texts) != len(names):
+            raise UserError(f"{where}: {model} has {len(names)} numbers, not {len(texts)}")
         numbers = {
-            name: number(f"{where}, {name}", text) for name, text in zip(names, given, strict=True)
+            name: number(f"{where}, {name}", text) for name, text in zip(names, texts, strict=True)
         }
-        found[bus][key], notes = make(numbers)
+        content, notes = make(numbers)
+        buses[bus][role] = _Record(f"{where}: {model} at bus {bus}", content)
         ignored += [f"{model} at bus {bus}: {note}." for note in notes]
-    machines, following = {}, {}
-    for bus, parts in found.items():
-        control = parts.pop("control", {})
-        if (converter := parts.pop("converter", None)) is not None:
-            following[bus] = converter | control
-            if parts:
-                ignored.append(f"The machine at bus {bus} is left out beside a converter.")
-            continue
-        own = parts.pop("machine", None)
-        if own is None:
-            ignored.append(f"The controls at bus {bus} are left out with their machine.")
-            continue
+    tables: dict[str, dict[str, dict[str, Any]]] = {}
+    for bus, parts in buses.items():
+        if (part := _part(bus, parts, ignored)) is not None:
+            table, content = part
+            tables.setdefault(table, {})[bus] = content
+    if not tables:
+        raise UserError(f"{path}: no record of GENROU, GENCLS or REGCA1")
+    return Machines(tables, list(dict.fromkeys(ignored)), str(path))
+
+
+def _part(
+    bus: str, parts: dict[str, _Record], ignored: list[str]
+) -> tuple[str, dict[str, Any]] | None:
+    """What the records at a bus are, its table and its keys, None without a generator; notes go to
+    ``ignored``. Raises UserError: a value that it refuses."""
+    control = parts.pop("control", None)
+    for role in ("converter", "machine", "classical"):
+        if role in parts:
+            break
+    else:
+        ignored.append(f"The controls at bus {bus} are left out with their machine.")
+        return None
+    own = parts.pop(role)
+    if role == "converter":
+        if parts:
+            ignored.append(f"The machine at bus {bus} is left out beside a converter.")
+        content = own.content | (control.content if control is not None else {})
+    elif role == "classical":
+        if parts:
+            ignored.append(f"The controls at bus {bus} are left out: GENCLS takes none here.")
+        content = own.content
+    else:
         if "pss" in parts and "avr" not in parts:
             ignored.append(f"The stabiliser at bus {bus} is left out with its exciter.")
             parts.pop("pss")
-        machines[bus] = own | parts
-    if not machines and not following:
-        raise UserError(f"{path}: no record of GENROU or REGCA1")
-    return Machines(machines, following, list(dict.fromkeys(ignored)))
+        content = own.content | {name: one.content for name, one in parts.items()}
+    table = _TABLES[role]
+    kind = COMPONENTS[table]
+    try:
+        kind.model_validate({"node": bus, "S": 1.0, "P": 0.0} | content)
+    except ValidationError as problem:
+        place, text = problem.errors()[0]["loc"], lines(problem, kind)[0]
+        key = str(place[0]) if place else ""
+        if key in parts:
+            own, text = parts[key], text.removeprefix(key).lstrip(".: ")
+        elif control is not None and key in control.content:
+            own = control
+        raise UserError(f"{own.where}: {text}") from None
+    return table, content
 
 
 def _sexs(p: Numbers) -> Made:
@@ -138,11 +180,30 @@ def _reec(p: Numbers) -> Made:
 
 
 def _lagging(content: dict[str, Any], *lags: str) -> Made:
-    """With time constants that are positive, as ours must be."""
-    zero = [name for name in lags if content[name] == 0.0]
-    return content | dict.fromkeys(zero, _SHORT), [f"{n} = {_SHORT:g} s instead of 0" for n in zero]
+    """With time constants that are as long as ours must be."""
+    short = [name for name in lags if 0.0 <= content[name] < _SHORT]
+    notes = [f"{name} = {_SHORT:g} s instead of {content[name]:g}" for name in short]
+    return content | dict.fromkeys(short, _SHORT), notes
 
 
+def _genrou(p: Numbers) -> Made:
+    return _lagging({**p}, "T_d10", "T_d20", "T_q10", "T_q20")
+
+
+def _gencls(p: Numbers) -> Made:
+    notes = []
+    if p["H"] == 0.0:
+        p["H"] = _INFINITE
+        notes.append(f"H = {_INFINITE:g} s instead of 0, an infinite bus")
+    return {**p, "droop": _CONSTANT}, notes
+
+
+#: the table of a network by what its generator is
+_TABLES = {
+    "machine": "synchronous_machines",
+    "classical": "machines",
+    "converter": "grid_following",
+}
 _REEC = ("Vdip", "Vup", "Trv", "dbd1", "dbd2", "Kqv", "Iqh1", "Iql1", "Vref0")
 _LOOPS = ("Tp", "Q_max", "Q_min", "V_max", "V_min", "Kqp", "Kqi", "Kvp", "Kvi")
 _POWER = ("Tiq", "dP_max", "dP_min", "P_max", "P_min", "Imax", "Tpord")
@@ -154,8 +215,9 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         "machine",
         ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
          "S_10", "S_12"),
-        lambda p: ({**p}, []),
+        _genrou,
     ),
+    "GENCLS": ("classical", ("H", "D"), _gencls),
     "REGCA1": (
         "converter",
         ("Lvplsw", "Tg", "Rrpwr", "Brkpt", "Zerox", "Lvpl1", "Volim", "Lvpnt1", "Lvpnt0", "Iolim",

@@ -16,7 +16,7 @@ from scipy.optimize import root
 
 from gfm_design.model.operating_point import node_voltages, operating_point
 from gfm_hil.api.dyr_machines import Machines, read_machines
-from gfm_hil.api.power_flow import PowerFlow, read_pandapower
+from gfm_hil.api.power_flow import PowerFlow, named, read_pandapower
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.engine.setup import make_benches
@@ -47,27 +47,46 @@ class NetworkCase:
     converters: dict[str, dict[str, Any]]  #: by file name, content
     ignored: Sequence[str]  #: what the case has and this has not, and what this adds
     voltages: Mapping[str, complex] = field(repr=False)  #: of its nodes by the power flow, p.u.
+    #: by what a message calls it, file and bus of each machine of a dynamics file
+    sources: Mapping[str, str] = field(repr=False, default_factory=dict)
 
     def save(self, folder: str | Path) -> Path:
         """Write ``network.toml`` and its converter files; returns the path of the former.
 
         Raises:
             UserError: the folder is not empty, or the network has no steady state like the
-                power flow.
+                power flow; nothing is left of it then.
         """
         folder = Path(folder)
         check_empty(folder)
+        was_there, file = folder.exists(), folder / "network.toml"
         folder.mkdir(parents=True, exist_ok=True)
-        for name, converter in self.converters.items():
-            write_text(folder / name, toml_text(converter))
-        write_text(folder / "network.toml", toml_text(self.content))
-        far = self.distance(folder / "network.toml")
-        if far > _NEAR:
-            raise UserError(
-                f"{folder / 'network.toml'}: in its steady state a voltage is {far:.2g} p.u. from"
-                " that of the power flow"
-            )
-        return folder / "network.toml"
+        contents = {**self.converters, file.name: self.content}
+        try:
+            for name, content in contents.items():
+                write_text(folder / name, toml_text(content))
+            far = self.distance(file)
+            if far > _NEAR:
+                raise UserError(
+                    f"{file}: in its steady state a voltage is {far:.2g} p.u. from that of the"
+                    " power flow"
+                )
+        except BaseException as problem:
+            for name in contents:
+                (folder / name).unlink(missing_ok=True)
+            if not was_there:
+                folder.rmdir()
+            if isinstance(problem, UserError) and (line := self._of_record(str(problem))):
+                raise UserError(line) from None
+            raise
+        return file
+
+    def _of_record(self, problem: str) -> str:
+        """A problem with a machine of a dynamics file, said of that file; "" if it is none."""
+        for part, where in self.sources.items():
+            if match := re.search(rf"\b{re.escape(part)}\b[.:]* *(.*)", problem):
+                return f"{where}: {match[1]}"
+        return ""
 
     def distance(self, file: str | Path) -> float:
         """How far the voltages of the network's steady state are from the power flow, p.u."""
@@ -116,8 +135,8 @@ def network_from(
             state there.
     """
     flow = read_pandapower(case, title)
-    machines = Machines({}, {}, ()) if dynamics is None else read_machines(dynamics)
-    flow = _with_following(flow, machines, f"{dynamics}")
+    machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
+    flow = _with_following(flow, machines)
     names = [bus.name for bus in flow.buses]
     laws = {
         str(bus): (one, 1.0) if isinstance(one, str) else (one[0], float(one[1]))
@@ -135,27 +154,29 @@ def network_from(
     for name in laws:
         if name not in feeding:
             what = "has no generator" if name in names else "is no bus of the case"
-            raise UserError(f"{flow.title}: bus {name}: {what}; {', '.join(feeding)} have one")
+            raise UserError(f"{flow.title}: {named(name)}: {what}; {', '.join(feeding)} have one")
         if not 0.0 < laws[name][1] <= 1.0:
             raise UserError(
-                f"{flow.title}: bus {name}: share = {laws[name][1]:g}: must lie in (0, 1]"
+                f"{flow.title}: {named(name)}: share = {laws[name][1]:g}: must lie in (0, 1]"
             )
     if slack not in ("machine", "grid"):
         raise UserError(f"slack = {slack!r}: must be machine or grid")
     return _Build(flow, laws, slack == "grid", machines).case()
 
 
-def _with_following(flow: PowerFlow, machines: Machines, file: str) -> PowerFlow:
+def _with_following(flow: PowerFlow, machines: Machines) -> PowerFlow:
     """A case whose generators that follow the grid by a dynamics file are static ones."""
     buses, names = [*flow.buses], [bus.name for bus in flow.buses]
-    for name in (*machines.at, *machines.following):
+    for name in dict.fromkeys(bus for table in machines.tables.values() for bus in table):
         if name not in names:
-            raise UserError(f"{file}: bus {name}: is no bus of {flow.title}")
-    for name in machines.following:
+            raise UserError(f"{machines.file}: {named(name)}: is no bus of {flow.title}")
+    for name in machines.tables.get("grid_following", ()):
         k = names.index(name)
         bus = buses[k]
         if k == flow.slack:
-            raise UserError(f"{file}: bus {name}: REGCA1 follows the grid, and this is the slack")
+            raise UserError(
+                f"{machines.file}: {named(name)}: REGCA1 follows the grid, and this is the slack"
+            )
         if bus.machine and bus.rating is not None:
             S = bus.static_rating + bus.rating
             static = bus.static + bus.machine
@@ -169,8 +190,8 @@ class _Build:
     def __init__(
         self, flow: PowerFlow, laws: Mapping[str, tuple[str, float]], grid: bool, machines: Machines
     ) -> None:
-        self.flow, self.laws, self.machines = flow, laws, machines.at
-        self.following = machines.following
+        self.flow, self.laws = flow, laws
+        self.tables, self.file = machines.tables, machines.file
         whole = [bus.name for bus in flow.buses]
         short = [re.sub(r"(?i)^bus[\s_-]*(?=.)", "", name) for name in whole]
         self.names = short if len({*short}) == len(short) else whole  # in those of the parts
@@ -180,6 +201,7 @@ class _Build:
         self.grid = flow.slack if grid and flow.buses[flow.slack].name not in laws else None
         self.ignored = [*flow.ignored, *machines.ignored]
         self.files: dict[str, dict[str, Any]] = {}
+        self.assumed: list[str] = []  # buses of classical machines whose reactance is ours
         self.par: Any = None  # the same for all, in p.u. of each
         self.network: dict[str, Any] = {} if self.grid is None else {"grid": self._node(self.grid)}
 
@@ -193,7 +215,7 @@ class _Build:
         if bus.rating is None:
             grid = ", or stand a grid there: slack = grid" if k == self.flow.slack else ""
             raise UserError(
-                f"{self.flow.title}: bus {bus.name}: its generator has no rating: give sn_mva or"
+                f"{self.flow.title}: {named(bus.name)}: its generator has no rating: give sn_mva or"
                 f" max_p_mw{grid}"
             )
         return bus.rating * self.flow.S_b
@@ -217,6 +239,12 @@ class _Build:
                 self._machine(k, left)
             if bus.static_rating and k != self.grid:
                 self._static(k, 1.0 if self._is_machine(k) else left)
+        if self.assumed:
+            X, buses = _default("machines", "X"), ", ".join(self.assumed)
+            self.ignored.append(
+                f"GENCLS at bus {buses}: X' = {X:g} p.u., our assumption: the case has no sn_mva"
+                " and xdss_pu, which is ZSOURCE, of its generators there."
+            )
         content = {
             "title": self.flow.title,
             "description": "Made from a power-flow case. " + " ".join(self.ignored),
@@ -227,7 +255,14 @@ class _Build:
             content["plant"] = {"grid": {"V_g": abs(self.flow.buses[self.grid].V)}}
         content["network"] = self.network
         volts = {self._node(k): bus.V for k, bus in enumerate(self.flow.buses)}
-        return NetworkCase(content, self.files, self.ignored, volts)
+        of_file = {bus for table in self.tables.values() for bus in table}
+        sources = {
+            part: f"{self.file}, {named(bus.name)}"
+            for k, bus in enumerate(self.flow.buses)
+            if bus.name in of_file
+            for part in (f"G{self.names[k]}", f"the machine at {self._node(k)}")
+        }
+        return NetworkCase(content, self.files, self.ignored, volts, sources)
 
     def _branches(self) -> None:
         feeding = {k for k, bus in enumerate(self.flow.buses) if bus.machine}
@@ -270,7 +305,7 @@ class _Build:
             return  # the grid holds its voltage
         if drawn.real < 0:
             raise UserError(
-                f"{self.flow.title}: bus {bus.name}: its loads draw {bus.load.real:g} p.u.; make"
+                f"{self.flow.title}: {named(bus.name)}: its loads draw {bus.load.real:g} p.u.; make"
                 " them static generators"
             )
         if drawn.real or drawn.imag > 0:
@@ -292,11 +327,24 @@ class _Build:
     def _machine(self, k: int, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
         i = (bus.machine / bus.V).conjugate() * self.flow.S_b / S
-        R = float(_default("synchronous_machines", "R"))
-        P = bus.machine.real * self.flow.S_b / S + R * abs(i) ** 2
-        values = {"node": self._node(k), "S": share * S / self.S_b, "P": P, "V": abs(bus.V)}
-        values |= self.machines.get(bus.name, _MACHINE)
+        values = {"node": self._node(k), "S": share * S / self.S_b}
+        P = bus.machine.real * self.flow.S_b / S
+        if (classical := self._record("machines", k)) is not None:
+            X = bus.X_source
+            if math.isnan(X):
+                X = float(_default("machines", "X"))
+                self.assumed.append(bus.name)
+            values |= {"P": P, "E": abs(bus.V + 1j * X * i), "X": X, **classical}
+            self._put("machines", f"G{self.names[k]}", values)
+            return
+        P += float(_default("synchronous_machines", "R")) * abs(i) ** 2
+        own = self._record("synchronous_machines", k)
+        values |= {"P": P, "V": abs(bus.V), **(_MACHINE if own is None else own)}
         self._put("synchronous_machines", f"G{self.names[k]}", values)
+
+    def _record(self, table: str, k: int) -> dict[str, Any] | None:
+        """What a dynamics file says of a part of a table at a bus."""
+        return self.tables.get(table, {}).get(self.flow.buses[k].name)
 
     def _static(self, k: int, share: float) -> None:
         """What follows the grid at a bus, and the capacitor of its filter, which the power flow
@@ -306,7 +354,7 @@ class _Build:
             return
         power = bus.static / bus.static_rating - 1j * _FILTER * abs(bus.V) ** 2
         node = {"node": self._node(k)}
-        own = self.following.get(bus.name, {})
+        own = self._record("grid_following", k) or {}
         V, k_V, band = abs(bus.V), own.get("k_V", 0.0), own.get("band", 0.0)
         supports = k_V * (max(1.0 - band - V, 0.0) - max(V - 1.0 - band, 0.0))  # p.u. of current
         values = {"S": S, "P": power.real, "Q": power.imag - supports * V, **own}
@@ -323,7 +371,7 @@ class _Build:
         try:
             references = _references(self.par, law, abs(bus.V), power)
         except (NoEquilibrium, LawError) as problem:
-            raise UserError(f"{self.flow.title}: bus {bus.name}: {problem}") from None
+            raise UserError(f"{self.flow.title}: {named(bus.name)}: {problem}") from None
         self._put(
             "converters",
             name,

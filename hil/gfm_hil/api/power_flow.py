@@ -1,5 +1,6 @@
 """Power-flow cases by pandapower: solved, and read as it hands them to PYPOWER."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,12 @@ class Bus(NamedTuple):
     rating: float | None  # of its machines
     static: complex = 0j  # what static generators and storages bring
     static_rating: float = 0.0  # of these
+    X_source: float = math.nan  # of its machines, p.u. of their rating; NaN if the case has it not
+
+
+def named(bus: str) -> str:
+    """A bus in a sentence: many names begin with the word themselves."""
+    return bus if bus.lower().startswith("bus") else f"bus {bus}"
 
 
 class FlowBranch(NamedTuple):
@@ -82,7 +89,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     unique = case.bus.name.notna().all() and case.bus.name.astype(str).is_unique
     called = {index: str(case.bus.name[index] if unique else index) for index in case.bus.index}
     if len(dead := case.bus.index[case.bus.in_service & case.res_bus.vm_pu.isna()]):
-        raise UserError(f"{title}: bus {called[dead[0]]} has no path to the slack")
+        raise UserError(f"{title}: {named(called[dead[0]])} has no path to the slack")
     for index, name in called.items():
         names.setdefault(int(where[index]), name)
     bus, branch = ppc["bus"], ppc["branch"]
@@ -99,6 +106,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
         branches.append(FlowBranch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
     ratings, static = _ratings(case, where, place, S_b), _static(case, where, place, S_b)
+    sources = _sources(case, where, place)
     ignored = [
         f"{len(case[table])} {table}: {why}."
         for table, why in _IGNORED.items()
@@ -108,14 +116,15 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
         ignored.append(f"{turning} trafo: they turn no phase.")
     buses = [
         Bus(names[int(row[0])], V[k], load[k] + static.get(k, (0j, 0.0))[0], shunt[k],
-            comes[k] if k in ratings else 0j, ratings.get(k), *static.get(k, (0j, 0.0)))
+            comes[k] if k in ratings else 0j, ratings.get(k), *static.get(k, (0j, 0.0)),
+            sources.get(k, math.nan))
         for k, row in enumerate(bus)
     ]  # fmt: skip
     for k, one in enumerate(buses):
         if k not in ratings and abs(comes[k]) > _NEAR:
             raise UserError(
-                f"{title}: bus {one.name}: {comes[k]:.3g} p.u. come from parts that this does not"
-                " read (iron losses of transformers, for one)"
+                f"{title}: {named(one.name)}: {comes[k]:.3g} p.u. come from parts that this does"
+                " not read (iron losses of transformers, for one)"
             )
     slack = int(np.flatnonzero(bus[:, 1] == 3)[0])
     return PowerFlow(title, S_b * 1e6, float(case.f_hz), buses, branches, slack, ignored)
@@ -135,6 +144,19 @@ def _ratings(
             before = ratings.get(k, 0.0)
             ratings[k] = None if own is None or before is None else before + own / S_b
     return ratings
+
+
+def _sources(case: Any, where: Any, place: Mapping[int, int]) -> dict[int, float]:
+    """The reactance behind which the generators of each bus have their voltage, all in parallel,
+    p.u. of their rating (``xdss_pu``, ZSOURCE of PSS/E); NaN if one of them has none."""
+    sums: dict[int, tuple[float, float]] = {}
+    for table in ("gen", "ext_grid"):
+        for _, row in _working(case, case[table]).iterrows():
+            k = place[int(where[row.bus])]
+            X, S = row.get("xdss_pu", math.nan), row.get("sn_mva", math.nan)
+            before = sums.get(k, (0.0, 0.0))
+            sums[k] = before[0] + S, before[1] + S / X
+    return {k: S / by_X for k, (S, by_X) in sums.items()}
 
 
 def _working(case: Any, table: Any) -> Any:

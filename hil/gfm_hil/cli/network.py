@@ -32,8 +32,8 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     read.add_argument(
         "--dynamics", metavar="FILE",
-        help="dynamic data of PSS/E (.dyr): GENROU, SEXS, IEEET1, EXDC2, EXST1, TGOV1,"
-        " IEEEG1, HYGOV, PSS1A, IEEEST, REGCA1, REECA1 and REECB1",
+        help="dynamic data of PSS/E (.dyr): GENROU, GENCLS, SEXS, IEEET1, EXDC2, EXST1,"
+        " TGOV1, IEEEG1, HYGOV, PSS1A, IEEEST, REGCA1, REECA1 and REECB1",
     )  # fmt: skip
     read.add_argument("-o", "--out", metavar="FOLDER", help="(default: the case's name)")
     read.set_defaults(call=call_import)
@@ -53,8 +53,10 @@ def call_import(options: argparse.Namespace) -> int:
     case = network_from(options.case, converters, options.slack, dynamics=options.dynamics)
     file = case.save(options.out or Path(options.case).stem)
     network, console = case.content["network"], terminal()
-    console.print(", ".join(f"{len(parts)} {table.replace('_', ' ')}"
-                            for table, parts in network.items() if table != "grid"))  # fmt: skip
+    counts = [(len(parts), table.replace("_", " "))
+              for table, parts in network.items() if table != "grid"]  # fmt: skip
+    console.print(", ".join(f"{n} {table.removesuffix('s') if n == 1 else table}"
+                            for n, table in counts))  # fmt: skip
     for line in case.ignored:
         console.print(f"• {line}")
     console.print(

@@ -186,13 +186,14 @@ def test_wrong_input_is_one_line(arguments, line, tmp_path, capsys):
     said = capsys.readouterr()
     assert line in said.err and len(said.err.splitlines()) == 1 and not said.out
     assert not (tmp_path / "net").exists()
+    assert not (tmp_path / "net").exists()
 
 
 def test_from_the_command_line(tmp_path, capsys):
     assert main(["network", "import", "case9", "--converter", "2=droop-3", "--slack", "grid",
                  "-o", str(tmp_path / "net")]) == 0  # fmt: skip
     said = capsys.readouterr().out
-    assert "1 converters, 9 lines" in said and "p.u. from the power flow" in said
+    assert "1 converter, 9 lines" in said and "p.u. from the power flow" in said
     assert (tmp_path / "net" / "network.toml").is_file()
 
 
@@ -232,16 +233,16 @@ PUBLISHED = """\
 def test_published_controls(record, known, notes, tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(f"{PUBLISHED.splitlines()[0]}\n1 '{record}\n")
-    machines, _, ignored = read_machines(file)
-    one = SynchronousMachine(node="a", S=1.0, P=0.5, **machines["1"])
+    tables, ignored, _ = read_machines(file)
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
     assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
 
 
 def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(PUBLISHED)
-    machines, _, ignored = read_machines(file)
-    one = SynchronousMachine(node="a", S=1.0, P=0.5, **machines["1"])
+    tables, ignored, _ = read_machines(file)
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
     assert (one.avr.T_B, one.avr.V_Rmin, one.avr.T_F, one.avr.saturation()) == (
         1.0, -4.16, 1.246, (0.0, 0.0),
     )  # fmt: skip
@@ -279,6 +280,33 @@ def test_converters_of_a_dynamics_file_follow_the_grid(tmp_path):
         gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
 
 
+def test_classical_machines_of_a_dynamics_file(tmp_path):
+    """Their voltage stands behind ZSOURCE where the case has it; nothing moves at the start, and an
+    infinite bus does not later."""
+    file = tmp_path / "classical.dyr"
+    file.write_text(
+        "1 'GENCLS' 1 0.0 0.0 /\n2 'GENCLS' 1 6.4 1.5 /\n2 'SEXS' 1 0.1 10 100 0.05 0 5 /"
+    )
+    net = networks.case9()
+    net.gen["sn_mva"], net.gen["xdss_pu"] = [200.0, 100.0], [0.12, 0.18]
+    case = gfmhil.network_from(net, {"3": "droop-3"}, dynamics=file)
+    one, two = (case.content["network"]["machines"][f"G{k}"] for k in "12")
+    assert (one["X"], two["X"], two["H"], two["D"], one["H"]) == (0.3, 0.12, 6.4, 1.5, 1e6)
+    i = complex(163.0, float(net.res_gen.q_mvar[0])) / 200.0  # at 1 p.u.
+    assert two["E"] == pytest.approx(abs(1.0 + 0.12j * i.conjugate()), abs=1e-9)
+    for line in (
+        "controls at bus 2 are left out",
+        "GENCLS at bus 1: X' = 0.3 p.u., our assumption",
+    ):
+        assert sum(line in said for said in case.ignored) == 1, line
+    case.content["network"]["record"] = ["machines"]
+    case.content["events"] = [{"type": "breaker", "t": 0.1, "name": "load5", "closed": False}]
+    run = gfmhil.run_network(case.save(tmp_path / "net"), duration=1.0)
+    speeds = np.array([run.flows[f"G{k}.omega"][:] for k in "12"]) - 1.0
+    assert np.abs(speeds[:, :999]).max() < 1e-9
+    assert np.abs(speeds[0]).max() < 1e-6 < 1e-4 < np.abs(speeds[1]).max()
+
+
 def test_machines_of_a_dynamics_file_run(tmp_path):
     file = tmp_path / "case9.dyr"
     file.write_text(DYNAMICS)
@@ -314,7 +342,12 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
         ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
         ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
         ("1 '", "77 '", "bus 77: is no bus of case9"),
-        ("GENROU", "GENSAL", "no record of GENROU or REGCA1"),
+        ("GENROU", "GENTPJ", "no record of GENROU, GENCLS or REGCA1"),
+        # refused by its own part, by a machine at this sampling period, and at the start
+        ("0.05 0.0 5.0", "0.05 5.0 0.0", "line 6: SEXS at bus 2: E_min = 5: must be less than E_m"),
+        ("0.1198", "0.9", "line 4: GENROU at bus 2: X_d = 0.8958: must be above that before it"),
+        ("23.64", "1e-6", "wrong.dyr, bus 1: it swings at 30699.8 rad/s; allowed are 1000 rad/s"),
+        ("0.05 0.0 5.0", "0.05 0.0 0.5", "wrong.dyr, bus 2: its avr, SEXS, needs E_fd = 1.249"),
     ],
 )
 def test_a_dynamics_file_that_is_none_is_one_line(old, new, line, tmp_path, capsys):
@@ -324,3 +357,4 @@ def test_a_dynamics_file_that_is_none_is_one_line(old, new, line, tmp_path, caps
     assert main([*command, "-o", str(tmp_path / "net")]) == 2
     said = capsys.readouterr()
     assert line in said.err and len(said.err.splitlines()) == 1 and not said.out
+    assert not (tmp_path / "net").exists()
