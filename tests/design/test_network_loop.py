@@ -133,6 +133,12 @@ def with_static_exciter(place: Path | None = None) -> Scenario:
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
 
 
+def with_salient_poles(place: Path | None = None, T_q10: float = 1.0) -> Scenario:
+    poles = {"X_q": 1.1, "X_q1": 1.1, "T_q10": T_q10, "saturates_by": "E_q1"}
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "S_10": 0.1, "S_12": 0.3, "avr": {}}
+    return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine | poles}})
+
+
 def with_following(place: Path | None = None) -> Scenario:
     neighbour = {"G": {"node": "far", "S": 0.8, "P": 0.4, "Q": 0.1, "k_V": 3.0, "band": 0.0}}
     banks = {"bank": {"node": "far", "Q": 0.1}}
@@ -197,6 +203,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_synchronous_machine,
         with_controls,
         with_static_exciter,
+        with_salient_poles,
         with_following,
         with_motor,
         with_waves,
@@ -215,6 +222,11 @@ def test_a_step_is_that_of_the_nonlinear_bench(of, reference, tmp_path):
             found = (moved[name][column] - rest[name][column]) / size
             largest = max(np.abs(y["A"][:, k]).max(), np.abs(y[name][:, k]).max())
             assert np.abs(found - y[name][:ticks, k]).max() < 2e-3 * largest, (name, column)
+
+
+@pytest.mark.full
+def test_salient_poles_have_no_mode_of_a_second_damper():
+    assert are_equal(poles(loop(with_salient_poles())), poles(loop(with_salient_poles(T_q10=3.0))))
 
 
 @pytest.mark.full

@@ -27,7 +27,7 @@ class Machines(NamedTuple):
     #: by table of a network, and by the name of the bus, keys of a part of that table
     tables: Mapping[str, Mapping[str, dict[str, Any]]]
     ignored: Sequence[str]  #: what it says and this has not, or has otherwise
-    file: str = ""
+    file: str = ""  #: its path
 
 
 class _Record(NamedTuple):
@@ -36,9 +36,9 @@ class _Record(NamedTuple):
 
 
 def read_machines(path: str | Path) -> Machines:
-    """Read the records of GENROU and GENCLS, and of their controls: the exciters SEXS, IEEET1,
-    EXDC2 and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and IEEEST; and of
-    REGCA1 with REECA1 or REECB1.
+    """Read the records of GENROU, GENSAL and GENCLS, and of their controls: the exciters SEXS,
+    IEEET1, EXDC2 and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and
+    IEEEST; and of REGCA1 with REECA1 or REECB1.
 
     Raises:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
@@ -74,7 +74,7 @@ def read_machines(path: str | Path) -> Machines:
             table, content = part
             tables.setdefault(table, {})[bus] = content
     if not tables:
-        raise UserError(f"{path}: no record of GENROU, GENCLS or REGCA1")
+        raise UserError(f"{path}: no record of GENROU, GENSAL, GENCLS or REGCA1")
     return Machines(tables, list(dict.fromkeys(ignored)), str(path))
 
 
@@ -190,6 +190,12 @@ def _genrou(p: Numbers) -> Made:
     return _lagging({**p}, "T_d10", "T_d20", "T_q10", "T_q20")
 
 
+def _gensal(p: Numbers) -> Made:
+    """With X_q' = X_q the machine of order 6 has one damper in its q axis."""
+    poles = {"X_q1": p["X_q"], "saturates_by": "E_q1"}
+    return _lagging({**p, **poles}, "T_d10", "T_d20", "T_q20")
+
+
 def _gencls(p: Numbers) -> Made:
     notes = []
     if p["H"] == 0.0:
@@ -216,6 +222,11 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
          "S_10", "S_12"),
         _genrou,
+    ),
+    "GENSAL": (
+        "machine",
+        ("T_d10", "T_d20", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_2", "X_l", "S_10", "S_12"),
+        _gensal,
     ),
     "GENCLS": ("classical", ("H", "D"), _gencls),
     "REGCA1": (

@@ -17,6 +17,10 @@ stator is a voltage behind one branch, R and X'', of the circuit that is solved 
 Its iron saturates by S(|psi''|): S times the flux is a parabola above a flux from which it begins
 (`controls.control.parabola`), by S_10 and S_12 at fluxes of 1 and 1.2. X'' does not saturate.
 
+With X_q' = X_q nothing moves E_d', which is 0: the q axis then has one damper, as that of a machine
+with salient poles. The iron of one by GENSAL saturates in the d axis alone, by E_q': S(E_q') E_q'
+takes the place of S psi_d'', and 0 that of S psi_q''.
+
 Its torque, psi_d'' i_q - psi_q'' i_d, drives the swing equation. The exciter gives E_fd by the size
 V of its terminals' voltage, the governor the torque of the turbine and the stabiliser a voltage by
 its speed: see `controls`.
@@ -30,7 +34,7 @@ torque of a turbine with a governor its value in the middle, extrapolated.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -92,8 +96,14 @@ def _flux(one: Any, x: Any) -> complex:
 
 
 @compiled
+def _iron(one: Any, x: Any, psi: complex) -> complex:
+    """Return the flux by which the iron saturates, and which its saturation weakens."""
+    return complex(x[E_Q], 0.0) if one.by_E_q1 != 0 else psi
+
+
+@compiled
 def _saturation(one: Any, psi: complex) -> float:
-    """Return S at a flux psi''."""
+    """Return S at a flux of the iron."""
     size = math.sqrt(psi.real * psi.real + psi.imag * psi.imag)
     if size <= one.s_a:
         return 0.0
@@ -103,7 +113,7 @@ def _saturation(one: Any, psi: complex) -> float:
 
 @compiled
 def _windings(one: Any, x: Any, E_fd: float, i: complex, psi: complex, S: float, out: Any) -> None:
-    """Write d/dt of the rotor's states, 1/s, at a current i, a flux psi'' and its saturation."""
+    """Write d/dt of the rotor's states, 1/s, at a current i, a flux of the iron and its S."""
     g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
     g_q = x[PSI_KQ] + one.X_ql * i.imag + x[E_D]
     out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d) - S * psi.real) / one.T_d10
@@ -124,7 +134,7 @@ def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     """Write d/dt of the states x, (N_STATES,), 1/s, at a terminal voltage of size V, a speed of
     1 + w and a current i; returns the torque of the turbine, if it has a governor."""
     V_s = stabilise(one.pss, one.pss_p, x, PSS, w, one.pss_set, out)
-    psi = _flux(one, x)
+    psi = _iron(one, x, _flux(one, x))
     S = _saturation(one, psi)
     seen = Terminals(V, _field_current(one, x, i, psi, S))
     E_fd = excite(one.avr, one.avr_p, x, AVR, seen, one.avr_set + V_s, out)
@@ -244,6 +254,7 @@ class SynchronousMachine(Rotating):
             *((name, "f8") for name in ("a_q", "X_2", "R", "T_d10", "T_q10", "T_d20", "T_q20")),
             # saturation: from which flux on, of the parabola, and its share in the q axis
             *((name, "f8") for name in ("s_a", "s_b", "s_q")),
+            ("by_E_q1", "i8"),
             # of each control: its kind, 0 if there is none, and its numbers
             *((role, "i8") for role in ROLES),
             *((f"{role}_p", "f8", (MOST_NUMBERS,)) for role in ROLES),
@@ -279,6 +290,9 @@ class SynchronousMachine(Rotating):
     T_q20: Positive = Field(0.05, description="open-circuit subtransient time constant T_q0'', s")
     S_10: NonNegative = Field(0.0, description="saturation S(1.0), at a flux of 1 p.u.")
     S_12: NonNegative = Field(0.0, description="saturation S(1.2), at 1.2 p.u.; 0: none at all")
+    saturates_by: Literal["psi_2", "E_q1"] = Field(
+        "psi_2", description="psi'', in both axes as of GENROU, or E_q', as of GENSAL"
+    )
     avr: AnyExciter | None = Field(
         None, description="voltage regulator with its exciter; E_fd is constant if none"
     )
@@ -372,6 +386,7 @@ class SynchronousMachine(Rotating):
             record[f"k_{axis}"] = (X_1 - self.X_2) / (X_1 - self.X_l) ** 2
         record["s_a"], record["s_b"] = self._parabola()
         record["s_q"] = (self.X_q - self.X_l) / (self.X_d - self.X_l)
+        record["by_E_q1"] = self.saturates_by == "E_q1"
         record["P_set"], record["begins"] = self.P, 1
 
     def steady(
@@ -387,7 +402,7 @@ class SynchronousMachine(Rotating):
         i, v = complex(*z[:2]), complex(*z[2:])
         iron = SimpleNamespace(**dict(zip(("s_a", "s_b"), self._parabola(), strict=True)))
         S = _saturation.py_func(iron, (v + complex(self.R, omega * self.X_2) * i) / omega)
-        S_q = S * float(record["s_q"])
+        S_q = 0.0 if record["by_E_q1"] else S * float(record["s_q"])
         X_q = self.X_q - (self.X_q - self.X_2) * S_q / (1.0 + S_q)
         q_axis = v + complex(self.R, omega * X_q) * i
         unit = -1j * q_axis / abs(q_axis)
@@ -395,6 +410,8 @@ class SynchronousMachine(Rotating):
         E = (v * unit.conjugate() + self.R * own).imag / omega + self.X_d * i_d
         E_q, E_d = E - (self.X_d - self.X_d1) * i_d, (X_q - self.X_q1) * i_q
         E_fd = E + S * (E - (self.X_d - self.X_2) * i_d)
+        if record["by_E_q1"]:
+            E_fd = E + _saturation.py_func(iron, complex(E_q, 0.0)) * E_q
         psi_kd = E_q - (self.X_d1 - self.X_l) * i_d
         psi_kq = -E_d - (self.X_q1 - self.X_l) * i_q
         torque = ((v + self.R * i) * i.conjugate()).real / omega + self.D * (omega - 1.0)
@@ -464,7 +481,8 @@ class SynchronousMachine(Rotating):
         found = np.stack(
             [(moved(x) - moved(-x)) / (2 * _NUDGE) for x in _NUDGE * np.eye(n + 2)], axis=1
         )
-        kept = [k for k in range(n) if found[k].any() or found[:, k].any()]
+        # without what nothing else moves, as E_d' of salient poles
+        kept = [k for k in range(n) if np.delete(found[k], k).any()]
         turn = np.zeros(len(kept))
         turn[0] = 1.0
         A, by_seen = found[np.ix_(kept, kept)], found[kept, n:]
@@ -481,7 +499,7 @@ class SynchronousMachine(Rotating):
             return found
 
         V_s = output("pss", w, one.pss_set)
-        psi = _flux.py_func(one, x)
+        psi = _iron.py_func(one, x, _flux.py_func(one, x))
         S = _saturation.py_func(one, psi)
         seen = Terminals(V, _field_current.py_func(one, x, i, psi, S))
         _windings.py_func(one, x, output("avr", seen, one.avr_set + V_s), i, psi, S, out)

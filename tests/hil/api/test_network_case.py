@@ -238,6 +238,18 @@ def test_published_controls(record, known, notes, tmp_path):
     assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
 
 
+def test_a_published_machine_with_salient_poles(tmp_path):
+    file = tmp_path / "published.dyr"
+    file.write_text(  # of ANDES's N44_BC.dyr
+        "3115 'GENSAL' 1 7.57 0.045 0.1 4.741 0.0 0.946 0.565 0.29 0.23 0.11077 0.10239 0.2742 /"
+    )
+    values = read_machines(file).tables["synchronous_machines"]["3115"]
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **values)
+    assert (one.T_d10, one.T_d20, one.T_q20, one.H, one.X_l) == (7.57, 0.045, 0.1, 4.741, 0.11077)
+    assert (one.X_d, one.X_q, one.X_q1, one.X_d1, one.X_2) == (0.946, 0.565, 0.565, 0.29, 0.23)
+    assert (one.S_10, one.S_12, one.saturates_by) == (0.10239, 0.2742, "E_q1")
+
+
 def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(PUBLISHED)
@@ -342,7 +354,7 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
         ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
         ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
         ("1 '", "77 '", "bus 77: is no bus of case9"),
-        ("GENROU", "GENTPJ", "no record of GENROU, GENCLS or REGCA1"),
+        ("GENROU", "GENTPJ", "no record of GENROU, GENSAL, GENCLS or REGCA1"),
         # refused by its own part, by a machine at this sampling period, and at the start
         ("0.05 0.0 5.0", "0.05 5.0 0.0", "line 6: SEXS at bus 2: E_min = 5: must be less than E_m"),
         ("0.1198", "0.9", "line 4: GENROU at bus 2: X_d = 0.8958: must be above that before it"),
