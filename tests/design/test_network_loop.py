@@ -135,7 +135,8 @@ def with_static_exciter(place: Path | None = None) -> Scenario:
 
 def with_salient_poles(place: Path | None = None, T_q10: float = 1.0) -> Scenario:
     poles = {"X_q": 1.1, "X_q1": 1.1, "T_q10": T_q10, "saturates_by": "E_q1"}
-    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "S_10": 0.1, "S_12": 0.3, "avr": {}}
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "S_10": 0.1, "S_12": 0.3}
+    machine |= {"avr": {"type": "ESST3A", "K_C": 0.2}}
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine | poles}})
 
 

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from gfm_plant.components import SynchronousMachine
 from gfm_plant.components.controls import EXCITERS, GOVERNORS, STABILISERS
 from gfm_plant.components.controls.control import Control, Exciter, Terminals
+from gfm_plant.components.controls.esst3a import Esst3a
 from gfm_plant.components.controls.exdc2 import Exdc2
 from gfm_plant.components.controls.exst1 import Exst1
 from gfm_plant.components.controls.hygov import Hygov
@@ -34,8 +35,11 @@ def product(*blocks: tuple[list[float], list[float]]) -> Polynomials:
 
 
 def sees(one: Control, seen: float, output: float) -> Any:
-    """What a control sees: of an exciter the voltage, and its own output as the field's current."""
-    return Terminals(seen, output) if isinstance(one, Exciter) else seen
+    """What a control sees: of an exciter the voltage, its own output as the field's current, and
+    phasors."""
+    return (
+        Terminals(seen, output, v=0.3 + 0.97j, i=0.6 + 0.5j) if isinstance(one, Exciter) else seen
+    )
 
 
 def stepped(one: Control, output: float, seen: float, by: float, t: np.ndarray) -> np.ndarray:
@@ -60,6 +64,12 @@ SEXS = Sexs(K=50.0, T_A=0.4, T_B=1.5, E_min=-5.0)
 IEEET1 = Ieeet1(V_Rmin=-8.0, V_Rmax=8.0)
 EXDC2 = Exdc2(T_B=1.2, T_C=0.3, V_Rmin=-8.0, V_Rmax=8.0)
 EXST1 = Exst1(T_C=0.3, T_B=1.2, K_F=0.05)
+ESST3A = Esst3a(K_C=0.5)
+LAGGING = Esst3a(K_C=0.5, T_A=0.05)
+# its rectifier, at the phasors of ``sees`` and a field's current of 1.8
+SOURCE = 3.67 * np.exp(1j * np.radians(3.33))
+V_E = abs(SOURCE * (0.3 + 0.97j) + 1j * (0.435 + 0.0098 * SOURCE) * (0.6 + 0.5j))
+V_B = V_E * (1.0 - 0.577 * 0.5 * 1.8 / V_E)
 IEEEG1 = Ieeeg1(T1=0.1, T2=0.05, T6=0.4, K1=0.2, K3=0.3, K5=0.3, K7=0.1)  # T7 left out
 HYGOV = Hygov(D_turb=0.0)
 TGOV1 = Tgov1(D_t=0.3)
@@ -92,6 +102,14 @@ PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
             (product(([50.0], [1]), ([0.3, 1], [1]), ([1.0, 1], [1]))[0],
              np.polyadd(product(([1], [1.2, 1]), ([1], [0.02, 1]), ([1], [1.0, 1]))[1],
                         np.polymul([0.3, 1], [50.0 * 0.05, 0.0]))),
+        ]),
+        # lead, lag and the outer regulator; the inner one with its feedback, closed
+        (ESST3A, 1.8, 1.02, [
+            ([-20.0], [0.02, 1]), ([1.0, 1], [5.0, 1]), ([8.0 * V_B], [0.4, 1 + 8.0 * V_B]),
+        ]),
+        (LAGGING, 1.8, 1.02, [
+            ([-20.0], [0.02, 1]), ([1.0, 1], [5.0, 1]), ([1], [0.05, 1]),
+            ([8.0 * V_B], [0.4, 1 + 8.0 * V_B]),
         ]),
         (Pss1a(T6=0.0, A1=0.0, A2=0.0), 0.0, 0.0, [
             ([200.0, 0], [10.0, 1]), ([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]),
@@ -159,9 +177,9 @@ def test_a_hydraulic_governor_by_its_linear_model():
 
 def test_the_limits_of_a_commutator_exciter_follow_the_voltage():
     one = Exdc2(V_Rmax=2.0, V_Rmin=-2.0)
-    _, asked = one.rest(1.5, Terminals(1.0, 1.5))
+    _, asked = one.rest(1.5, Terminals(1.0, 1.5, 1j, 0j))
     out, p = np.zeros(5), np.array(one.numbers())
-    halved = Terminals(0.5, 1.5)
+    halved = Terminals(0.5, 1.5, 0.5j, 0j)
     Exdc2.rates.py_func(p, np.array([0.5, 2.0, 1.5, 1.5, 0.1]), 0, halved, asked, out)
     assert out[1] == 0.0  # at 0.5 p.u. it is beyond its limit, and rises no further
     assert out[2] == pytest.approx((0.5 * 2.0 - 1.5) / 0.314)
@@ -176,10 +194,10 @@ def test_a_static_exciter_is_at_its_ceiling_without_wind_up(V, I_fd, asked, ceil
     p, rates = np.array(one.numbers()), Exst1.rates.py_func
     out, x = np.zeros(4), np.array([V, 0.0, 1.0, 1.0])
     for _ in range(2000):
-        E_fd = rates(p, x, 0, Terminals(V, I_fd), asked, out)
+        E_fd = rates(p, x, 0, Terminals(V, I_fd, V * 1j, 0j), asked, out)
         x += 1e-5 * out
     assert E_fd == pytest.approx(ceiling)
-    rates(p, x, 0, Terminals(V, I_fd), V, out)  # the error is gone
+    rates(p, x, 0, Terminals(V, I_fd, V * 1j, 0j), V, out)  # the error is gone
     assert out[2] * ceiling < 0.0 and abs(x[2] - ceiling) < 0.1
 
 
@@ -188,6 +206,40 @@ def test_the_error_of_a_static_exciter_is_limited():
     t = np.linspace(0.0, 2.0, 20)
     found = stepped(one, 1.0, 1.0, -0.2, t)  # from an error of 1/50 to 0.03
     assert found[-1] == pytest.approx(50.0 * 0.03 - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("load", "keeps"),
+    [(0.0, 1.0), (0.2, 0.8846), (0.6, 0.39**0.5), (0.9, 0.1732), (1.2, 0.0), (-0.1, 1.0)],
+)
+def test_what_a_rectifier_keeps_of_its_voltage(load, keeps):
+    """F_EX of IEEE Std 421.5, annex D, and the limit behind it."""
+    one = Esst3a(K_P=2.0, K_I=0.0, X_L=0.0, theta_P=0.0, K_C=0.5, V_Bmax=1.9)
+    seen = Terminals(1.0, 4.0 * load, 1j, 0j)
+    x = np.array([1.0, 0.0, 0.0, 0.7])
+    E_fd = Esst3a.rates.py_func(np.array(one.numbers()), x, 0, seen, 1.0, np.zeros(4))
+    assert E_fd == pytest.approx(min(2.0 * keeps, 1.9) * 0.7, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("more", "by", "field"),
+    [
+        ({"V_Imax": 0.1}, -0.5, 0.1 * 20.0),  # the error
+        ({"V_Rmax": 1.9}, -0.15, 1.9),  # the outer regulator, without lag
+        ({"V_Gmax": 1.82}, -0.005, None),  # the feedback: the inner loop is open beyond it
+    ],
+)
+def test_the_limits_of_a_compound_exciter(more, by, field):
+    """At rest the inner regulator makes V_M = K_M (V_R - K_G E_fd), so E_fd = V_R / (K_G + 1 / (K_M
+    V_B)), or V_B K_M (V_R - V_Gmax)."""
+    one = Esst3a(K_C=0.0, T_B=0.0, T_C=0.0, **more)
+    _, asked = one.rest(1.8, sees(one, 1.0, 1.8))
+    found = 1.8 + stepped(one, 1.8, 1.0, by, np.linspace(0.0, 30.0, 5))[-1]
+    B = min(V_E, 5.48)
+    expected = B * 8.0 * (20.0 * (asked - 1.0 - by) - 1.82)
+    if field is not None:
+        expected = field / (1.0 + 1.0 / (8.0 * B))
+    assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_saturation_passes_both_points():
@@ -200,7 +252,20 @@ def test_the_saturation_passes_both_points():
 
 def test_a_rest_does_not_move():
     saturated = Ieeet1(E_1=2.8, S_E1=0.04, E_2=3.73, S_E2=0.33)
-    for one in (SEXS, IEEET1, EXDC2, EXST1, saturated, TGOV1, IEEEG1, HYGOV, PSS1A, PLAIN):
+    for one in (
+        SEXS,
+        IEEET1,
+        EXDC2,
+        EXST1,
+        ESST3A,
+        LAGGING,
+        saturated,
+        TGOV1,
+        IEEEG1,
+        HYGOV,
+        PSS1A,
+        PLAIN,
+    ):
         output = 0.0 if isinstance(one, Pss1a) else 3.0
         seen = sees(one, 1.0 if isinstance(one, Exciter) else 0.01, output)
         states, asked = one.rest(output, seen)
@@ -240,6 +305,8 @@ def kind_of(one: Control) -> str:
         ({"avr": {"type": "EXDC2", "T_C": 0.1}}, "T_B = 0: must be above 0 with T_C = 0.1"),
         ({"avr": {"type": "EXST1", "V_Rmin": 1e4}}, "V_Rmin = 10000: must be less than V_Rmax"),
         ({"avr": {"type": "EXST1", "V_Imax": 0.0, "V_Imin": 0.0}}, "V_Imin = 0: must be less than"),
+        ({"avr": {"type": "ESST3A", "V_Mmin": 99.0}}, "V_Mmin = 99: must be less than V_Mmax, 99"),
+        ({"avr": {"type": "ESST3A", "K_P": 0.0, "K_I": 0.0}}, "K_P and K_I are 0: nothing would"),
         ({"governor": {"T1": -0.5}}, "greater than 0"),
         ({"governor": {"V_min": 1.5}}, "V_min = 1.5: must be less than V_max, 1.2"),
         ({"governor": {}, "droop": 0.04}, "droop = 0.04: leave it out, the governor has its own"),

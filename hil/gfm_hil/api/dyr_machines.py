@@ -37,8 +37,8 @@ class _Record(NamedTuple):
 
 def read_machines(path: str | Path) -> Machines:
     """Read the records of GENROU, GENSAL and GENCLS, and of their controls: the exciters SEXS,
-    IEEET1, EXDC2 and EXST1, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A and
-    IEEEST; and of REGCA1 with REECA1 or REECB1.
+    IEEET1, EXDC2, EXST1 and ESST3A, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A
+    and IEEEST; and of REGCA1 with REECA1 or REECB1.
 
     Raises:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
@@ -135,6 +135,10 @@ def _rotating(type: str, p: Numbers) -> Made:
 
 def _exst1(p: Numbers) -> Made:
     return _lagging({"type": "EXST1", **p}, "T_R", "T_A", "T_F")
+
+
+def _esst3a(p: Numbers) -> Made:
+    return _lagging({"type": "ESST3A", **p}, "T_R", "T_M")
 
 
 def _tgov1(p: Numbers) -> Made:
@@ -263,6 +267,12 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_C", "K_F",
          "T_F"),
         _exst1,
+    ),
+    "ESST3A": (
+        "avr",
+        ("T_R", "V_Imax", "V_Imin", "K_M", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_G",
+         "K_P", "K_I", "V_Bmax", "K_C", "X_L", "V_Gmax", "theta_P", "T_M", "V_Mmax", "V_Mmin"),
+        _esst3a,
     ),
     "IEEEG1": (
         "governor",

@@ -112,21 +112,24 @@ def _saturation(one: Any, psi: complex) -> float:
 
 
 @compiled
-def _windings(one: Any, x: Any, E_fd: float, i: complex, psi: complex, S: float, out: Any) -> None:
+def _windings(one: Any, x: Any, E_fd: float, i: complex, iron: complex, S: float, out: Any) -> None:
     """Write d/dt of the rotor's states, 1/s, at a current i, a flux of the iron and its S."""
     g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
     g_q = x[PSI_KQ] + one.X_ql * i.imag + x[E_D]
-    out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d) - S * psi.real) / one.T_d10
-    out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q) + S * one.s_q * psi.imag) / one.T_q10
+    out[E_Q] = (E_fd - x[E_Q] - one.X_dd * (i.real - one.k_d * g_d) - S * iron.real) / one.T_d10
+    out[E_D] = (-x[E_D] + one.X_qq * (i.imag - one.k_q * g_q) + S * one.s_q * iron.imag) / one.T_q10
     out[PSI_KD], out[PSI_KQ] = -g_d / one.T_d20, -g_q / one.T_q20
 
 
 @compiled
-def _field_current(one: Any, x: Any, i: complex, psi: complex, S: float) -> float:
-    """Return the current of the field, X_ad I_fd, as it stands in d/dt of E_q'."""
+def _terminals(
+    one: Any, x: Any, V: float, w: float, i: complex, psi: complex, iron: complex, S: float
+) -> Terminals:
+    """Return what the exciter sees, at a flux psi'', a flux of the iron and its S."""
     g_d = x[PSI_KD] + one.X_dl * i.real - x[E_Q]
-    I_fd: float = x[E_Q] + one.X_dd * (i.real - one.k_d * g_d) + S * psi.real
-    return I_fd
+    I_fd = x[E_Q] + one.X_dd * (i.real - one.k_d * g_d) + S * iron.real  # as in d/dt of E_q'
+    v = 1j * (1.0 + w) * psi - complex(one.R, (1.0 + w) * one.X_2) * i
+    return Terminals(V, I_fd, v, i)
 
 
 @compiled
@@ -134,11 +137,12 @@ def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     """Write d/dt of the states x, (N_STATES,), 1/s, at a terminal voltage of size V, a speed of
     1 + w and a current i; returns the torque of the turbine, if it has a governor."""
     V_s = stabilise(one.pss, one.pss_p, x, PSS, w, one.pss_set, out)
-    psi = _iron(one, x, _flux(one, x))
-    S = _saturation(one, psi)
-    seen = Terminals(V, _field_current(one, x, i, psi, S))
+    psi = _flux(one, x)
+    iron = _iron(one, x, psi)
+    S = _saturation(one, iron)
+    seen = _terminals(one, x, V, w, i, psi, iron, S)
     E_fd = excite(one.avr, one.avr_p, x, AVR, seen, one.avr_set + V_s, out)
-    _windings(one, x, E_fd, i, psi, S, out)
+    _windings(one, x, E_fd, i, iron, S, out)
     turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, w, one.governor_set, out)
     return turbine
 
@@ -418,7 +422,7 @@ class SynchronousMachine(Rotating):
         record["x"], record["avr_set"] = 0.0, E_fd
         record["x"][:AVR] = E_q, E_d, psi_kd, psi_kq
         seen: Mapping[str, tuple[float, Any]] = {
-            "avr": (E_fd, Terminals(abs(v), E_fd)),
+            "avr": (E_fd, Terminals(abs(v), E_fd, v * unit.conjugate(), own)),
             "governor": (torque, omega - 1.0),
             "pss": (0.0, omega - 1.0),
         }
@@ -499,8 +503,9 @@ class SynchronousMachine(Rotating):
             return found
 
         V_s = output("pss", w, one.pss_set)
-        psi = _iron.py_func(one, x, _flux.py_func(one, x))
-        S = _saturation.py_func(one, psi)
-        seen = Terminals(V, _field_current.py_func(one, x, i, psi, S))
-        _windings.py_func(one, x, output("avr", seen, one.avr_set + V_s), i, psi, S, out)
+        psi = _flux.py_func(one, x)
+        iron = _iron.py_func(one, x, psi)
+        S = _saturation.py_func(one, iron)
+        seen = _terminals.py_func(one, x, V, w, i, psi, iron, S)
+        _windings.py_func(one, x, output("avr", seen, one.avr_set + V_s), i, iron, S, out)
         return output("governor", w, one.governor_set)

@@ -207,7 +207,7 @@ DYNAMICS = """\
 2 'SEXS' 1 0.1 10.0 100.0 0.05 0.0 5.0 /
 2 'IEEEST' 1 1 0 0 0 0 0 0 0 0.05 0.02 3.0 5.4 10.0 5.0 20.0 0.2 -0.2 0 0 /
 2 'HYGOV' 1 0.05 0.5 5.0 0.05 0.2 0.2 1.0 0.0 1.0 1.2 0.5 0.08 /
-2 'ESST3A' 1 0 0 /
+2 'ESST4B' 1 0 0 /
 """
 
 
@@ -340,7 +340,7 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
     assert [two["governor"][key] for key in ("type", "T_W", "q_NL")] == ["HYGOV", 1.0, 0.08]
     # its washout 20 · 10 s/(1 + 5 s), as ours is written
     assert (two["pss"]["K_S"], two["pss"]["T5"], two["pss"]["T6"]) == (40.0, 5.0, 0.0)
-    for line in ("T_R = 0.001 s instead of 0", "ESST3A at bus 2 is"):
+    for line in ("T_R = 0.001 s instead of 0", "ESST4B at bus 2 is"):
         assert sum(line in said for said in case.ignored) in (1, 2), line
     run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.5)
     p = run["C3"].signals["p"]

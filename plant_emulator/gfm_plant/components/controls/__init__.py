@@ -9,6 +9,7 @@ from typing import Annotated, Any, Union
 from pydantic import BeforeValidator, Field
 
 from gfm_plant.components.controls.control import Control, Exciter, Governor, Stabiliser, Terminals
+from gfm_plant.components.controls.esst3a import Esst3a
 from gfm_plant.components.controls.exdc2 import Exdc2
 from gfm_plant.components.controls.exst1 import Exst1
 from gfm_plant.components.controls.hygov import Hygov
@@ -19,7 +20,7 @@ from gfm_plant.components.controls.sexs import Sexs
 from gfm_plant.components.controls.tgov1 import Tgov1
 from gfm_runtime.compiled import inlined_as
 
-EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1)
+EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1, Esst3a)
 GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov)
 STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a,)
 
@@ -75,5 +76,5 @@ def _most(kinds: Sequence[type[Control]], seen: Any) -> int:
 _EACH = (*EXCITERS, *GOVERNORS, *STABILISERS)
 #: numbers and states of one of each role, at most
 MOST_NUMBERS = max(len(kind().numbers()) for kind in _EACH)
-OF_EXCITER = _most(EXCITERS, Terminals(1.0, 1.0))
+OF_EXCITER = _most(EXCITERS, Terminals(1.0, 1.0, 1.0 + 0j, 0j))
 OF_GOVERNOR, OF_STABILISER = _most(GOVERNORS, 0.0), _most(STABILISERS, 0.0)

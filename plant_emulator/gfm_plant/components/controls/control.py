@@ -19,10 +19,17 @@ def parabola(E_1: float, S_1: float, E_2: float, S_2: float) -> tuple[float, flo
 
 
 class Terminals(NamedTuple):
-    """What an exciter sees of its machine, p.u."""
+    """What an exciter sees of its machine, p.u.
+
+    The phasors are those of the rotor's frame, i out of the machine. v leaves out what the stator
+    adds while currents and fluxes move, as the models of phasors do, for which exciters that use
+    it are defined.
+    """
 
     V: float  #: size of the terminals' voltage
     I_fd: float  #: current of the field, X_ad I_fd: E_fd where nothing moves
+    v: complex
+    i: complex
 
 
 class Control(Options):

@@ -1,0 +1,138 @@
+"""ESST3A, a static exciter fed by the voltage and the current of the terminals, with a regulator of
+the field's voltage inside (ST3A of IEEE Std 421.5):
+
+    T_R dV_m/dt = V - V_m,    V_I = V_set - V_m,    V_Imin <= V_I <= V_Imax,
+    T_B dy/dt = V_I - y,
+    T_A dV_R/dt = K_A (y + (V_I - y) T_C / T_B) - V_R,    V_Rmin <= V_R <= V_Rmax,
+    T_M dV_M/dt = K_M (V_R - min(K_G E_fd, V_Gmax)) - V_M,    V_Mmin <= V_M <= V_Mmax,
+    E_fd = V_B V_M,    V_B = min(V_E F(K_C I_fd / V_E), V_Bmax),
+    V_E = |K_Pp v + j (K_I + K_Pp X_L) i|,    K_Pp = K_P e^(j theta_P),
+
+with the phasors v and i of the terminals and the current I_fd of the field. F is what a rectifier
+of six pulses keeps of its voltage under that current: 1 - 0.577 I up to I = 0.433,
+sqrt(0.75 - I^2) up to 0.75, 1.732 (1 - I) up to 1, and 0 beyond. The gate for a limiter of
+under-excitation is left out.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from gfm_plant.components.controls.control import Exciter, Terminals
+from gfm_plant.parameters import NonNegative, Positive
+from gfm_runtime.compiled import compiled
+
+_LEAST = 1e-6  # p.u.; of V_E, by which the field's current is divided
+
+
+@compiled
+def _rectified(p: Any, seen: Terminals) -> float:
+    """Return V_B."""
+    K_P, K_I, X_L, K_C, V_Bmax = complex(p[12], p[13]), p[14], p[15], p[16], p[17]
+    feeds = K_P * seen.v + 1j * (K_I + K_P * X_L) * seen.i
+    V_E = math.sqrt(feeds.real * feeds.real + feeds.imag * feeds.imag)
+    load = K_C * seen.I_fd / max(V_E, _LEAST)
+    if load <= 0.433:
+        keeps = min(1.0 - 0.577 * load, 1.0)
+    elif load < 0.75:
+        keeps = math.sqrt(0.75 - load * load)
+    else:
+        keeps = max(1.732 * (1.0 - load), 0.0)
+    V_B: float = min(V_E * keeps, V_Bmax)
+    return V_B
+
+
+@compiled
+def _rates(p: Any, x: Any, at: int, seen: Terminals, asked: float, out: Any) -> float:
+    T_R, V_Imax, V_Imin, T_C, T_B, K_A, T_A = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
+    V_Rmax, V_Rmin, K_G, K_M, T_M, V_Gmax = p[7], p[8], p[9], p[10], p[11], p[18]
+    V_m, y, V_R, V_M = x[at], x[at + 1], x[at + 2], x[at + 3]
+    V_I = min(max(asked - V_m, V_Imin), V_Imax)
+    out[at] = (seen.V - V_m) / T_R
+    if T_B > 0.0:
+        out[at + 1] = (V_I - y) / T_B
+        V_I = y + T_C / T_B * (V_I - y)
+    if T_A > 0.0:
+        out[at + 2] = (K_A * V_I - V_R) / T_A
+    else:
+        V_R = min(max(K_A * V_I, V_Rmin), V_Rmax)
+    E_fd: float = _rectified(p, seen) * V_M
+    out[at + 3] = (K_M * (V_R - min(K_G * E_fd, V_Gmax)) - V_M) / T_M
+    return E_fd
+
+
+class Esst3a(Exciter):
+    """A static exciter fed by voltage and current, with a regulator inside, ESST3A. The defaults
+    are those of IEEE's case of 14 buses (ANDES, ieee14.dyr)."""
+
+    states: ClassVar = (
+        ("V_m", "p.u.", "voltage that it has measured"),
+        ("y", "p.u.", "of its lead and lag"),
+        ("V_R", "p.u.", "output of the outer regulator"),
+        ("V_M", "p.u.", "output of the inner regulator"),
+    )
+    rates: ClassVar = _rates
+
+    type: Literal["ESST3A"] = Field("ESST3A", description="which exciter")
+    T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
+    V_Imax: float = Field(0.2, ge=0.0, le=1e4, description="largest error of the voltage, p.u.")
+    V_Imin: float = Field(-0.2, ge=-1e4, le=0.0, description="least error of it, p.u.")
+    K_M: Positive = Field(8.0, description="gain of the inner regulator")
+    T_C: NonNegative = Field(1.0, description="lead before the outer regulator, s")
+    T_B: NonNegative = Field(5.0, description="lag before it, s; 0: neither it nor T_C")
+    K_A: Positive = Field(20.0, description="gain of the outer regulator")
+    T_A: NonNegative = Field(0.0, description="lag of the outer regulator, s; 0: none")
+    V_Rmax: float = Field(99.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
+    V_Rmin: float = Field(-99.0, ge=-1e4, le=1e4, description="least output of it, p.u.")
+    K_G: NonNegative = Field(1.0, description="gain of the feedback of E_fd")
+    K_P: NonNegative = Field(3.67, description="what the voltage gives to the rectifier")
+    K_I: NonNegative = Field(0.435, description="what the current gives to it")
+    V_Bmax: Positive = Field(5.48, description="largest voltage behind the rectifier, p.u.")
+    K_C: NonNegative = Field(0.01, description="how the field's current loads the rectifier")
+    X_L: NonNegative = Field(0.0098, description="reactance of the source of voltage, p.u.")
+    V_Gmax: Positive = Field(3.86, description="largest feedback of E_fd, p.u.")
+    theta_P: float = Field(3.33, ge=-180.0, le=180.0, description="angle of that source, degrees")
+    T_M: Positive = Field(0.4, description="lag of the inner regulator, s")
+    V_Mmax: float = Field(99.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
+    V_Mmin: float = Field(0.0, ge=-1e4, le=1e4, description="least output of it, p.u.")
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        for name in ("V_I", "V_R", "V_M"):
+            least, most = getattr(self, f"{name}min"), getattr(self, f"{name}max")
+            if not least < most:
+                raise ValueError(f"{name}min = {least:g}: must be less than {name}max, {most:g}")
+        if self.T_B == 0.0 and self.T_C > 0.0:
+            raise ValueError(f"T_B = 0: must be above 0 with T_C = {self.T_C:g}")
+        if self.K_P == 0.0 and self.K_I == 0.0:
+            raise ValueError("K_P and K_I are 0: nothing would feed it")
+        return self
+
+    def numbers(self) -> Sequence[float]:
+        names = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_G",
+                 "K_M", "T_M")  # fmt: skip
+        angle = math.radians(self.theta_P)
+        K_P = self.K_P * math.cos(angle), self.K_P * math.sin(angle)
+        behind = self.K_I, self.X_L, self.K_C, self.V_Bmax, self.V_Gmax
+        return *(getattr(self, name) for name in names), *K_P, *behind
+
+    def lags(self) -> Mapping[str, float]:
+        own = {name: getattr(self, name) for name in ("T_R", "T_B", "T_A")}
+        V_B = min(self.K_P * (1.0 + self.X_L) + self.K_I, self.V_Bmax)  # at 1 p.u. of both
+        own["T_M / (1 + K_M K_G V_B)"] = self.T_M / (1.0 + self.K_M * self.K_G * V_B)
+        return {name: T for name, T in own.items() if T > 0.0}
+
+    def limits(self) -> Mapping[int, tuple[float, float]]:
+        return {2: (self.V_Rmin, self.V_Rmax), 3: (self.V_Mmin, self.V_Mmax)}
+
+    def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
+        return {1: (self.V_Imin, self.V_Imax), **self.limits()}
+
+    def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
+        V_B = _rectified.py_func(self.numbers(), seen)
+        V_M = output / V_B if V_B > 0.0 else math.inf
+        V_R = V_M / self.K_M + min(self.K_G * output, self.V_Gmax)
+        error = V_R / self.K_A
+        return (seen.V, error, V_R, V_M), seen.V + error
