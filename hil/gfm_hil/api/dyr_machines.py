@@ -17,7 +17,7 @@ _CONSTANT = 1e12  # p.u./p.u.; the droop of a turbine whose power is constant
 _INFINITE = 1e6  # s; the inertia constant of an infinite bus
 
 Numbers = dict[str, float]
-#: keys of a table, and what is otherwise than in the record
+#: keys of a table, none if the record is left out, and what is otherwise than in it
 Made = tuple[dict[str, Any], list[str]]
 
 
@@ -66,8 +66,9 @@ def read_machines(path: str | Path) -> Machines:
             name: number(f"{where}, {name}", text) for name, text in zip(names, texts, strict=True)
         }
         content, notes = make(numbers)
-        buses[bus][role] = _Record(f"{where}: {model} at bus {bus}", content)
         ignored += [f"{model} at bus {bus}: {note}." for note in notes]
+        if content:
+            buses[bus][role] = _Record(f"{where}: {model} at bus {bus}", content)
     tables: dict[str, dict[str, dict[str, Any]]] = {}
     for bus, parts in buses.items():
         if (part := _part(bus, parts, ignored)) is not None:
@@ -158,8 +159,10 @@ def _hygov(p: Numbers) -> Made:
 def _stabiliser(p: Numbers) -> Made:
     """Its washout is K_S T5 s/(1 + T6 s), ours K_S T5 s/(1 + T5 s)."""
     notes = []
-    if p.pop("mode") != 1.0:
-        notes.append("acts on the speed here")
+    if (mode := p.pop("mode")) not in (1.0, 2.0):
+        return {}, [f"its input, mode {mode:g}, is no speed, and it is left out"]
+    if mode == 2.0:
+        notes.append("acts on the speed of the rotor here")
     more = [p.pop(name, 0.0) for name in ("bus", "A3", "A4", "A5", "A6", "V_CU", "V_CL")]
     if any(more[1:]):
         notes.append("A3 to A6, V_CU and V_CL are left out")

@@ -238,6 +238,16 @@ def test_published_controls(record, known, notes, tmp_path):
     assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
 
 
+def test_a_stabiliser_by_power_is_left_out(tmp_path):
+    """Its gain, which is negative in ieee14.dyr, is none of a speed."""
+    file = tmp_path / "published.dyr"
+    stabiliser = "1 'IEEEST' 1 3 0 0 0 0 0 0 0 0 0 0 0.75 1.0 4.2 -2.0 0.1 -0.1 0 0 /"
+    file.write_text("\n".join([*PUBLISHED.splitlines()[:2], stabiliser]))
+    tables, ignored, _ = read_machines(file)
+    assert "pss" not in tables["synchronous_machines"]["1"]
+    assert "IEEEST at bus 1: its input, mode 3, is no speed, and it is left out." in ignored
+
+
 def test_a_published_machine_with_salient_poles(tmp_path):
     file = tmp_path / "published.dyr"
     file.write_text(  # of ANDES's N44_BC.dyr
