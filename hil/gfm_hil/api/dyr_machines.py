@@ -1,7 +1,7 @@
 """Machines with their controls, and converters that follow the grid, of a dynamic data file of
 PSS/E (.dyr)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from gfm_plant.components import COMPONENTS
 
 _SHORT = 1e-3  # s; the shortest time constant at a sampling period of 0.1 ms
 _CONSTANT = 1e12  # p.u./p.u.; the droop of a turbine whose power is constant
+_MOST = 2.0  # p.u.; of set-points of P and Q
 _INFINITE = 1e6  # s; the inertia constant of an infinite bus
 
 Numbers = dict[str, float]
@@ -38,7 +39,7 @@ class _Record(NamedTuple):
 def read_machines(path: str | Path) -> Machines:
     """Read the records of GENROU, GENSAL and GENCLS, and of their controls: the exciters SEXS,
     IEEET1, EXDC2, EXST1 and ESST3A, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A
-    and IEEEST; and of REGCA1 with REECA1 or REECB1.
+    and IEEEST; and of REGCA1 with REECA1 or REECB1, and REPCA1.
 
     Raises:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
@@ -63,7 +64,9 @@ def read_machines(path: str | Path) -> Machines:
         if len(texts) != len(names):
             raise UserError(f"{where}: {model} has {len(names)} numbers, not {len(texts)}")
         numbers = {
-            name: number(f"{where}, {name}", text) for name, text in zip(names, texts, strict=True)
+            name: number(f"{where}, {name}", text)
+            for name, text in zip(names, texts, strict=True)
+            if name != "circuit"  # a text
         }
         content, notes = make(numbers)
         ignored += [f"{model} at bus {bus}: {note}." for note in notes]
@@ -71,53 +74,59 @@ def read_machines(path: str | Path) -> Machines:
             buses[bus][role] = _Record(f"{where}: {model} at bus {bus}", content)
     tables: dict[str, dict[str, dict[str, Any]]] = {}
     for bus, parts in buses.items():
-        if (part := _part(bus, parts, ignored)) is not None:
-            table, content = part
+        for table, content in _parts(bus, parts, ignored):
             tables.setdefault(table, {})[bus] = content
     if not tables:
         raise UserError(f"{path}: no record of GENROU, GENSAL, GENCLS or REGCA1")
     return Machines(tables, list(dict.fromkeys(ignored)), str(path))
 
 
-def _part(
-    bus: str, parts: dict[str, _Record], ignored: list[str]
-) -> tuple[str, dict[str, Any]] | None:
-    """What the records at a bus are, its table and its keys, None without a generator; notes go to
-    ``ignored``. Raises UserError: a value that it refuses."""
-    control = parts.pop("control", None)
-    for role in ("converter", "machine", "classical"):
-        if role in parts:
-            break
-    else:
+def _parts(
+    bus: str, records: Mapping[str, _Record], ignored: list[str]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The table and the keys of each part that the records at a bus are; notes go to ``ignored``.
+    Raises UserError: a value that its part refuses."""
+    generators = [role for role in records if role in _TABLES]
+    if not generators:
         ignored.append(f"The controls at bus {bus} are left out with their machine.")
-        return None
-    own = parts.pop(role)
+        return
+    role = "converter" if "converter" in generators else generators[0]
+    controls = {name: records[name] for name in _CONTROLS[role] if name in records}
     if role == "converter":
-        if parts:
+        if len(generators) > 1:
             ignored.append(f"The machine at bus {bus} is left out beside a converter.")
-        content = own.content | (control.content if control is not None else {})
-    elif role == "classical":
-        if parts:
-            ignored.append(f"The controls at bus {bus} are left out: GENCLS takes none here.")
-        content = own.content
-    else:
-        if "pss" in parts and "avr" not in parts:
-            ignored.append(f"The stabiliser at bus {bus} is left out with its exciter.")
-            parts.pop("pss")
-        content = own.content | {name: one.content for name, one in parts.items()}
-    table = _TABLES[role]
+        if (park := records.get("plant")) is not None:
+            _check("plant_controllers", park.content, park, {})
+            yield "plant_controllers", park.content
+    elif len(generators) > 1:
+        ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
+    if role == "classical" and any(name in records for name in _CONTROLS["machine"]):
+        ignored.append(f"The controls at bus {bus} are left out: GENCLS takes none here.")
+    if "pss" in controls and "avr" not in controls:
+        ignored.append(f"The stabiliser at bus {bus} is left out with its exciter.")
+        controls.pop("pss")
+    content = dict(records[role].content)
+    for name, one in controls.items():
+        content |= one.content if role == "converter" else {name: one.content}
+    _check(_TABLES[role], {"node": bus, "S": 1.0, "P": 0.0} | content, records[role], controls)
+    yield _TABLES[role], content
+
+
+def _check(
+    table: str, content: dict[str, Any], own: _Record, controls: Mapping[str, _Record]
+) -> None:
+    """Raise UserError with the record from which a value comes that a part refuses."""
     kind = COMPONENTS[table]
     try:
-        kind.model_validate({"node": bus, "S": 1.0, "P": 0.0} | content)
+        kind.model_validate(content)
     except ValidationError as problem:
         place, text = problem.errors()[0]["loc"], lines(problem, kind)[0]
         key = str(place[0]) if place else ""
-        if key in parts:
-            own, text = parts[key], text.removeprefix(key).lstrip(".: ")
-        elif control is not None and key in control.content:
-            own = control
+        if key in controls:
+            own, text = controls[key], text.removeprefix(key).lstrip(".: ")
+        elif key not in own.content:
+            own = next((one for one in controls.values() if key in one.content), own)
         raise UserError(f"{own.where}: {text}") from None
-    return table, content
 
 
 def _sexs(p: Numbers) -> Made:
@@ -183,7 +192,37 @@ def _reec(p: Numbers) -> Made:
         notes.append(f"dead band of {content['band']:g} on both sides")
     if p["PQFLAG"]:
         notes.append("reactive current comes first")
-    return content, [*notes, "its loops and tables are left out, P and Q are held"]
+    return content, [*notes, "its loops and tables are left out, P and Q are as they are set"]
+
+
+def _repca1(p: Numbers) -> Made:
+    """Its line is named by the buses at its ends until the case says what it is called."""
+    if not p["Fflag"]:
+        p["Kpg"] = p["Kig"] = 0.0
+    if not (p["Kp"] or p["Ki"] or p["Kpg"] or p["Kig"]):
+        return {}, ["its gains are 0, and it is left out"]
+    start, end = (f"{p[name]:.0f}" for name in ("from", "to"))
+    content, notes = _lagging({"T_fv": p["Tfv"]}, *(["T_fv"] if p["Tft"] else []))
+    content |= {
+        "line": f"{start}-{end}", "node": start, "control": "V" if p["RefFlag"] else "Q",
+        "sends": "Q_ref", "period_s": _SHORT, "delay_s": 0.0, "T_fltr": p["Tfltr"], "T_p": p["Tp"],
+        "K_p": p["Kp"], "K_i": p["Ki"], "V_frz": p["Vfrz"], "K_pg": p["Kpg"], "K_ig": p["Kig"],
+        "T_ft": p["Tft"], "T_g": p["Tg"], "D_dn": p["Ddn"], "D_up": p["Dup"],
+        "fe_max": p["femax"], "fe_min": p["femin"],
+    }  # fmt: skip
+    content |= {"R_c": p["Rc"], "X_c": p["Xc"]} if p["VCFlag"] else {"K_c": p["Kc"]}
+    for band, low, high in (("dbd", "dbd1", "dbd2"), ("fdbd", "fdbd1", "fdbd2")):
+        content[band] = max(p[high], -p[low], 0.0)
+        if p[high] != -p[low]:
+            notes.append(f"{band} = {content[band]:g} on both sides")
+    content["e_max"] = max(p["emax"], -p["emin"])
+    if p["emax"] != -p["emin"]:
+        notes.append(f"e_max = {content['e_max']:g} on both sides")
+    for name in ("P_max", "P_min", "Q_max", "Q_min"):
+        content[name] = min(max(p[name.replace("_", "")], -_MOST), _MOST)
+    if p["remote"] not in (0.0, p["from"]):
+        notes.append("it measures the voltage where its line begins, not at its remote bus")
+    return content, notes
 
 
 def _lagging(content: dict[str, Any], *lags: str) -> Made:
@@ -217,6 +256,8 @@ _TABLES = {
     "classical": "machines",
     "converter": "grid_following",
 }
+#: which controls each has
+_CONTROLS = {"machine": ("avr", "governor", "pss"), "classical": (), "converter": ("control",)}
 _REEC = ("Vdip", "Vup", "Trv", "dbd1", "dbd2", "Kqv", "Iqh1", "Iql1", "Vref0")
 _LOOPS = ("Tp", "Q_max", "Q_min", "V_max", "V_min", "Kqp", "Kqi", "Kvp", "Kvi")
 _POWER = ("Tiq", "dP_max", "dP_min", "P_max", "P_min", "Imax", "Tpord")
@@ -252,6 +293,14 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         "control",
         ("bus", "PFFLAG", "VFLAG", "QFLAG", "PQFLAG", *_REEC, *_LOOPS, *_POWER),
         _reec,
+    ),
+    "REPCA1": (
+        "plant",
+        ("remote", "from", "to", "circuit", "VCFlag", "RefFlag", "Fflag", "Tfltr", "Kp", "Ki",
+         "Tft", "Tfv", "Vfrz", "Rc", "Xc", "Kc", "emax", "emin", "dbd1", "dbd2", "Qmax", "Qmin",
+         "Kpg", "Kig", "Tp", "fdbd1", "fdbd2", "femax", "femin", "Pmax", "Pmin", "Tg", "Ddn",
+         "Dup"),
+        _repca1,
     ),
     "SEXS": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max"), _sexs),
     "IEEET1": (

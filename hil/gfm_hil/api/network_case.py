@@ -260,7 +260,11 @@ class _Build:
             part: f"{self.file}, {named(bus.name)}"
             for k, bus in enumerate(self.flow.buses)
             if bus.name in of_file
-            for part in (f"G{self.names[k]}", f"the machine at {self._node(k)}")
+            for part in (
+                f"G{self.names[k]}",
+                f"P{self.names[k]}",
+                f"the machine at {self._node(k)}",
+            )
         }
         return NetworkCase(content, self.files, self.ignored, volts, sources)
 
@@ -360,6 +364,33 @@ class _Build:
         values = {"S": S, "P": power.real, "Q": power.imag - supports * V, **own}
         self._put("grid_following", f"F{self.names[k]}", node | values)
         self._put("capacitors", f"filter{self.names[k]}", node | {"Q": _FILTER * S})
+        if (park := self._record("plant_controllers", k)) is not None:
+            self._plant_controller(k, park)
+
+    def _plant_controller(self, k: int, park: dict[str, Any]) -> None:
+        """That of what follows the grid at a bus, on the branch that it names, or else on the only
+        one of its bus."""
+        start, _, end = park["line"].partition("-")
+        names = {bus.name: self._node(j) for j, bus in enumerate(self.flow.buses)}
+        node = self._node(k) if start == "0" else names.get(start, "")
+        branches = [
+            name
+            for table in ("lines", "transformers")
+            for name, one in self.network.get(table, {}).items()
+            if node in (one["start"], one["end"])
+            and (start == "0" or names.get(end) in (one["start"], one["end"]))
+        ]
+        bus = named(self.flow.buses[k].name)
+        if not branches or (start == "0" and len(branches) > 1):
+            why = f"there is no branch {park['line']}" if start != "0" else (
+                f"it names no branch, and its bus has {len(branches)}"
+            )  # fmt: skip
+            self.ignored.append(f"REPCA1 at {bus} is left out: {why}.")
+            return
+        if len(branches) > 1:
+            self.ignored.append(f"REPCA1 at {bus} measures {branches[0]}, the first of its lines.")
+        values = {"line": branches[0], "node": node, "converters": [f"F{self.names[k]}"]}
+        self._put("plant_controllers", f"P{self.names[k]}", park | values)
 
     def _converter(self, k: int, law: str, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)

@@ -13,8 +13,9 @@ and in every cycle of T seconds, where dz is what lies beyond a dead band, [ ] a
     x_P <- [x_P + T K_ig e_P],    P_set = [x_P + K_pg e_P];
 
 x stays while |v| < V_frz. X is Q_set or V_set. These are the block diagrams of WECC's REPC_A (Solar
-Plant Dynamic Modeling Guidelines, 2014) without its lags T_fv and T_g, in whose place cycle and
-delay stand. ``delay_s`` after its measurement a converter takes over a set-point: its reference at
+Plant Dynamic Modeling Guidelines, 2014). X then passes its lead and lag (1 + T_ft s)/(1 + T_fv s),
+held over a cycle, and P_set its lag T_g; by default cycle and delay stand in their place.
+``delay_s`` after its measurement a converter takes over a set-point: its reference at
 the start, and by how much P_set or X has moved since, in p.u. of its own rating.
 """
 
@@ -101,6 +102,11 @@ def _decide(one: Any) -> None:
     if one.size >= one.V_frz:
         x[1] = _within(x[1] + one.T * one.K_i * e, low, high)
     out[1] = _within(x[1] + one.K_p * e, low, high)
+    for j in range(2):
+        if one.send_lag[j] < 1.0:
+            ahead = out[j] - one.y[j]
+            out[j] = one.y[j] + one.send_lead[j] * ahead
+            one.y[j] += one.send_lag[j] * ahead
 
 
 @compiled
@@ -167,6 +173,8 @@ class PlantController(Dynamic):
             *((x, "f8") for x in ("K_pg", "K_ig", "D_dn", "D_up", "size")),
             *((x, "c16") for x in ("Z", "v_before")),
             *((x, "f8", (2,)) for x in ("e", "fe", "P_limits", "X_limits", "x", "out", "begin")),
+            # of P_set and X: what is behind their lags, weights of these, and leads over lags
+            *((x, "f8", (2,)) for x in ("y", "send_lag", "send_lead")),
             # of P, Q, V and omega: weights of the lags, as measured, and where they are to be (NaN:
             # where they are at the start)
             *((x, "f8", (4,)) for x in ("lag", "m", "ref")),
@@ -220,6 +228,8 @@ class PlantController(Dynamic):
     Q_min: float = Field(-0.5, description="least")
     V_max: float = Field(1.1, description="largest V_ref, p.u.")
     V_min: float = Field(0.9, description="least")
+    T_ft: NonNegative = Field(0.0, description="lead of what it sends for Q or V, s")
+    T_fv: NonNegative = Field(0.0, description="lag of it, s; 0: neither it nor T_ft")
     fdbd: NonNegative = Field(0.0006, description="dead band of the frequency, p.u.")
     D_dn: NonNegative = Field(0.0, description="droop of P above omega_ref, p.u./p.u.")
     D_up: NonNegative = Field(0.0, description="below it")
@@ -229,6 +239,7 @@ class PlantController(Dynamic):
     K_ig: NonNegative = Field(1.0, description="integral gain, 1/s; both 0: no P_ref is sent")
     P_max: float = Field(1.0, description="largest P_ref, p.u. of the plant's rating")
     P_min: float = Field(0.0, description="least")
+    T_g: NonNegative = Field(0.0, description="lag of the P_ref that it sends, s")
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:
@@ -245,6 +256,8 @@ class PlantController(Dynamic):
             raise ValueError(f"{unused}: has no effect with control = {self.control!r}")
         if not (self.K_p or self.K_i or self.K_pg or self.K_ig):
             raise ValueError("K_p, K_i, K_pg and K_ig are 0: it would send nothing")
+        if self.T_fv == 0.0 and self.T_ft > 0.0:
+            raise ValueError(f"T_fv = 0: must be above 0 with T_ft = {self.T_ft:g}")
         return self
 
     def label(self) -> str:
@@ -314,6 +327,9 @@ class PlantController(Dynamic):
         record["sends_P"], record["sends_X"] = "P_ref" in self.sent(), self.sends in self.sent()
         lags = self.T_p, self.T_fltr, self.T_fltr, self.T_f
         record["lag"] = [-math.expm1(-T_s / T) if T > 0 else 1.0 for T in lags]
+        for j, (lead, lag) in enumerate(((0.0, self.T_g), (self.T_ft, self.T_fv))):
+            record["send_lag"][j] = -math.expm1(-self.period_s / lag) if lag > 0.0 else 1.0
+            record["send_lead"][j] = lead / lag if lag > 0.0 else 0.0
         refs = self.P_ref, self.Q_ref, self.V_ref, self.omega_ref
         record["ref"] = [math.nan if ref is None else ref for ref in refs]
 
@@ -387,7 +403,7 @@ def begin_set_points(plant: Network, references: NDArray[np.float64]) -> None:
                     f"plant_controllers.{name}: {x}_ref of its converters, {value:g} at the start,"
                     f" must lie within {x}_min = {low:g} and {x}_max = {high:g}"
                 )
-        record["begin"] = record["x"] = record["out"] = begin
+        record["begin"] = record["x"] = record["out"] = record["y"] = begin
         record["m"][3] = speeds[own][0]  # until there are two voltages
 
 

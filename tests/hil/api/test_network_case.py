@@ -302,6 +302,45 @@ def test_converters_of_a_dynamics_file_follow_the_grid(tmp_path):
         gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
 
 
+#: in the order of GridPACK's case9_REGCA1_REECA1_REPCA1.dyr, which has bands of 1 p.u.
+PARK = """\
+2 'REPCA1' '1 ' 0 2 8 '1 ' 0 1 1
+  0.02 0.5 2.0 0.03 0.05 0.7 0.0 0.0 0.02 0.1 -0.1 -0.002 0.002 0.43 -0.43
+  0.2 2.0 0.05 -0.0006 0.0004 99.0 -99.0 1.0 0.0 0.1 10.0 20.0 /
+"""
+
+
+def test_a_plant_controller_of_a_dynamics_file(tmp_path):
+    """Nothing moves at the start; it brings the power at its branch to a new reference."""
+    file = tmp_path / "pv.dyr"
+    file.write_text(FOLLOWING + PARK)
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    park = case.content["network"]["plant_controllers"]["P2"]
+    assert park == {
+        "line": "line8-2", "node": "bus2", "converters": ["F2"], "control": "V", "sends": "Q_ref",
+        "period_s": 0.001, "delay_s": 0.0, "T_fltr": 0.02, "T_p": 0.05, "K_p": 0.5, "K_i": 2.0,
+        "T_ft": 0.03, "T_fv": 0.05, "V_frz": 0.7, "K_c": 0.02, "e_max": 0.1, "dbd": 0.002,
+        "Q_max": 0.43, "Q_min": -0.43, "K_pg": 0.2, "K_ig": 2.0, "fdbd": 0.0006, "fe_max": 99.0,
+        "fe_min": -99.0, "P_max": 1.0, "P_min": 0.0, "T_g": 0.1, "D_dn": 10.0, "D_up": 20.0,
+    }  # fmt: skip
+    assert "REPCA1 at bus 2: fdbd = 0.0006 on both sides." in case.ignored
+    S, P = (case.content["network"]["grid_following"]["F2"][key] for key in "SP")
+    case.content["events"] = [{"type": "plant-reference", "t": 0.5, "name": "P2", "P_ref": P - 0.1}]
+    run = gfmhil.run_network(case.save(tmp_path / "net"), duration=6.0)
+    power, V = run.flows["P2.P"][:] / S, run.flows["P2.V"][:]
+    assert np.ptp(power[:4999]) < 1e-6 and np.ptp(V[:4999]) < 1e-6
+    # the frequency that falls meanwhile calls for more
+    lacks = 1.0 - run.flows["P2.omega"][-1] - 0.0006
+    assert power[-1] == pytest.approx(P - 0.1 + 20.0 * max(lacks, 0.0), abs=2e-3)
+    file.write_text(FOLLOWING + PARK.replace("0 2 8", "0 2 9"))
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    assert "REPCA1 at bus 2 is left out: there is no branch 2-9." in case.ignored
+    assert "plant_controllers" not in case.content["network"]
+    file.write_text(FOLLOWING + PARK.replace("1.0 0.0 0.1 10.0", "0.0 1.0 0.1 10.0"))
+    with pytest.raises(UserError, match="line 6: REPCA1 at bus 2: P_min = 1, P_max = 0: must rise"):
+        gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+
+
 def test_classical_machines_of_a_dynamics_file(tmp_path):
     """Their voltage stands behind ZSOURCE where the case has it; nothing moves at the start, and an
     infinite bus does not later."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 import gfmhil
 from gfm_hil.core.errors import UserError
@@ -23,6 +23,7 @@ ALL: dict[str, Any] = {
     "D_dn": 8.0, "D_up": 12.0, "fe_max": 0.1, "fe_min": -0.05, "K_pg": 0.3, "K_ig": 4.0,
     "T_fltr": 0.015, "T_p": 0.01,
 }  # fmt: skip
+NO_LAGS = {"T_ft": 0.0, "T_fv": 0.0, "T_g": 0.0}
 SAG = {"type": "grid-voltage", "t": 0.6, "V_g": 0.7, "duration": 0.1}
 
 
@@ -74,7 +75,7 @@ def block_diagram(done: NetworkRun, park: dict[str, Any], S: float = 2.0) -> NDA
     seen = V_m if park["control"] == "V" else Q_m
     aim, every, x = seen[0], round(park["period_s"] / T_S), np.array([0.25, 0.0])
     x[1], limits = (1.0, (0.9, 1.1)) if park["sends"] == "V_ref" else (0.0, (-0.5, 0.5))
-    rows = []
+    rows, begin = [], x.copy()
 
     def dz(e: float, band: float) -> float:
         return float(np.sign(e) * max(abs(e) - band, 0))
@@ -90,15 +91,23 @@ def block_diagram(done: NetworkRun, park: dict[str, Any], S: float = 2.0) -> NDA
         if V[k] >= park["V_frz"]:
             x[1] = np.clip(x[1] + park["period_s"] * park["K_i"] * e, *limits)
         rows.append((P_set, np.clip(x[1] + park["K_p"] * e, *limits)))
-    return np.array(rows)
+    sent, leads = np.array(rows), ((0.0, park["T_g"]), (park["T_ft"], park["T_fv"]))
+    for j, (lead, lag) in enumerate(leads):
+        if lag > 0.0:
+            b, a, _ = cont2discrete(
+                (np.trim_zeros([lead, 1.0], "f"), [lag, 1.0]), park["period_s"], "zoh"
+            )
+            sent[:, j] = begin[j] + lfilter(b[0], a, sent[:, j] - begin[j])
+    return sent
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("control", ["V", "Q"])
 @pytest.mark.parametrize("sends", ["V_ref", "Q_ref"])
-def test_its_commands_are_those_of_the_block_diagram(control: str, sends: str) -> None:
+@pytest.mark.parametrize("lags", [NO_LAGS, {"T_ft": 0.03, "T_fv": 0.1, "T_g": 0.05}], ids=["", "s"])
+def test_its_commands_are_those_of_the_block_diagram(control: str, sends: str, lags: Any) -> None:
     """With a swing of the grid's frequency, a sag that freezes an integral, limits and bands."""
-    park = {**ALL, "control": control, "sends": sends}
+    park = {**ALL, **lags, "control": control, "sends": sends}
     events = [
         {"type": "grid-frequency", "t": 0.1, "f_hz": 49.7, "rate": 2.5},
         {"type": "grid-frequency", "t": 0.4, "f_hz": 50.3, "rate": 2.5},
@@ -278,6 +287,7 @@ def test_over_a_link_every_bit_is_that_in_process(link: str, tmp_path: Path) -> 
         ({"P_ref": 2.5}, {}, "P_ref = 2.5: must lie in [-2, 2]"),
         ({"P_max": 3.0}, {}, "P_min = 0, P_max = 3: must rise within [-2, 2]"),
         ({"K_i": 0.0, "K_ig": 0.0}, {}, "K_p, K_i, K_pg and K_ig are 0: it would send nothing"),
+        ({"T_ft": 0.1}, {}, "T_fv = 0: must be above 0 with T_ft = 0.1"),
         ({"sends": "Q_ref"}, {}, "park: sends Q_ref, which none of its laws takes: droop-3"),
         ({"sends": "V_ref"}, {"law": "grid-following"}, "park: sends V_ref, which none of its"),
         ({}, {"link": {"type": "can"}}, "carries no set-points"),
