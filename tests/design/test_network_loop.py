@@ -130,6 +130,7 @@ def with_controls(place: Path | None = None) -> Scenario:
 
 def with_static_exciter(place: Path | None = None) -> Scenario:
     machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "avr": {"type": "EXST1", "K_C": 0.1}}
+    machine |= {"pss": {"type": "ST2CUT", "T1": 0.02}}
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from gfm_plant.components import SynchronousMachine
 from gfm_plant.components.controls import EXCITERS, GOVERNORS, STABILISERS
-from gfm_plant.components.controls.control import Control, Exciter, Terminals
+from gfm_plant.components.controls.control import Control, Exciter, Stabiliser, Terminals
 from gfm_plant.components.controls.esst3a import Esst3a
 from gfm_plant.components.controls.exdc2 import Exdc2
 from gfm_plant.components.controls.exst1 import Exst1
@@ -20,6 +20,7 @@ from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
 from gfm_plant.components.controls.pss1a import Pss1a
 from gfm_plant.components.controls.sexs import Sexs
+from gfm_plant.components.controls.st2cut import St2cut
 from gfm_plant.components.controls.tgov1 import Tgov1
 
 MACHINE = {"node": "m", "S": 1.0, "H": 3.0, "P": 0.5}
@@ -74,6 +75,7 @@ IEEEG1 = Ieeeg1(T1=0.1, T2=0.05, T6=0.4, K1=0.2, K3=0.3, K5=0.3, K7=0.1)  # T7 l
 HYGOV = Hygov(D_turb=0.0)
 TGOV1 = Tgov1(D_t=0.3)
 PSS1A = Pss1a(T6=0.02, A1=0.05, A2=0.001, V_STmin=-9.0, V_STmax=9.0)
+ST2CUT = St2cut(K2=4.0, T1=0.02, T2=0.1, T4=2.0, T9=0.2, L_Smin=-9.0, L_Smax=9.0)
 PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
 
 
@@ -117,6 +119,11 @@ PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
         (PSS1A, 0.0, 1e-3, [
             ([1], [0.02, 1]), ([200.0, 0], [10.0, 1]), ([1], [0.001, 0.05, 1]),
             ([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]),
+        ]),
+        # 10/(1 + 0.02 s) + 4/(1 + 0.1 s) = (14 + 1.08 s)/((1 + 0.02 s)(1 + 0.1 s))
+        (ST2CUT, 0.0, 1e-3, [
+            ([1.08, 14.0], [1]), ([1], [0.02, 1]), ([1], [0.1, 1]), ([3.0, 0], [2.0, 1]),
+            ([0.15, 1], [0.05, 1]), ([0.15, 1], [0.05, 1]), ([0.2, 1], [0.05, 1]),
         ]),
         (PLAIN, 0.0, 0.0, [([200.0, 0], [10.0, 1])]),
     ],
@@ -266,7 +273,7 @@ def test_a_rest_does_not_move():
         PSS1A,
         PLAIN,
     ):
-        output = 0.0 if isinstance(one, Pss1a) else 3.0
+        output = 0.0 if isinstance(one, Stabiliser) else 3.0
         seen = sees(one, 1.0 if isinstance(one, Exciter) else 0.01, output)
         states, asked = one.rest(output, seen)
         out = np.zeros(len(states))
@@ -278,6 +285,8 @@ def test_the_output_of_a_stabiliser_is_limited():
     t = np.linspace(0.0, 5.0, 200)
     assert stepped(Pss1a(), 0.0, 0.0, 0.05, t).max() == 0.2
     assert stepped(Pss1a(), 0.0, 0.0, -0.05, t).min() == -0.2
+    found = stepped(St2cut(L_Smin=-0.04), 0.0, 0.0, 0.05, t)
+    assert (found.max(), found.min()) == (0.05, -0.04)
 
 
 def test_every_control_is_complete():
@@ -316,6 +325,8 @@ def kind_of(one: Control) -> str:
         ({"avr": {"type": "IEEET1", "S_E1": 0.2, "S_E2": 0.1, "E_2": 2.0}}, "must be at most S_E2"),
         ({"pss": {}}, "pss: acts on a voltage regulator; give the machine an avr, too"),
         ({"avr": {}, "pss": {"T2": 0.0}}, "T2 = 0: must be above 0 with T1 = 0.05"),
+        ({"avr": {}, "pss": {"type": "ST2CUT", "T8": 0.0}}, "T8 = 0: must be above 0 with T7"),
+        ({"avr": {}, "pss": {"type": "PSS2B"}}, "'PSS1A', 'ST2CUT'"),
         ({"avr": {}, "pss": {"A2": 0.1}}, "A1 = 0: must be above 0 with A2 = 0.1"),
     ],
 )

@@ -38,8 +38,8 @@ class _Record(NamedTuple):
 
 def read_machines(path: str | Path) -> Machines:
     """Read the records of GENROU, GENSAL and GENCLS, and of their controls: the exciters SEXS,
-    IEEET1, EXDC2, EXST1 and ESST3A, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A
-    and IEEEST; and of REGCA1 with REECA1 or REECB1, and REPCA1.
+    IEEET1, EXDC2, EXST1 and ESST3A, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A,
+    IEEEST and ST2CUT; and of REGCA1 with REECA1 or REECB1, and REPCA1.
 
     Raises:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
@@ -178,6 +178,24 @@ def _stabiliser(p: Numbers) -> Made:
     lag = p["T6"] or _SHORT
     p["K_S"], p["T5"], p["T6"] = p["K_S"] * p["T5"] / lag, lag, 0.0
     return {"type": "PSS1A", **p}, notes
+
+
+def _st2cut(p: Numbers) -> Made:
+    """Of its inputs those of a speed."""
+    notes = []
+    for k, mode in (("1", p.pop("mode")), ("2", p.pop("mode2"))):
+        if mode not in (1.0, 2.0):
+            if mode and p[f"K{k}"]:
+                notes.append(f"its input {k}, mode {mode:g}, is no speed, and is left out")
+            p[f"K{k}"] = 0.0
+        elif mode == 2.0:
+            notes.append(f"its input {k} is the speed of the rotor here")
+    if not (p["K1"] or p["K2"]) or not p["T3"]:
+        return {}, [*notes, "K1 and K2, or T3, are 0, and it is left out"]
+    if any([p.pop(name) for name in ("bus", "bus2", "V_CU", "V_CL")][2:]):
+        notes.append("V_CU and V_CL are left out")
+    content, more = _lagging({"type": "ST2CUT", **p}, "T4")
+    return content, notes + more
 
 
 def _regca1(p: Numbers) -> Made:
@@ -340,4 +358,10 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
     "TGOV1": ("governor", ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"), _tgov1),
     "PSS1A": ("pss", ("mode", "bus", "A1", "A2", *_LEADS), _stabiliser),
     "IEEEST": ("pss", ("mode", "bus", "A1", "A2", "A3", "A4", "A5", "A6", *_LEADS), _stabiliser),
+    "ST2CUT": (
+        "pss",
+        ("mode", "bus", "mode2", "bus2", "K1", "K2", *(f"T{k}" for k in range(1, 11)), "L_Smax",
+         "L_Smin", "V_CU", "V_CL"),
+        _st2cut,
+    ),
 }  # fmt: skip

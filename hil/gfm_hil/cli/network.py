@@ -33,8 +33,8 @@ def add(command: argparse.ArgumentParser) -> None:
     read.add_argument(
         "--dynamics", metavar="FILE",
         help="dynamic data of PSS/E (.dyr): GENROU, GENSAL, GENCLS, SEXS, IEEET1, EXDC2,"
-        " EXST1, ESST3A, TGOV1, IEEEG1, HYGOV, PSS1A, IEEEST, REGCA1, REECA1,"
-        " REECB1 and REPCA1",
+        " EXST1, ESST3A, TGOV1, IEEEG1, HYGOV, PSS1A, IEEEST, ST2CUT, REGCA1,"
+        " REECA1, REECB1 and REPCA1",
     )  # fmt: skip
     read.add_argument("-o", "--out", metavar="FOLDER", help="(default: the case's name)")
     read.set_defaults(call=call_import)

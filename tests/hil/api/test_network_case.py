@@ -238,6 +238,22 @@ def test_published_controls(record, known, notes, tmp_path):
     assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
 
 
+def test_a_published_stabiliser_with_three_leads(tmp_path):
+    """Of ANDES's ieee14.dyr, which has one without a gain too."""
+    times = "0.0 0.0 3.0 3.0 0.15 0.05 0.15 0.05 0.15 0.05 0.05 -0.05 0 0 /"
+    file = tmp_path / "published.dyr"
+    for K1, known in (("10.0", True), ("0.0", False)):
+        stabiliser = f"1 'ST2CUT' 1 1 0 0 0 {K1} 0.0 {times}"
+        file.write_text("\n".join([*PUBLISHED.splitlines()[:2], stabiliser]))
+        tables, ignored, _ = read_machines(file)
+        one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
+        assert (one.pss is not None) == known
+        left_out = "ST2CUT at bus 1: K1 and K2, or T3, are 0, and it is left out."
+        assert (left_out in ignored) != known
+        if known:
+            assert (one.pss.K1, one.pss.T3, one.pss.T9, one.pss.L_Smin) == (10.0, 3.0, 0.15, -0.05)
+
+
 def test_a_stabiliser_by_power_is_left_out(tmp_path):
     """Its gain, which is negative in ieee14.dyr, is none of a speed."""
     file = tmp_path / "published.dyr"

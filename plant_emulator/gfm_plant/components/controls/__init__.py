@@ -17,12 +17,13 @@ from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
 from gfm_plant.components.controls.pss1a import Pss1a
 from gfm_plant.components.controls.sexs import Sexs
+from gfm_plant.components.controls.st2cut import St2cut
 from gfm_plant.components.controls.tgov1 import Tgov1
 from gfm_runtime.compiled import inlined_as
 
 EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1, Esst3a)
 GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov)
-STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a,)
+STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a, St2cut)
 
 
 def _one_of(kinds: Sequence[type[Control]]) -> Any:
