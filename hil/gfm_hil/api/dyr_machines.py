@@ -100,6 +100,8 @@ def _parts(
             yield "plant_controllers", park.content
     elif len(generators) > 1:
         ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
+    if role != "converter" and not {"control", "plant"}.isdisjoint(records):
+        ignored.append(f"The controls of a converter at bus {bus} are left out: it has no REGCA1.")
     if role == "classical" and any(name in records for name in _CONTROLS["machine"]):
         ignored.append(f"The controls at bus {bus} are left out: GENCLS takes none here.")
     if "pss" in controls and "avr" not in controls:

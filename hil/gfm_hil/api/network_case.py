@@ -354,7 +354,10 @@ class _Build:
         """What follows the grid at a bus, and the capacitor of its filter, which the power flow
         has not."""
         bus, S = self.flow.buses[k], share * self.flow.buses[k].static_rating * self.scale
+        park = self._record("plant_controllers", k)
         if not S:
+            if park is not None:
+                self.ignored.append(f"REPCA1 at {named(bus.name)} is left out with its generator.")
             return
         power = bus.static / bus.static_rating - 1j * _FILTER * abs(bus.V) ** 2
         node = {"node": self._node(k)}
@@ -364,7 +367,7 @@ class _Build:
         values = {"S": S, "P": power.real, "Q": power.imag - supports * V, **own}
         self._put("grid_following", f"F{self.names[k]}", node | values)
         self._put("capacitors", f"filter{self.names[k]}", node | {"Q": _FILTER * S})
-        if (park := self._record("plant_controllers", k)) is not None:
+        if park is not None:
             self._plant_controller(k, park)
 
     def _plant_controller(self, k: int, park: dict[str, Any]) -> None:
@@ -372,24 +375,27 @@ class _Build:
         one of its bus."""
         start, _, end = park["line"].partition("-")
         names = {bus.name: self._node(j) for j, bus in enumerate(self.flow.buses)}
-        node = self._node(k) if start == "0" else names.get(start, "")
-        branches = [
-            name
+        own, bus = self._node(k), named(self.flow.buses[k].name)
+        node = own if start == "0" else names.get(start, "")
+        ends = {
+            name: (one["start"], one["end"])
             for table in ("lines", "transformers")
             for name, one in self.network.get(table, {}).items()
             if node in (one["start"], one["end"])
             and (start == "0" or names.get(end) in (one["start"], one["end"]))
-        ]
-        bus = named(self.flow.buses[k].name)
-        if not branches or (start == "0" and len(branches) > 1):
-            why = f"there is no branch {park['line']}" if start != "0" else (
-                f"it names no branch, and its bus has {len(branches)}"
-            )  # fmt: skip
+        }
+        if not ends or (start == "0" and len(ends) > 1):
+            why = f"there is no branch {park['line']}"
+            if start == "0":
+                why = f"it names no branch, and its bus has {len(ends)}"
             self.ignored.append(f"REPCA1 at {bus} is left out: {why}.")
             return
-        if len(branches) > 1:
-            self.ignored.append(f"REPCA1 at {bus} measures {branches[0]}, the first of its lines.")
-        values = {"line": branches[0], "node": node, "converters": [f"F{self.names[k]}"]}
+        line = next(iter(ends))
+        if len(ends) > 1:
+            self.ignored.append(f"REPCA1 at {bus} measures {line}, the first of its lines.")
+        values = {"line": line, "node": node, "converters": [f"F{self.names[k]}"]}
+        if own in ends[line] and own != node:
+            values["plant_end"] = own
         self._put("plant_controllers", f"P{self.names[k]}", park | values)
 
     def _converter(self, k: int, law: str, share: float) -> None:

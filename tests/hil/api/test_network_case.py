@@ -348,10 +348,20 @@ def test_a_plant_controller_of_a_dynamics_file(tmp_path):
     # the frequency that falls meanwhile calls for more
     lacks = 1.0 - run.flows["P2.omega"][-1] - 0.0006
     assert power[-1] == pytest.approx(P - 0.1 + 20.0 * max(lacks, 0.0), abs=2e-3)
-    file.write_text(FOLLOWING + PARK.replace("0 2 8", "0 2 9"))
-    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
-    assert "REPCA1 at bus 2 is left out: there is no branch 2-9." in case.ignored
-    assert "plant_controllers" not in case.content["network"]
+    for branch, others, note in (
+        ("0 2 9", {}, "REPCA1 at bus 2 is left out: there is no branch 2-9."),
+        ("0 2 8", {"2": "grid-following"}, "REPCA1 at bus 2 is left out with its generator."),
+    ):
+        file.write_text(FOLLOWING + PARK.replace("0 2 8", branch))
+        case = gfmhil.network_from("case9", {"3": "droop-3", **others}, dynamics=file)
+        assert note in case.ignored and "plant_controllers" not in case.content["network"]
+    for branch, node in (("0 0 0", "bus2"), ("0 8 2", "bus8")):
+        file.write_text(FOLLOWING + PARK.replace("0 2 8", branch))
+        case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+        park = case.content["network"]["plant_controllers"]["P2"]
+        assert (park["line"], park["node"], park.get("plant_end", node)) == (
+            "line8-2", node, "bus2"
+        )  # fmt: skip
     file.write_text(FOLLOWING + PARK.replace("1.0 0.0 0.1 10.0", "0.0 1.0 0.1 10.0"))
     with pytest.raises(UserError, match="line 6: REPCA1 at bus 2: P_min = 1, P_max = 0: must rise"):
         gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
