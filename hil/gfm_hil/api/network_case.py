@@ -76,7 +76,8 @@ class NetworkCase:
                 (folder / name).unlink(missing_ok=True)
             if not was_there:
                 folder.rmdir()
-            if isinstance(problem, UserError) and (line := self._of_record(str(problem))):
+            text = str(problem).removeprefix(f"{file}: ")
+            if isinstance(problem, UserError) and (line := self._of_record(text)):
                 raise UserError(line) from None
             raise
         return file
