@@ -78,11 +78,11 @@ def test_the_coefficients_are_those_of_the_law_with_these_gains(name):
             assert np.abs(found[field] - wanted).max(initial=0.0) <= 1e-10 * most, field
 
 
-@pytest.mark.parametrize("real", slow_but(["float32"], ["float32", "float64"]))
+@pytest.mark.full
+@pytest.mark.parametrize("real", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("laws", "how"),
-    [pytest.param(("vsg-2", "vsg-12", "hybrid-angle", "matching-2", "dvoc"), (),
-                  marks=pytest.mark.full),
+    [(("vsg-2", "vsg-12", "hybrid-angle", "matching-2", "dvoc"), ()),
      (("mimo-gfm", "droop-4"), ("--inner", "cascaded", "--counts", "rig"))],
     ids=["plain", "counts"],
 )  # fmt: skip

@@ -165,6 +165,7 @@ def test_ripple_of_a_triangle_is_its_height():
     assert synthetic(x, t).ripple("i_a") == pytest.approx(0.5, rel=1e-9)
 
 
+@pytest.mark.full
 def test_the_command_prints_writes_and_refuses(tmp_path, capsys, refused):
     run(duration=0.25).save(tmp_path / "run")
     words = ["waveforms", str(tmp_path / "run"), "0.05:0.25", "--data-sheet", str(SHEET), "--json"]

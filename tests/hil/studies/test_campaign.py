@@ -304,6 +304,7 @@ def test_checks_that_take_long_show_how_far_they_are(file, capsys, monkeypatch, 
     attack_now(f"after a second a bar or a line says how many of the {len(seen)} checks are done")
 
 
+@pytest.mark.full
 def test_dead_time_and_drops_of_a_switched_bridge_are_drawn():
     """On nominal chokes VSG-2 bears no dead time from 2 us on, MIMO-GFM does."""
     draws = [
