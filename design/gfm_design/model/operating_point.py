@@ -38,7 +38,7 @@ _ROUNDS = 40
 _ROUNDING = 1e-12  # p.u.; a residual that is smaller is none
 _MOST_BY_SQUARES = 500  # unknowns; the time of least squares grows with their cube
 _LEAST_P = 1e-9  # p.u. of power; less is rounding
-_NUDGE = 1e-7  # central differences; the error map is compiled for real numbers only
+_NUDGE = 1e-7  # of differences; the error map is compiled for real numbers only
 _LOSES = 30  # rounds in which a command is found by what the bridge loses of it
 
 Drop = Callable[[complex, complex], complex]
@@ -517,7 +517,7 @@ def _newton(
             for group in groups:
                 nudge = np.zeros(len(z))
                 nudge[group] = _NUDGE
-                slopes = (residual(z + nudge) - residual(z - nudge)) / (2 * _NUDGE)
+                slopes = ((residual(z + nudge) - now) / _NUDGE).tolist()
                 jacobian += [(j, column, slopes[j]) for column in group for j in reach[column][0]]
             step_of = _steps(jacobian, (len(now), len(z)))
         step = step_of(now)
@@ -550,7 +550,7 @@ def _steps(
 ) -> Callable[[Vector], Vector]:
     """The step of Newton's method by what must vanish, for slopes by row and unknown: of least
     squares, but for a large network whose rows are independent."""
-    rows, columns, values = (np.array([one[k] for one in slopes]) for k in range(3))
+    rows, columns, values = map(np.array, zip(*slopes, strict=True))
     if shape[0] == shape[1] > _MOST_BY_SQUARES:
         try:
             sparse = scipy.sparse.csc_matrix((values, (rows, columns)), shape)
@@ -559,7 +559,8 @@ def _steps(
             pass
     jacobian = np.zeros(shape)
     np.add.at(jacobian, (rows, columns), values)
-    return lambda right: np.asarray(np.linalg.lstsq(jacobian, right, rcond=1e-12)[0])
+    inverse = np.linalg.pinv(jacobian, rcond=1e-12)
+    return lambda right: np.asarray(inverse @ right)
 
 
 def _internal(law: DiscreteLaw, x: Vector, u: Vector, e: complex, limited: bool = True) -> complex:
