@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.recording.columns import PIECE, ColumnLike
+from gfm_hil.recording.columns import ColumnLike
 
 Vector = NDArray[np.float64]
+
+PIECE = 8000  # ticks of which means are made at a time, in the processor's cache
 
 
 def cycle_ticks(T_s: float, f_n: float) -> float:
@@ -75,5 +77,8 @@ def cycle_means(column: ColumnLike, first: int, last: int, width: float) -> Iter
         # a window begins in one block of n ticks and ends in the next one
         sums = np.zeros((blocks, n + 1))
         np.cumsum(padded[:-1].reshape(blocks, n), axis=1, out=sums[:, 1:])
-        total = (sums[:-1, n:] - sums[:-1, :n] + sums[1:, :n]).ravel()[:have]
-        yield (total + part * padded[n : n + have]) / width
+        means = (sums[:-1, n:] - sums[:-1, :n] + sums[1:, :n]).ravel()[:have]
+        if part:
+            means += part * padded[n : n + have]
+        means /= width
+        yield means

@@ -207,7 +207,7 @@ def _strongest(
     x = x - np.mean(x[-max(1, len(x) // 10) :])
     if not np.max(np.abs(x)) >= least:
         return None
-    hankel = np.lib.stride_tricks.sliding_window_view(x, len(x) // 3 + 1)
+    hankel = np.ascontiguousarray(np.lib.stride_tricks.sliding_window_view(x, len(x) // 3 + 1))
     # the few largest singular values and vectors: far above rounding, so that squares do
     power, modes = np.linalg.eigh(hankel.T @ hankel)
     subspace = modes[:, -_RANK:][:, power[-_RANK:] > 1e-6 * power[-1]]
