@@ -55,8 +55,7 @@ def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
 _PLANT = ("m_max", "omega_b", "current", "i_u_gain", "k_p", "k_i", "C_dc", "seed")
 _SENSORS = ("gain", "offset", "noise_std", "adc_lo", "adc_hi", "adc_lsb")
 _DAC = ("dac_lo", "dac_hi", "dac_lsb")
-_LAW = ("A", "B_r", "B_y", "C", "D_r", "D_y", "D_u0", "u_0", "W", "loop", "low", "high", "decay",
-        "follow")  # fmt: skip
+_LAW = ("A", "B_y", "C", "D_y", "u_0", "W", "loop", "low", "high", "decay", "follow")
 
 #: what stays; the names are those of the plant's, the circuits' and the law's records
 fixed_dtype = _record(
@@ -67,9 +66,9 @@ fixed_dtype = _record(
     ("states", "f8", _MODES, 2, _MODES), ("grid_gain", "f8", _PARTS, 2, _MODES),
     ("grid_turn", "f8", 2, _PARTS), ("E_grid", "f8", 2, 1), ("omega_grid", "f8"),
     ("trips", "i8", N_TRIPS), ("trip_limit", "f8", N_TRIPS),
-    ("y_low", "f8", NY), ("y_high", "f8", NY), ("ref", "f8", NY),
-    ("A", "f8", _ORDER, _ORDER), ("B_r", "f8", _ORDER, NY), ("B_y", "f8", _ORDER, NY),
-    ("C", "f8", NU, _ORDER), ("D_r", "f8", NU, NY), ("D_y", "f8", NU, NY), ("D_u0", "f8", NU, NY),
+    ("y_low", "f8", NY), ("y_high", "f8", NY),
+    ("A", "f8", _ORDER, _ORDER), ("B_y", "f8", _ORDER, NY), ("x_ref", "f8", _ORDER),
+    ("C", "f8", NU, _ORDER), ("D_y", "f8", NU, NY), ("from_ref", "f8", NU, NY),
     ("u_0", "f8", NU), ("W", "f8", _ORDER, NU), ("loop", "f8"), ("low", "f8", NU),
     ("high", "f8", NU), ("decay", "f8"), ("follow", "f8"),
 )  # fmt: skip
@@ -115,40 +114,40 @@ def _sample(n, c, s):
 
 
 @inlined
-def _row(n, c, s, order, i):
-    """As of `gfm_runtime.kernel`."""
+def _control(n, c, s, order):
+    """As `look` and `advance` of `gfm_runtime.kernel`. A loop over lanes holds those of fixed
+    length that it can, so that sums stay in registers."""
     for j in range(n):
-        s.raw[i, j] = c.u_0[i, j] + s.off[i, j]
+        for i in range(NU):
+            s.raw[i, j] = c.u_0[i, j] + s.off[i, j]
     for k in range(order):
         for j in range(n):
-            s.raw[i, j] += c.C[i, k, j] * s.x_law[k, j]
-    for k in range(NY):
+            for i in range(NU):
+                s.raw[i, j] += c.C[i, k, j] * s.x_law[k, j]
+    for i in range(NU):
         for j in range(n):
-            s.raw[i, j] += c.D_u0[i, k, j] * c.ref[k, j] + c.D_r[i, k, j] * c.ref[k, j]
-    for k in range(NY):
-        if k != 2:
-            for j in range(n):
-                s.raw[i, j] += c.D_y[i, k, j] * s.seen_y[k, j]
-
-
-@inlined
-def _control(n, c, s, order):
-    """As `look` and `advance` of `gfm_runtime.kernel`."""
-    _row(n, c, s, order, 1)
+            raw = s.raw[i, j]
+            for k in range(NY):
+                raw += c.from_ref[i, k, j]
+            for k in range(NY):
+                if k != 2:
+                    raw += c.D_y[i, k, j] * s.seen_y[k, j]
+            s.raw[i, j] = raw
     for j in range(n):
         s.raw[1, j] *= c.loop[j]
         s.now[1, j] = s.seen_y[2, j] = limited(s.raw[1, j], c.low[1, j], c.high[1, j])
     for i in (0, 2):
-        _row(n, c, s, order, i)
         for j in range(n):
             s.raw[i, j] += c.D_y[i, 2, j] * s.seen_y[2, j]
             s.now[i, j] = limited(s.raw[i, j], c.low[i, j], c.high[i, j])
-    for i in range(NU):
-        for k in range(order):
-            for j in range(n):
+    for k in range(order):
+        for j in range(n):
+            x = s.x_law[k, j]
+            for i in range(NU):
                 excess = s.now[i, j] - s.raw[i, j]
-                x = s.x_law[k, j]
-                s.x_law[k, j] = x + c.W[k, i, j] * excess if excess != 0 else x
+                x = x + c.W[k, i, j] * excess if excess != 0 else x
+            s.x_law[k, j] = x
+    for i in range(NU):
         for j in range(n):
             s.upset[j] |= 0 if abs(s.now[i, j]) < math.inf else 1
             s.off[i, j] = faded(s.off[i, j] * c.decay[j])
@@ -157,13 +156,10 @@ def _control(n, c, s, order):
             s.u_law[i, j] = s.now[i, j]
     for i in range(order):
         for j in range(n):
-            s.x_next[i, j] = c.B_r[i, 0, j] * c.ref[0, j]
-        for k in range(1, NY):
-            for j in range(n):
-                s.x_next[i, j] += c.B_r[i, k, j] * c.ref[k, j]
-        for k in range(NY):
-            for j in range(n):
-                s.x_next[i, j] += c.B_y[i, k, j] * s.seen_y[k, j]
+            x = c.x_ref[i, j]
+            for k in range(NY):
+                x += c.B_y[i, k, j] * s.seen_y[k, j]
+            s.x_next[i, j] = x
         for k in range(order):
             for j in range(n):
                 s.x_next[i, j] += c.A[i, k, j] * s.x_law[k, j]
@@ -449,7 +445,12 @@ class Lanes:
         )  # fmt: skip
         for name in ("y_low", "y_high"):
             fixed[name][:, j] = ctl[name][:NY]
-        fixed["ref"][:, j] = ctl["ref"]
+        ref, x_ref = ctl["ref"], fixed["x_ref"][:, j]  # what the references bring to a law
+        fixed["from_ref"][..., j] = law["D_u0"] * ref + law["D_r"] * ref
+        by_ref = law["B_r"][: len(x_ref)] * ref
+        x_ref[:] = by_ref[:, 0]
+        for column in by_ref.T[1:]:
+            x_ref += column
         moving["upset"][j] = 0
         for name in ("tick", "i_reg", "E_most"):
             moving[name][j] = s[name]
