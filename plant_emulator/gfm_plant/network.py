@@ -102,7 +102,7 @@ class Network:
 
     def copy(self) -> Network:
         """Return the same plant at the same instant, in memory of its own."""
-        copies = (_bytes(record).copy().view(record.dtype) for record in self.memory)
+        copies = (np.ndarray(r.shape, r.dtype, _bytes(r).copy()) for r in self.memory)
         par, st, net, now, *parts = copies
         return Network(
             par, st, net, now, tuple(parts), self.wiring, self.elsewhere, self.at_least,
@@ -143,9 +143,9 @@ class Network:
             voltages: of the nodes there, p.u.; they count where a component's current rises so
                 steeply with its voltage that the search for both does not end.
         """
-        x, u = np.atleast_2d(x), np.atleast_2d(u)
-        u = np.pad(u[:, :COMPARE], ((0, 0), (0, COMPARE - u[:, :COMPARE].shape[1])))
         now, N, wiring = self.now[0], len(self.par), self.wiring
+        x, commands, u = np.atleast_2d(x), np.atleast_2d(u)[:, :COMPARE], np.zeros((N, COMPARE))
+        u[:, : commands.shape[1]] = commands
         turn = np.exp(1j * x[:, DELTA])
         now["unit"][:N] = turn
         order, omega_b, place_of = wiring.order, wiring.omega_b, wiring.sources()
@@ -192,7 +192,8 @@ class Network:
     def begin(self, x: NDArray[np.float64], u: NDArray[np.float64]) -> None:
         """Fill the delay lines, sensors and DC sources of a plant whose circuit is at rest; x and u
         are (N, 8) and (N, 4), as of ``start``."""
-        told = np.pad(u, ((0, 0), (0, N_COMMANDS - COMPARE)), constant_values=-1.0)
+        told = np.full((len(u), N_COMMANDS), -1.0)
+        told[:, :COMPARE] = u
         plant_start(self.typed, x, told)
 
     def rewire(self, wiring: Wiring) -> None:
@@ -280,8 +281,9 @@ def _known(wiring: Wiring) -> Wiring:
 
 
 def _bytes(record: Record) -> NDArray[np.uint8]:
-    """Its memory, the gaps between its fields included."""
-    return record.view(np.uint8)
+    """Its memory, the gaps between its fields included; as a view, numpy would look at each field
+    for Python objects."""
+    return np.ndarray(record.nbytes, np.uint8, record)
 
 
 def connect_new(plant: Network, wiring: Wiring) -> None:

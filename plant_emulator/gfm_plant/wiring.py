@@ -477,11 +477,12 @@ class Wiring:
         Raises:
             ValueError: as ``find_modes``.
         """
-        circuits = [self.circuit(blocked, contact, axis)[0] for axis in (ALPHA, BETA)]
+        circuit, _ = self.circuit(blocked, contact, ALPHA)
+        alpha = find_modes(circuit, self.omega_b, self.order)
         if contact is None or contact.balanced:
-            return find_modes(circuits[0], self.omega_b, self.order), circuits[0].names
-        alpha, beta = (find_modes(one, self.omega_b, self.order) for one in circuits)
-        return join_axes(alpha, beta, contact.angle), circuits[0].names
+            return alpha, circuit.names
+        beta = find_modes(self.circuit(blocked, contact, BETA)[0], self.omega_b, self.order)
+        return join_axes(alpha, beta, contact.angle), circuit.names
 
     def resting_by_modes(
         self, volts: Mapping[str, complex], turns: Mapping[str, float]

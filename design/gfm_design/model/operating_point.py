@@ -30,6 +30,7 @@ from gfm_plant.wiring import Wiring
 from gfm_runtime import LawError
 from gfm_runtime.error_maps import ERROR_MAPS, map_errors
 from gfm_runtime.inner import GridFollowingStage
+from gfm_runtime.signals import NU, NY
 from gfm_runtime.tustin import DiscreteLaw
 
 Vector = NDArray[np.float64]
@@ -384,6 +385,11 @@ class _ConverterEquilibrium:
         self._gain, self._offset = (
             par[0][name][: len(SENSED)].copy() for name in ("gain", "offset")
         )
+        nothing = np.zeros((law.order, NY))
+        #: u - u_0 and the next state by the state, the references, and what the errors are of
+        self._gains = np.block(
+            [[law.C, law.D_u0, law.D_r, law.D_y], [law.A, nothing, law.B_r, law.B_y]]
+        )
         impedance = np.zeros(2)
         impedance[: len(law.law.error_parameters)] = law.law.error_parameters
         self._impedance = impedance
@@ -464,8 +470,8 @@ class _ConverterEquilibrium:
         """The law's u (3,) and next state at held inputs; column 3 sees the plant's omega_u."""
         law, r, measured = self.law, ref.copy(), y.copy()
         map_errors(ERROR_MAPS[law.law.error_map], self._impedance, r, measured)
-        u = law.u_0 + law.D_u0 @ ref + law.C @ x + law.D_r @ r + law.D_y @ measured
-        return u, law.A @ x + law.B_r @ r + law.B_y @ measured
+        made = self._gains @ np.concatenate([x, ref, r, measured])
+        return law.u_0 + made[:NU], made[NU:]
 
     def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""

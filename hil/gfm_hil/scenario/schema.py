@@ -331,7 +331,7 @@ class Scenario(StrictSchema):
 
     def laws(self) -> list[str]:
         """Names of all laws that the run uses, each once, the initial law first."""
-        changes = [e.law for e in self.sorted_events() if hasattr(e, "law")]
+        changes = [vars(e)["law"] for e in self.sorted_events() if "law" in vars(e)]
         return list(dict.fromkeys([self.law, *changes, *self.ready_laws]))
 
     def sorted_events(self) -> list[Event]:
