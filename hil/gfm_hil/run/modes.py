@@ -214,9 +214,10 @@ def _strongest(
     z = np.linalg.eigvals(np.linalg.lstsq(subspace[:-1], subspace[1:], rcond=None)[0])
     z = z[np.abs(z) > _GONE]  # of what is over within a sample, as after a trip
     s = np.log(z.astype(complex)) / h
-    t = np.arange(len(x)) * h
-    grown = np.where(s.real > 0, t[-1] * s.real, 0.0)  # until the end, where such a mode is 1
-    powers = np.exp(np.outer(t, s) - grown)
+    grows = s.real > 0
+    powers = np.vander(np.where(grows, 1 / z, z), len(x), increasing=True).T
+    powers[:, grows] = powers[::-1, grows]  # until the end, where such a mode is 1
+    grown = np.where(grows, (len(x) - 1) * h * s.real, 0.0)
     largest = np.linalg.lstsq(powers, x.astype(complex), rcond=None)[0]
     energy = np.sum(np.abs(powers * largest) ** 2, axis=0) * h
     amplitude = largest * np.exp(-grown)
