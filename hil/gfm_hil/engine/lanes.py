@@ -409,11 +409,11 @@ class Lanes:
     def enter(self, j: int, stretch: Stretch) -> bool:
         """Put a run into the empty lane j, if its ticks may be calm and like those of the others;
         returns whether."""
-        kind, bench = _kind_of(stretch), stretch.those.benches[0]
+        bench, columns = stretch.those.benches[0], _columns(stretch)
+        kind = _kind_of(bench) if {*MOVING} <= {*columns} <= _RECORDED else None
         if kind is None or (self._used.any() and kind != self._kind):
             return False
         self._kind, self._used[j] = kind, 1
-        columns = _columns(stretch)
         self._columns[:, j] = [columns[name][stretch.start :].ctypes.data for name in MOVING]
         fixed, moving, parts = self._fixed[0], self._moving[0], kind[1]
         plant, c = bench.plant, bench.controller
@@ -431,12 +431,12 @@ class Lanes:
         fixed["i_most"][:, j] = s["i_most"]
         fixed["half_h"][:parts, j], fixed["age"][:parts, j] = n["half_h"][:parts], n["age"][:, 0]
         fixed["lag_weights"][:parts, :, j] = n["lag_weights"][:parts, 0]
-        fixed["rate"][..., j] = _pair(n["rate"][0, :_MODES])
-        fixed["drive"][..., j] = _pair(n["drive"][0, 0, :_MODES, 0])
-        fixed["decay_z"][:parts, ..., j] = _pairs(n["decay"][0, :parts, :_MODES])
-        fixed["states"][..., j] = _pairs(n["states"][0, :_MODES, :_MODES])
-        fixed["grid_gain"][:parts, ..., j] = _pairs(now["gain"][:parts, 1, :_MODES])
-        fixed["grid_turn"][:, :parts, j] = _pair(now["turn"][:parts, 1])
+        _put(fixed["rate"][..., j], n["rate"][0, :_MODES])
+        _put(fixed["drive"][..., j], n["drive"][0, 0, :_MODES, 0])
+        _put(fixed["decay_z"][..., j].swapaxes(0, 1), n["decay"][0, :parts, :_MODES])
+        _put(fixed["states"][..., j].swapaxes(0, 1), n["states"][0, :_MODES, :_MODES])
+        _put(fixed["grid_gain"][..., j].swapaxes(0, 1), now["gain"][:parts, 1, :_MODES])
+        _put(fixed["grid_turn"][..., j], now["turn"][:parts, 1])
         E = now["sequence"][0]
         fixed["E_grid"][:, 0, j] = now["V_g"] * E.real, now["V_g"] * E.imag
         fixed["omega_grid"][j] = now["omega_g"]
@@ -458,7 +458,7 @@ class Lanes:
         moving["u"][:, :, j], moving["E_q"][j] = s["u"][:, :NU], s["u"][0, NU]
         moving["u_now"][:, j] = s["u_now"][:NU]
         for name, count in _PHASORS.items():
-            moving[name][..., j] = _pair(now[name][:count])
+            _put(moving[name][..., j], now[name][:count])
         moving["E"][:, j], moving["y"][:, j] = s["E"], ctl["y"][:NY]
         for name, of in _STATE.items():
             moving[name][:, j] = state[of][: len(moving[name])]
@@ -517,14 +517,9 @@ def _columns(stretch: Stretch) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _pair(z: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Real and imaginary parts, (2, ...)."""
-    return np.stack([z.real, z.imag])
-
-
-def _pairs(z: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Those of each row of z (rows, ...), (rows, 2, ...)."""
-    return np.stack([z.real, z.imag], axis=1)
+def _put(parts: NDArray[np.float64], z: NDArray[np.complex128]) -> None:
+    """Put z (n, ...) into real and imaginary parts, (2, n or more, ...)."""
+    parts[0, : len(z)], parts[1, : len(z)] = z.real, z.imag
 
 
 def run_together(runs: Iterable[Steps[T]]) -> list[T]:
@@ -588,11 +583,10 @@ def is_plain(bench: Bench) -> bool:
     )  # fmt: skip
 
 
-def _kind_of(stretch: Stretch) -> tuple[int, int] | None:
+def _kind_of(bench: Bench) -> tuple[int, int] | None:
     """What the lanes of runs have to have in common: a law's order and the parts of a period; None
     if a run's next ticks are none of theirs."""
-    bench, columns = stretch.those.benches[0], _columns(stretch)
-    if not (is_plain(bench) and {*MOVING} <= {*columns} <= _RECORDED):
+    if not is_plain(bench):
         return None
     plant, c = bench.plant, bench.controller
     s, n, now, ctl = plant.st[0], plant.net[0], plant.now[0], c.ctl[0]
