@@ -1,6 +1,6 @@
 """The converter of Eq. (1)-(8) with R_f: the one copy of its equations.
 
-SciPy's solvers in the tests, the steady state, and linearisation by complex step take it from here.
+SciPy's solvers in the tests, operating points, and linearisation by complex step take it from here.
 Hence no abs, min or max, and no argument has a fixed type: float64 and complex128 both work.
 
 All quantities are in p.u. (`gfm_plant.bases`), time is in s, angles are in rad. The order is

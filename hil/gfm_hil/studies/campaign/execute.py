@@ -3,6 +3,7 @@ records on disk: JSON, one run a line, so that nothing done is ever lost."""
 
 import contextlib
 import json
+import math
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,9 @@ from gfm_hil.studies.campaign.worker import (
 )
 from gfm_hil.studies.workers import SILENT, Pool, Watch, WorkerLost, pool_of, run_tasks
 
-CHUNK = 32  # runs a task: half a second, so that little is lost and little is waited for
+#: runs a task, at most: a second, so that little is lost and little is waited for; fewer leave
+#: lanes empty for longer, at the end of each task
+CHUNK = 64
 _FILE = "runs.jsonl"
 _PATIENCE_S = 1.0  # how long the checks may go on without a word
 
@@ -181,7 +184,8 @@ def _execute(
         told = ", ".join(f"{n} {v.replace('-', ' ')}" for v, n in counts.items())
         watch.progress(len(verdicts), of, told)
 
-    size = min(CHUNK, -(-len(jobs) // pool.workers))
+    rounds = math.ceil(len(jobs) / (CHUNK * pool.workers))
+    size = math.ceil(len(jobs) / (rounds * pool.workers))
     chunks = (jobs[k : k + size] for k in range(0, len(jobs), size))
     run_tasks(partial(run_chunk, campaign), chunks, pool, keep, watch)
 
