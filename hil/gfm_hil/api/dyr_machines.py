@@ -91,14 +91,17 @@ def _parts(
         ignored.append(f"The controls at bus {bus} are left out with their machine.")
         return
     role = "converter" if "converter" in generators else generators[0]
+    others = len(generators) > 1
+    if role == "converter" and others:  # the case says which of both it is
+        machine = {name: one for name, one in records.items() if name not in _OF_CONVERTER}
+        yield from _parts(bus, machine, ignored)
+        records = {name: one for name, one in records.items() if name in _OF_CONVERTER}
     controls = {name: records[name] for name in _CONTROLS[role] if name in records}
     if role == "converter":
-        if len(generators) > 1:
-            ignored.append(f"The machine at bus {bus} is left out beside a converter.")
         if (park := records.get("plant")) is not None:
             _check("plant_controllers", park.content, park, {})
             yield "plant_controllers", park.content
-    elif len(generators) > 1:
+    elif others:
         ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
     if role != "converter" and not {"control", "plant"}.isdisjoint(records):
         ignored.append(f"The controls of a converter at bus {bus} are left out: it has no REGCA1.")
@@ -278,6 +281,7 @@ _TABLES = {
 }
 #: which controls each has
 _CONTROLS = {"machine": ("avr", "governor", "pss"), "classical": (), "converter": ("control",)}
+_OF_CONVERTER = ("converter", "control", "plant")
 _REEC = ("Vdip", "Vup", "Trv", "dbd1", "dbd2", "Kqv", "Iqh1", "Iql1", "Vref0")
 _LOOPS = ("Tp", "Q_max", "Q_min", "V_max", "V_min", "Kqp", "Kqi", "Kvp", "Kvi")
 _POWER = ("Tiq", "dP_max", "dP_min", "P_max", "P_min", "Imax", "Tpord")

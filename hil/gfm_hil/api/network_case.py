@@ -27,7 +27,7 @@ from gfm_runtime import LawError, discretise, load_law
 from gfm_runtime.signals import Y_NAMES
 
 P_AT, V_AT = Y_NAMES.index("p"), Y_NAMES.index("V")
-_LEAST_BRANCH = 1e-9  # p.u.; a smaller reactance is none
+_LEAST = 1e-9  # p.u.; a smaller reactance or power of a load is none
 _NEAR = 1e-6  # p.u.; how far the network's steady state may lie from the power flow
 # of PowerSimulationsDynamics.jl's inverter (scenarios/published/psid_inverter.toml), p.u.; its
 # line stands for the converter's own transformer
@@ -168,21 +168,34 @@ def network_from(
 def _with_following(flow: PowerFlow, machines: Machines) -> PowerFlow:
     """A case whose generators that follow the grid by a dynamics file are static ones."""
     buses, names = [*flow.buses], [bus.name for bus in flow.buses]
-    for name in dict.fromkeys(bus for table in machines.tables.values() for bus in table):
-        if name not in names:
-            raise UserError(f"{machines.file}: {named(name)}: is no bus of {flow.title}")
+    ignored = [*flow.ignored]
+    own = [*dict.fromkeys(bus for table in machines.tables.values() for bus in table)]
+    absent = [name for name in own if name not in names]
+    if absent == own != []:
+        raise UserError(f"{machines.file}: {named(own[0])}: is no bus of {flow.title}")
+    ignored += [f"{named(name)} of the dynamic data is none of the case." for name in absent]
     for name in machines.tables.get("grid_following", ()):
+        if name in absent:
+            continue
         k = names.index(name)
         bus = buses[k]
-        if k == flow.slack:
+        beside = any(
+            name in machines.tables.get(t, ()) for t in ("synchronous_machines", "machines")
+        )
+        if k == flow.slack and not beside:
             raise UserError(
                 f"{machines.file}: {named(name)}: REGCA1 follows the grid, and this is the slack"
             )
+        if k == flow.slack:
+            ignored.append(f"REGCA1 at {named(name)} is left out beside the slack's machine.")
+            continue
+        if beside:
+            ignored.append(f"The machine at {named(name)} is left out beside a converter.")
         if bus.machine and bus.rating is not None:
             S = bus.static_rating + bus.rating
             static = bus.static + bus.machine
             buses[k] = bus._replace(machine=0j, rating=None, static=static, static_rating=S)
-    return replace(flow, buses=buses)
+    return replace(flow, buses=buses, ignored=ignored)
 
 
 class _Build:
@@ -279,7 +292,7 @@ class _Build:
             names[name] += 1
             name += f"-{names[name]}" * (names[name] > 1)
             R, X = (part / self.scale for part in (branch.Z.real, branch.Z.imag))
-            if R < 0 or X < _LEAST_BRANCH:
+            if R < 0 or X < _LEAST:
                 raise UserError(
                     f"{self.flow.title}: {kind} {a} to {b}: R = {branch.Z.real:g}, X ="
                     f" {branch.Z.imag:g} p.u.: R must be >= 0, X > 0"
@@ -304,6 +317,7 @@ class _Build:
             if b.transformer and k in (b.start, b.end)
         )
         drawn = bus.load / abs(bus.V) ** 2 * self.scale
+        drawn = complex(*(one if abs(one) > _LEAST else 0.0 for one in (drawn.real, drawn.imag)))
         shunt = (bus.shunt + 1j * charging) * self.scale
         capacitor = max(shunt.imag, 0.0) + max(-drawn.imag, 0.0)
         if k == self.grid:

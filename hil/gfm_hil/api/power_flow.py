@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.api.raw import read_raw
 from gfm_hil.core.errors import UserError, need
 from gfm_runtime.errors import meant
 
@@ -68,8 +69,13 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     import pandapower  # an optional package, and seconds of imports
     from pandapower.converter.pypower import to_ppc
 
+    ignored: list[str] = []
     if isinstance(case, str | Path):
-        title, case = title or Path(case).stem, _load_pandapower(str(case))
+        title = title or Path(case).stem
+        if str(case).lower().endswith(".raw"):
+            case, ignored = read_raw(case)
+        else:
+            case = _load_pandapower(str(case))
     title = title or str(case.name or "case")
     if len(case.bus) > _MOST_BUSES:
         raise UserError(f"{title}: {len(case.bus)} buses: at most {_MOST_BUSES}")
@@ -107,7 +113,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
     ratings, static = _ratings(case, where, place, S_b), _static(case, where, place, S_b)
     sources = _sources(case, where, place)
-    ignored = [
+    ignored += [
         f"{len(case[table])} {table}: {why}."
         for table, why in _IGNORED.items()
         if len(case.get(table, ()))
@@ -195,7 +201,7 @@ def _load_pandapower(case: str) -> Any:
     if case not in known:
         raise UserError(
             f"{case!r}: must be one of {', '.join(known)}, or the path of a net of pandapower"
-            f" (.json){meant(case, known)}"
+            f" (.json) or of PSS/E (.raw){meant(case, known)}"
         )
     return getattr(shipped, case)()
 

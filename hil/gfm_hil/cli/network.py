@@ -18,7 +18,9 @@ def add(command: argparse.ArgumentParser) -> None:
         "a power-flow case, at its operating point."
     )
     read.add_argument(
-        "case", help="a case of pandapower (case9, case39, case118, ...), or its net as .json"
+        "case",
+        help="a case of pandapower (case9, case39, case118, ...), its net as .json, or a file"
+        " of PSS/E (.raw)",
     )
     read.add_argument(
         "--converter", action="append", default=[], metavar="BUS=LAW[:SHARE]",

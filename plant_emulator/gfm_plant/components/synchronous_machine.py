@@ -286,7 +286,7 @@ class SynchronousMachine(Rotating):
     X_d1: Positive = Field(0.3, description="transient reactance X_d', p.u.")
     X_q1: Positive = Field(0.55, description="transient reactance X_q', p.u.")
     X_2: Positive = Field(0.25, description="subtransient reactance X'' of both axes, p.u.")
-    X_l: Positive = Field(0.2, description="leakage reactance, p.u.")
+    X_l: NonNegative = Field(0.2, description="leakage reactance, p.u.")
     R: NonNegative = Field(0.0025, description="resistance of the stator, p.u.")
     T_d10: Positive = Field(8.0, description="open-circuit transient time constant T_d0', s")
     T_q10: Positive = Field(0.4, description="open-circuit transient time constant T_q0', s")

@@ -313,7 +313,8 @@ def test_converters_of_a_dynamics_file_follow_the_grid(tmp_path):
     assert any("REECB1 at bus 2: its loops" in line for line in case.ignored)
     run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.2)
     assert run.status == "completed" and np.ptp(run["C3"].signals["p"]) < 1e-6
-    file.write_text(FOLLOWING.replace("2 '", "1 '"))
+    alone = FOLLOWING.split("\n", 1)[1]  # without the machine
+    file.write_text(alone.replace("2 '", "1 '"))
     with pytest.raises(UserError, match="bus 1: REGCA1 follows the grid, and this is the slack"):
         gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
 
@@ -422,13 +423,37 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
     assert run.status == "completed" and np.ptp(p) < 1e-6
 
 
+def test_a_dynamics_file_of_more_buses_or_of_others(tmp_path):
+    file = tmp_path / "more.dyr"
+    machine = "'GENROU' 1 8.96 0.04 0.31 0.06 23.64 0.0 1.46 0.969 0.3608 0.569 0.2 0.0 0.0 0.0 /\n"
+    file.write_text(f"77 {machine}1 {machine}")
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    assert "bus 77 of the dynamic data is none of the case." in case.ignored
+    assert case.content["network"]["synchronous_machines"]["G1"]["X_l"] == 0.0
+    file.write_text(f"77 {machine}")
+    with pytest.raises(UserError, match="bus 77: is no bus of case9"):
+        gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+
+
+def test_a_machine_beside_a_converter_stands_for_both_at_the_slack(tmp_path):
+    file = tmp_path / "beside.dyr"
+    both = FOLLOWING.replace("2 '", "1 '")
+    file.write_text(both)
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    assert "grid_following" not in case.content["network"]
+    assert case.content["network"]["synchronous_machines"]["G1"]["H"] == 23.64
+    assert "REGCA1 at bus 1 is left out beside the slack's machine." in case.ignored
+    file.write_text(both.replace("1 '", "2 '"))
+    network = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file).content["network"]
+    assert [*network["grid_following"]] == ["F2"] and [*network["synchronous_machines"]] == ["G1"]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
         ("1.2 0.0 2.0 7.0 0.0 /", "1.2 /", "line 3: TGOV1 has 7 numbers, not 3"),
         ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
         ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
-        ("1 '", "77 '", "bus 77: is no bus of case9"),
         ("GENROU", "GENTPJ", "no record of GENROU, GENSAL, GENCLS or REGCA1"),
         # refused by its own part, by a machine at this sampling period, and at the start
         ("0.05 0.0 5.0", "0.05 5.0 0.0", "line 6: SEXS at bus 2: E_min = 5: must be less than E_m"),

@@ -1,0 +1,343 @@
+"""Power-flow cases of PSS/E (.raw, revisions 31 to 33) as nets of pandapower.
+
+A file is three lines of title, and then sections of records, one a line (a transformer takes four
+or five), whose fields are divided by commas. A line that begins with 0 ends a section. Buses keep
+the voltages at which the file's own power flow holds them.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gfm_hil.api.dyr import number
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.files import read_file
+
+_SECTIONS = (
+    "bus", "load", "fixed shunt", "generator", "branch", "transformer", "area",
+    "two-terminal DC line", "VSC DC line", "impedance correction", "multi-terminal DC line",
+    "multi-section line", "zone", "transfer", "owner", "FACTS device", "switched shunt",
+    "GNE device", "induction machine",
+)  # fmt: skip
+#: those that a network has not, and the lines that a record of them takes
+_LEFT_OUT = {
+    "two-terminal DC line": 3,
+    "VSC DC line": 3,
+    "multi-terminal DC line": 1,
+    "FACTS device": 1,
+    "induction machine": 1,
+}
+#: where the fields of a record are that are read here; those of a transformer by its line
+_FIELDS = {
+    "bus": {"I": 0, "BASKV": 2, "IDE": 3, "VM": 7, "VA": 8},
+    "load": {"I": 0, "STATUS": 2, "PL": 5, "QL": 6, "IP": 7, "IQ": 8, "YP": 9, "YQ": 10},
+    "fixed shunt": {"I": 0, "STATUS": 2, "GL": 3, "BL": 4},
+    "switched shunt": {"I": 0, "STATUS": 3, "BL": 9},
+    "generator": {"I": 0, "PG": 2, "MBASE": 8, "ZX": 10, "STATUS": 14},
+    "branch": {"I": 0, "J": 1, "R": 3, "X": 4, "B": 5, "GI": 9, "BI": 10, "GJ": 11, "BJ": 12,
+               "STATUS": 13},
+    "transformer": {"I": 0, "J": 1, "K": 2, "CW": 4, "CZ": 5, "CM": 6, "MAG1": 7, "MAG2": 8,
+                    "STATUS": 11},
+}  # fmt: skip
+_ELSE = {"STATUS": 1.0, "CW": 1.0, "CZ": 1.0, "CM": 1.0, "IDE": 1.0, "VM": 1.0, "ZX": 1.0}
+_JUMPER = 1e-4  # p.u.; a branch of less is none to PSS/E (THRSHZ), and makes two buses one
+
+
+class _Record(NamedTuple):
+    where: str  # file, line and kind
+    fields: list[str]
+
+    def number(self, name: str, at: int, otherwise: float = 0.0) -> float:
+        text = self.fields[at] if at < len(self.fields) else ""
+        return number(f"{self.where}, {name}", text) if text else otherwise
+
+    def numbers(self, kind: str) -> dict[str, float]:
+        """Its fields by name; those that it leaves out have PSS/E's values."""
+        return {
+            name: self.number(name, at, _ELSE.get(name, 0.0)) for name, at in _FIELDS[kind].items()
+        }
+
+
+class _Winding(NamedTuple):
+    bus: int
+    tap: float  # p.u. of the voltage of its bus
+    degrees: float
+
+
+def read_raw(path: str | Path) -> tuple[Any, list[str]]:
+    """The net of a case, whose buses are called by their numbers, and what it leaves out.
+
+    Raises:
+        UserError: the file cannot be read, is of another revision, or a record is none; the message
+            has the file, the line and the field.
+    """
+    return _Case(Path(path)).net()
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The number of each line and its fields, without its comment."""
+    try:
+        text = read_file(path).decode("utf-8", "replace")
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    for k, line in enumerate(text.splitlines(), 1):
+        fields = []
+        for one, end in re.findall(r"\s*('[^']*'|[^,/']*)\s*(,|/|$)", line):
+            fields.append(one.strip("' "))
+            if end != ",":
+                break
+        yield k, fields
+
+
+class _Case:
+    """The tables of PYPOWER, being filled; p.u. of ``S_b`` in MVA."""
+
+    def __init__(self, path: Path) -> None:
+        lines = list(_lines(path))
+        head = _Record(f"{path}, line 1", lines[0][1] if lines else [])
+        revision = head.number("REV", 2)
+        if revision not in (31.0, 32.0, 33.0):
+            raise UserError(f"{path}, line 1, REV: revision {revision:g}: must be 31, 32 or 33")
+        self.path = path
+        self.S_b, self.f = head.number("SBASE", 1, 100.0), head.number("BASFRQ", 5, 60.0)
+        self.sections = self._divided(lines[3:])
+        self.ignored: list[str] = []
+        #: by number: type, P, Q of loads, G, B of shunts, MW and Mvar, VM, VA, kV
+        self.buses: dict[int, list[float]] = {}
+        self.numbers: set[float] = set()  # of all buses, isolated ones too
+        self.branches: list[list[float]] = []  # from, to, R, X, B, ratio, shift
+        self.jumpers: list[tuple[int, int]] = []
+
+    def _divided(self, lines: list[tuple[int, list[str]]]) -> dict[str, list[_Record]]:
+        sections = {name: list[_Record]() for name in _SECTIONS}
+        names = iter(_SECTIONS)
+        name = next(names)
+        for k, fields in lines:
+            if fields[0] in ("0", "Q") and len(fields) == 1:
+                if fields[0] == "Q" or (name := next(names, "")) == "":
+                    break
+            else:
+                sections[name].append(_Record(f"{self.path}, line {k}, {name}", fields))
+        return sections
+
+    def net(self) -> tuple[Any, list[str]]:
+        for record in self.sections["bus"]:
+            p = record.numbers("bus")
+            self.numbers.add(p["I"])
+            if p["IDE"] != 4.0:  # isolated
+                values = [1.0, 0.0, 0.0, 0.0, 0.0, p["VM"], p["VA"], p["BASKV"] or 1.0]
+                self.buses[int(p["I"])] = values
+                if p["IDE"] == 3.0:
+                    values[0] = 3.0
+        self._loads()
+        self._shunts()
+        generators = self._generators()
+        self._lines()
+        self._transformers()
+        self._series_capacitors()
+        self._dead_ends()
+        for kind, each in _LEFT_OUT.items():
+            if count := len(self.sections[kind]) // each:
+                self.ignored.append(f"{count} {kind}{'s' * (count > 1)}: left out.")
+        return self._made(generators), self.ignored
+
+    def _made(self, generators: dict[int, tuple[float, float, float]]) -> Any:
+        """The net of pandapower."""
+        import pandapower as pp
+
+        net = pp.create_empty_network(f_hz=self.f, sn_mva=self.S_b)
+        for k, (type, P, Q, G, B, V, _, kV) in self.buses.items():
+            pp.create_bus(net, kV, index=k, name=str(k))
+            if P < 0.0:
+                pp.create_sgen(net, k, -P, -Q)
+            elif P or Q:
+                pp.create_load(net, k, P, Q)
+            if G or B:
+                pp.create_shunt(net, k, -B, G)
+            if k in generators:
+                P, S, by_X = generators[k]
+                if type == 3.0:
+                    pp.create_ext_grid(net, k, V)
+                else:
+                    pp.create_gen(net, k, P, V)
+                table = net.ext_grid if type == 3.0 else net.gen
+                table.loc[table.index[-1], ["sn_mva", "xdss_pu"]] = S, S / by_X or math.nan
+        for a, b, R, X, B, ratio, degrees in self.branches:
+            if ratio:
+                pp.create_transformer_from_parameters(
+                    net, a, b, self.S_b, self.buses[int(a)][7] * ratio, self.buses[int(b)][7],
+                    100.0 * R, math.copysign(100.0 * abs(complex(R, X)), X), 0.0, 0.0, degrees,
+                )  # fmt: skip
+            else:
+                pp.create_impedance(net, a, b, R, X, self.S_b, bf_pu=B / 2, bt_pu=B / 2)
+        for a, b in self.jumpers:
+            pp.create_switch(net, a, b, et="b")
+        return net
+
+    def _working(self, kind: str) -> Iterator[tuple[_Record, dict[str, float]]]:
+        """The records of a kind that are in service, as is their bus."""
+        for record in self.sections[kind]:
+            p = record.numbers(kind)
+            if p["STATUS"] and all(
+                self._has(record, n, p) for n in "IJK" if n in p and (p[n] or n != "K")
+            ):
+                yield record, p
+
+    def _has(self, record: _Record, name: str, p: dict[str, float]) -> bool:
+        """Whether a bus is in service."""
+        p[name] = abs(p[name])  # the sign says where a flow is metered
+        if p[name] not in self.numbers:
+            raise UserError(f"{record.where}, {name}: {p[name]:g}: there is no such bus")
+        return p[name] in self.buses
+
+    def _loads(self) -> None:
+        for _, p in self._working("load"):
+            bus = self.buses[int(p["I"])]
+            V = bus[5]
+            bus[1] += p["PL"] + p["IP"] * V + p["YP"] * V**2
+            bus[2] += p["QL"] + p["IQ"] * V - p["YQ"] * V**2
+
+    def _shunts(self) -> None:
+        for kind in ("fixed shunt", "switched shunt"):
+            for _, p in self._working(kind):
+                self._shunt(int(p["I"]), complex(p.get("GL", 0.0), p["BL"]))
+
+    def _shunt(self, k: int, Y: complex) -> None:
+        self.buses[k][3] += Y.real
+        self.buses[k][4] += Y.imag
+
+    def _generators(self) -> dict[int, tuple[float, float, float]]:
+        """P, MBASE, and MBASE by ZSOURCE of all generators of each bus, which holds its voltage."""
+        sums: dict[int, tuple[float, float, float]] = {}
+        for _, p in self._working("generator"):
+            k, S = int(p["I"]), p["MBASE"] or self.S_b
+            before = sums.get(k, (0.0, 0.0, 0.0))
+            by_X = S / p["ZX"] if p["ZX"] else math.inf
+            sums[k] = (before[0] + p["PG"], before[1] + S, before[2] + by_X)
+            self.buses[k][0] = max(self.buses[k][0], 2.0)
+        return sums
+
+    def _lines(self) -> None:
+        for _, p in self._working("branch"):
+            a, b = int(p["I"]), int(p["J"])
+            if abs(complex(p["R"], p["X"])) < _JUMPER:
+                self.jumpers.append((a, b))
+                continue
+            for k, end in ((a, "I"), (b, "J")):
+                if p[f"G{end}"] < 0.0:
+                    self.ignored.append(f"G{end} = {p[f'G{end}']:g} of line {a}-{b} is left out.")
+                self._shunt(k, complex(max(p[f"G{end}"], 0.0), p[f"B{end}"]) * self.S_b)
+            self.branches.append([a, b, p["R"], p["X"], p["B"], 0.0, 0.0])
+
+    def _transformers(self) -> None:
+        own, records = self.sections["transformer"], dict[int, list[_Record]]()
+        k = 0
+        while k < len(own):  # the third field is the third bus, 0 for two windings
+            length = 4 if own[k].number("K", 2) == 0.0 else 5
+            records[k], k = own[k : k + length], k + length
+        self.sections["transformer"] = [lines[0] for lines in records.values()]
+        lines_of = {lines[0].where: lines for lines in records.values()}
+        for record, p in self._working("transformer"):
+            lines = lines_of[record.where]
+            if len(lines) < (5 if p["K"] else 4):
+                raise UserError(f"{record.where}: the record does not end")
+            pairs = [self._impedance(lines[1], p, 3 * j) for j in range(3 if p["K"] else 1)]
+            windings = [
+                self._winding(line, int(p[name]), p["CW"])
+                for line, name in zip(lines[2:], "IJK", strict=False)
+            ]
+            G, B = p["MAG1"], p["MAG2"]
+            if p["CM"] == 2.0:  # W, and a current in p.u.
+                S = lines[1].number("SBASE1-2", 2, self.S_b)
+                G, B = G / 1e6 / self.S_b, -math.sqrt(max((B * S / self.S_b) ** 2 - G**2, 0.0))
+            self._shunt(windings[0].bus, complex(G, B) * self.S_b)
+            if not p["K"]:
+                self._leg(windings[0], windings[1], pairs[0])
+                continue
+            Z12, Z23, Z31 = pairs
+            star = max(self.buses) + 1
+            kV = min(self.buses[w.bus][7] for w in windings)
+            V, angle = (lines[1].number(n, at) for n, at in (("VMSTAR", 9), ("ANSTAR", 10)))
+            self.buses[star] = [1.0, 0.0, 0.0, 0.0, 0.0, V or 1.0, angle, kV]
+            legs = (Z12 + Z31 - Z23) / 2, (Z12 + Z23 - Z31) / 2, (Z23 + Z31 - Z12) / 2
+            out = {2.0: 1, 3.0: 2, 4.0: 0}.get(p["STATUS"])  # the winding that is open
+            for j, (winding, Z) in enumerate(zip(windings, legs, strict=True)):
+                if j != out:
+                    self._leg(winding, _Winding(star, 1.0, 0.0), Z)
+
+    def _passes(self, k: int) -> bool:
+        """Whether nothing but branches and shunts is at a bus."""
+        return self.buses[k][:3] == [1.0, 0.0, 0.0] and not any(k in one for one in self.jumpers)
+
+    def _series_capacitors(self) -> None:
+        """Join each with the line behind it where nothing is between them, as a part of that line's
+        reactance; charging and shunts between them then are at the far end."""
+        count = 0
+        while joint := next(self._joints(), None):
+            capacitor, line, between = joint
+            far = int(capacitor[0] if capacitor[1] == between else capacitor[1])
+            line[0 if line[0] == between else 1] = far
+            for j in (2, 3, 4):
+                line[j] += capacitor[j]
+            self._shunt(far, complex(*self.buses.pop(between)[3:5]))
+            self.branches.remove(capacitor)
+            count += 1
+        if count:
+            self.ignored.append(f"{count} series capacitors: a part of their lines' reactance.")
+
+    def _joints(self) -> Iterator[tuple[list[float], list[float], int]]:
+        """A branch of negative reactance, the line behind it, and the bus between them."""
+        for one in self.branches:
+            if one[3] >= 0.0 or one[5]:
+                continue
+            for between in map(int, one[:2]):
+                there = [b for b in self.branches if b is not one and between in b[:2]]
+                loop = len(there) == 1 and {*there[0][:2]} == {*one[:2]}
+                if len(there) == 1 and not there[0][5] and not loop and self._passes(between):
+                    yield one, there[0], between
+
+    def _dead_ends(self) -> None:
+        """Take out the buses that end a branch without charging and have nothing."""
+        while True:
+            ends = Counter(int(k) for b in self.branches for k in b[:2])
+            dead = [
+                (k, b)
+                for b in self.branches
+                for k in map(int, b[:2])
+                if ends[k] == 1 and b[4] == 0.0 and self._passes(k) and not any(self.buses[k][3:5])
+            ]
+            if not dead:
+                break
+            k, branch = dead[0]
+            self.branches.remove(branch)
+            del self.buses[k]
+            self.ignored.append(f"bus {k}: nothing is there, and it is left out with its branch.")
+
+    def _impedance(self, line: _Record, p: dict[str, float], at: int) -> complex:
+        """That between two windings, p.u. of the case's power."""
+        R, X = (line.number(name, at + j) for j, name in enumerate("RX"))
+        S = line.number("SBASE", at + 2, self.S_b)
+        if p["CZ"] == 3.0:  # W, and the modulus
+            R = R / 1e6 / S
+            X = math.sqrt(max(X**2 - R**2, 0.0))
+        return complex(R, X) * (1.0 if p["CZ"] == 1.0 else self.S_b / S)
+
+    def _winding(self, line: _Record, k: int, unit: float) -> _Winding:
+        kV, tap = self.buses[k][7], line.number("WINDV", 0, 1.0)
+        if unit == 2.0:
+            tap /= kV
+        elif unit == 3.0:
+            tap *= (line.number("NOMV", 1) or kV) / kV
+        return _Winding(k, tap, line.number("ANG", 2))
+
+    def _leg(self, a: _Winding, b: _Winding, Z: complex) -> None:
+        """A transformer of two windings; pandapower has its taps at the side of high voltage."""
+        if self.buses[a.bus][7] < self.buses[b.bus][7]:
+            a, b = b, a
+        Z *= b.tap**2
+        self.branches.append(
+            [a.bus, b.bus, Z.real, Z.imag, 0.0, a.tap / b.tap, a.degrees - b.degrees]
+        )
