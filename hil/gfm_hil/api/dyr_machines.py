@@ -37,9 +37,8 @@ class _Record(NamedTuple):
 
 
 def read_machines(path: str | Path) -> Machines:
-    """Read the records of GENROU, GENSAL and GENCLS, and of their controls: the exciters SEXS,
-    IEEET1, EXDC2, EXST1 and ESST3A, the governors TGOV1, IEEEG1 and HYGOV, the stabilisers PSS1A,
-    IEEEST and ST2CUT; and of REGCA1 with REECA1 or REECB1, and REPCA1.
+    """Read the records of machines, their exciters, governors and stabilisers, of REGCA1 with
+    REECA1 or REECB1, and of REPCA1: those in ``MODELS``.
 
     Raises:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
@@ -54,10 +53,10 @@ def read_machines(path: str | Path) -> Machines:
         bus, model, texts = fields[0], fields[1].upper(), fields[3:]
         if model == "USRMDL" and len(texts) > 6:
             model, texts = texts[0].upper(), texts[7:]
-        if model not in _MODELS:
+        if model not in MODELS:
             ignored.append(f"{model} at bus {bus} is not known here and left out.")
             continue
-        role, names, make = _MODELS[model]
+        role, names, make = MODELS[model]
         if role in buses.setdefault(bus, {}):
             ignored.append(f"Of several machines at bus {bus} the first one stands for all.")
             continue
@@ -77,7 +76,7 @@ def read_machines(path: str | Path) -> Machines:
         for table, content in _parts(bus, parts, ignored):
             tables.setdefault(table, {})[bus] = content
     if not tables:
-        raise UserError(f"{path}: no record of GENROU, GENSAL, GENCLS or REGCA1")
+        raise UserError(f"{path}: no record of GENROU, GENROE, GENSAL, GENSAE, GENCLS or REGCA1")
     return Machines(tables, list(dict.fromkeys(ignored)), str(path))
 
 
@@ -148,8 +147,59 @@ def _rotating(type: str, p: Numbers) -> Made:
     return content, notes
 
 
+def _unlimited(p: Numbers) -> Made:
+    """One whose limits follow no voltage: IEEET1, which has no lead and lag."""
+    T_B, T_C = p.pop("T_B"), p.pop("T_C")
+    content, notes = _rotating("IEEET1", p)
+    return content, notes + ["its lead and lag are left out"] * (T_B > 0.0 and T_B != T_C)
+
+
+def _esdc2a(p: Numbers) -> Made:
+    if p["V_Rmax"] <= 0.0:  # PSS/E finds it from the second point of the saturation
+        p["V_Rmax"] = (p["K_E"] + p["S_E2"]) * p["E_2"]
+        content, notes = _rotating("EXDC2", p)
+        return content, [*notes, f"V_Rmax = {p['V_Rmax']:.4g}, which its saturation asks for"]
+    return _rotating("EXDC2", p)
+
+
+def _ieeet2(p: Numbers) -> Made:
+    """Its feedback has two lags, ours the sum of both."""
+    p["T_F"] = p.pop("T_F1") + p.pop("T_F2")
+    content, notes = _rotating("IEEET1", {"switch": 0.0, **p})
+    return content, [*notes, f"its feedback has one lag, T_F = {p['T_F']:g} s"]
+
+
 def _exst1(p: Numbers) -> Made:
     return _lagging({"type": "EXST1", **p}, "T_R", "T_A", "T_F")
+
+
+def _esst1a(p: Numbers) -> Made:
+    """EXST1 with limits of its regulator, a second lead and lag, and a limiter of its field."""
+    notes = []
+    if p["T_C1"] != p["T_B1"]:
+        notes.append("its second lead and lag are left out")
+    if p["V_Amax"] < p["V_Rmax"] or p["V_Amin"] > p["V_Rmin"]:
+        notes.append("V_Amax and V_Amin are left out")
+    if p["K_LR"] > 0.0:
+        notes.append("its limiter of the field's current is left out")
+    kept = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_C", "K_F",
+            "T_F")  # fmt: skip
+    content, more = _exst1({name: p[name] for name in kept})
+    return content, notes + more
+
+
+def _scrx(p: Numbers) -> Made:
+    """SEXS, or fed by the terminals EXST1, but for its gain, which follows their voltage."""
+    by_terminals = p.pop("C_switch") == 0.0
+    p.pop("rc/rfd")
+    if not by_terminals:
+        return _sexs(p)
+    content, notes = _exst1({
+        "T_R": 0.0, "V_Imax": 99.0, "V_Imin": -99.0, "T_C": p["T_A/T_B"] * p["T_B"],
+        "T_B": p["T_B"], "K_A": p["K"], "T_A": p["T_E"], "V_Rmax": p["E_max"],
+        "V_Rmin": p["E_min"], "K_C": 0.0, "K_F": 0.0, "T_F": 1.0,
+    })  # fmt: skip
+    return content, [*notes, "its gain does not follow the voltage"]
 
 
 def _esst3a(p: Numbers) -> Made:
@@ -163,7 +213,16 @@ def _tgov1(p: Numbers) -> Made:
 def _ieeeg1(p: Numbers) -> Made:
     shafts = [p.pop(name) for name in ("bus", "machine", "K2", "K4", "K6", "K8")][2:]
     content, notes = _lagging({"type": "IEEEG1", **p}, "T3")
+    if p["T1"] == 0.0 < p["T2"]:
+        content["T2"] = 0.0
+        notes.append("T2 is left out, for T1 = 0")
     return content, notes + ["its shaft of low pressure is left out"] * any(shafts)
+
+
+def _wsieg1(p: Numbers) -> Made:
+    more = [p.pop(name) for name in (*_CURVE, "block")]
+    content, notes = _ieeeg1(p)
+    return content, notes + ["its dead bands and its curve are left out"] * any(more)
 
 
 def _hygov(p: Numbers) -> Made:
@@ -265,6 +324,13 @@ def _gensal(p: Numbers) -> Made:
     return _lagging({**p, **poles}, "T_d10", "T_d20", "T_q20")
 
 
+def _exponential(make: Callable[[Numbers], Made], p: Numbers) -> Made:
+    content, notes = make(p)
+    if p["S_12"]:
+        notes.append("a parabola saturates it, through the same two points")
+    return content, notes
+
+
 def _gencls(p: Numbers) -> Made:
     notes = []
     if p["H"] == 0.0:
@@ -286,20 +352,21 @@ _REEC = ("Vdip", "Vup", "Trv", "dbd1", "dbd2", "Kqv", "Iqh1", "Iql1", "Vref0")
 _LOOPS = ("Tp", "Q_max", "Q_min", "V_max", "V_min", "Kqp", "Kqi", "Kvp", "Kvi")
 _POWER = ("Tiq", "dP_max", "dP_min", "P_max", "P_min", "Imax", "Tpord")
 _SATURATION = ("switch", "E_1", "S_E1", "E_2", "S_E2")
+_ROUND = ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
+          "S_10", "S_12")  # fmt: skip
+_SALIENT = ("T_d10", "T_d20", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_2", "X_l", "S_10", "S_12")
+_COMMUTATOR = ("T_R", "K_A", "T_A", "T_B", "T_C", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F",
+               *_SATURATION)  # fmt: skip
+_STEAM = ("bus", "machine", "K", "T1", "T2", "T3", "U_o", "U_c", "P_max", "P_min", "T4", "K1", "K2",
+          "T5", "K3", "K4", "T6", "K5", "K6", "T7", "K7", "K8")  # fmt: skip
+_CURVE = ("db1", "err", "db2", *(f"{x}{k}" for k in range(1, 6) for x in ("GV", "PGV")))
 _LEADS = ("T1", "T2", "T3", "T4", "T5", "T6", "K_S", "V_STmax", "V_STmin", "V_CU", "V_CL")
 #: by model: which part of a machine it is, its numbers in the order of a record, and what makes it
-_MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
-    "GENROU": (
-        "machine",
-        ("T_d10", "T_d20", "T_q10", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_q1", "X_2", "X_l",
-         "S_10", "S_12"),
-        _genrou,
-    ),
-    "GENSAL": (
-        "machine",
-        ("T_d10", "T_d20", "T_q20", "H", "D", "X_d", "X_q", "X_d1", "X_2", "X_l", "S_10", "S_12"),
-        _gensal,
-    ),
+MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
+    "GENROU": ("machine", _ROUND, _genrou),
+    "GENROE": ("machine", _ROUND, partial(_exponential, _genrou)),
+    "GENSAL": ("machine", _SALIENT, _gensal),
+    "GENSAE": ("machine", _SALIENT, partial(_exponential, _gensal)),
     "GENCLS": ("classical", ("H", "D"), _gencls),
     "REGCA1": (
         "converter",
@@ -332,11 +399,23 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         ("T_R", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F", *_SATURATION),
         partial(_rotating, "IEEET1"),
     ),
-    "EXDC2": (
+    "IEEET2": (
         "avr",
-        ("T_R", "K_A", "T_A", "T_B", "T_C", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F",
-         *_SATURATION),
-        partial(_rotating, "EXDC2"),
+        ("T_R", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_E", "T_E", "K_F", "T_F1", "T_F2",
+         *_SATURATION[1:]),
+        _ieeet2,
+    ),
+    "EXDC1": ("avr", _COMMUTATOR, _unlimited),
+    "ESDC1A": ("avr", _COMMUTATOR, _unlimited),
+    "IEEEX1": ("avr", _COMMUTATOR, _unlimited),
+    "EXDC2": ("avr", _COMMUTATOR, partial(_rotating, "EXDC2")),
+    "ESDC2A": ("avr", _COMMUTATOR, _esdc2a),
+    "SCRX": ("avr", ("T_A/T_B", "T_B", "K", "T_E", "E_min", "E_max", "C_switch", "rc/rfd"), _scrx),
+    "ESST1A": (
+        "avr",
+        ("UEL", "VOS", "T_R", "V_Imax", "V_Imin", "T_C", "T_B", "T_C1", "T_B1", "K_A", "T_A",
+         "V_Amax", "V_Amin", "V_Rmax", "V_Rmin", "K_C", "K_F", "T_F", "K_LR", "I_LR"),
+        _esst1a,
     ),
     "EXST1": (
         "avr",
@@ -350,12 +429,8 @@ _MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
          "K_P", "K_I", "V_Bmax", "K_C", "X_L", "V_Gmax", "theta_P", "T_M", "V_Mmax", "V_Mmin"),
         _esst3a,
     ),
-    "IEEEG1": (
-        "governor",
-        ("bus", "machine", "K", "T1", "T2", "T3", "U_o", "U_c", "P_max", "P_min", "T4", "K1", "K2",
-         "T5", "K3", "K4", "T6", "K5", "K6", "T7", "K7", "K8"),
-        _ieeeg1,
-    ),
+    "IEEEG1": ("governor", _STEAM, _ieeeg1),
+    "WSIEG1": ("governor", (*_STEAM, *_CURVE, "block"), _wsieg1),
     "HYGOV": (
         "governor",
         ("R", "r", "T_r", "T_f", "T_g", "VELM", "G_max", "G_min", "T_W", "A_t", "D_turb", "q_NL"),

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from gfm_hil.api.dyr_machines import MODELS
 from gfm_hil.api.network_case import network_from
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
@@ -34,9 +35,7 @@ def add(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     read.add_argument(
         "--dynamics", metavar="FILE",
-        help="dynamic data of PSS/E (.dyr): GENROU, GENSAL, GENCLS, SEXS, IEEET1, EXDC2,"
-        " EXST1, ESST3A, TGOV1, IEEEG1, HYGOV, PSS1A, IEEEST, ST2CUT, REGCA1,"
-        " REECA1, REECB1 and REPCA1",
+        help=f"dynamic data of PSS/E (.dyr): {', '.join(MODELS)}",
     )  # fmt: skip
     read.add_argument("-o", "--out", metavar="FOLDER", help="(default: the case's name)")
     read.set_defaults(call=call_import)

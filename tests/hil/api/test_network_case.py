@@ -227,7 +227,45 @@ PUBLISHED = """\
             "EXST1 ' 1 0.02 99.0 -99.0 0.0 0.02 50.0 0.02 9999.0 -9999.0 0.0 0.01 1.0 /",
             {"V_Imin": -99.0, "T_B": 0.02, "K_A": 50.0, "V_Rmax": 9999.0, "K_F": 0.01, "T_F": 1.0},
             [],
-        )
+        ),
+        # of the IEEE's benchmark system VII (Benchmark_4ger_33_2015.dyr of PowerSystems.jl)
+        (
+            "ESST1A' 1 1 1 0.01 99 -99 1 10 1 1 200 0 4 -4 4 -4 0 0 1 0 3 /",
+            {
+                "type": "EXST1",
+                "T_R": 0.01,
+                "T_C": 1.0,
+                "T_B": 10.0,
+                "K_A": 200.0,
+                "T_A": 1e-3,
+                "V_Rmax": 4.0,
+                "V_Rmin": -4.0,
+                "K_C": 0.0,
+                "T_F": 1.0,
+            },
+            ["T_A = 0.001 s instead of 0"],
+        ),
+        # of ANDES's npcc_full.dyr, N44_BC.dyr and wecc_full.dyr
+        (
+            "IEEEX1' 1 0 50 0.06 0 0 1 -1 -0.04 0.5 0.08 1 0 2 0.0016 3 1.45 /",
+            {"type": "IEEET1", "K_A": 50.0, "K_E": -0.04, "T_F": 1.0, "E_2": 3.0, "S_E2": 1.45},
+            ["T_R = 0.001 s instead of 0"],
+        ),
+        (
+            "IEEET2' 1 0.02 729 0.04 5.32 -4.05 1 0.44 0.0667 2 0.44 6.5 0.054 8 0.202 /",
+            {"type": "IEEET1", "V_Rmin": -4.05, "K_F": 0.0667, "T_F": 2.44, "S_E1": 0.054},
+            ["its feedback has one lag, T_F = 2.44 s"],
+        ),
+        (
+            "SCRX' 1 0.25385 13 31 0.05 0 4 0 0 /",
+            {"type": "EXST1", "T_B": 13.0, "K_A": 31.0, "T_A": 0.05, "V_Rmax": 4.0, "K_F": 0.0},
+            ["T_R = 0.001 s instead of 0", "its gain does not follow the voltage"],
+        ),
+        (
+            "ESDC2A' 1 0.02 50 0.05 0.02 0 0 -3 0 0.512 0.07 1.3 0 3.9825 0.5 5.31 1.049 /",
+            {"type": "EXDC2", "T_B": 0.02, "V_Rmax": 1.049 * 5.31, "V_Rmin": -3.0, "K_E": 0.0},
+            ["V_Rmax = 5.57, which its saturation asks for"],
+        ),
     ],
 )
 def test_published_controls(record, known, notes, tmp_path):
@@ -235,7 +273,8 @@ def test_published_controls(record, known, notes, tmp_path):
     file.write_text(f"{PUBLISHED.splitlines()[0]}\n1 '{record}\n")
     tables, ignored, _ = read_machines(file)
     one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
-    assert {name: getattr(one.avr, name) for name in known} == known and ignored == notes
+    assert {name: getattr(one.avr, name) for name in known} == known
+    assert [line.rstrip(".").partition(": ")[2] for line in ignored] == notes
 
 
 def test_a_published_stabiliser_with_three_leads(tmp_path):
@@ -274,6 +313,24 @@ def test_a_published_machine_with_salient_poles(tmp_path):
     assert (one.T_d10, one.T_d20, one.T_q20, one.H, one.X_l) == (7.57, 0.045, 0.1, 4.741, 0.11077)
     assert (one.X_d, one.X_q, one.X_q1, one.X_d1, one.X_2) == (0.946, 0.565, 0.565, 0.29, 0.23)
     assert (one.S_10, one.S_12, one.saturates_by) == (0.10239, 0.2742, "E_q1")
+
+
+def test_governors_and_machines_of_gridpack_and_sienna(tmp_path):
+    """WSIEG1 of GridPACK's tamu_500bus_detail.dyr, and GENROE of the IEEE's system VII."""
+    file = tmp_path / "published.dyr"
+    file.write_text(
+        "1 'GENROE' 1 8 0.03 0.4 0.05 6.5 0 1.8 1.7 0.3 0.55 0.25 0.2 0.0392 0.2672 /\n"
+        f"1 'WSIEG1' 1 0 0 25 0 3.3 0.3 0.25 -3.3 51 0 0.086 1 {'0 ' * 24} /"
+    )
+    tables, ignored, _ = read_machines(file)
+    one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
+    assert (one.X_q, one.S_10, one.S_12, one.saturates_by) == (1.7, 0.0392, 0.2672, "psi_2")
+    own = one.governor
+    assert (own.type, own.K, own.T2, own.T4, own.K1, own.P_max) == ("IEEEG1", 25, 0, 0.086, 1, 51)
+    assert ignored == [
+        "GENROE at bus 1: a parabola saturates it, through the same two points.",
+        "WSIEG1 at bus 1: T2 is left out, for T1 = 0.",
+    ]
 
 
 def test_a_commutator_exciter_and_a_governor_of_one_shaft(tmp_path):
@@ -454,7 +511,7 @@ def test_a_machine_beside_a_converter_stands_for_both_at_the_slack(tmp_path):
         ("1.2 0.0 2.0 7.0 0.0 /", "1.2 /", "line 3: TGOV1 has 7 numbers, not 3"),
         ("8.96", "8.9x6", "line 1, T_d10: '8.9x6' is no number from -1e6 to 1e6"),
         ("0.0 0.0 / the", "0.0 0.0 the", "line 1: GENROU has 14 numbers, not 33"),
-        ("GENROU", "GENTPJ", "no record of GENROU, GENSAL, GENCLS or REGCA1"),
+        ("GENROU", "GENTPJ", "no record of GENROU, GENROE, GENSAL, GENSAE, GENCLS or REGCA1"),
         # refused by its own part, by a machine at this sampling period, and at the start
         ("0.05 0.0 5.0", "0.05 5.0 0.0", "line 6: SEXS at bus 2: E_min = 5: must be less than E_m"),
         ("0.1198", "0.9", "line 4: GENROU at bus 2: X_d = 0.8958: must be above that before it"),
