@@ -15,6 +15,7 @@ from gfm_plant.components import COMPONENTS
 _SHORT = 1e-3  # s; the shortest time constant at a sampling period of 0.1 ms
 _CONSTANT = 1e12  # p.u./p.u.; the droop of a turbine whose power is constant
 _MOST = 2.0  # p.u.; of set-points of P and Q
+_HIGH = 99.0  # p.u.; a limit that never acts
 _INFINITE = 1e6  # s; the inertia constant of an infinite bus
 
 Numbers = dict[str, float]
@@ -155,11 +156,12 @@ def _unlimited(p: Numbers) -> Made:
 
 
 def _esdc2a(p: Numbers) -> Made:
-    if p["V_Rmax"] <= 0.0:  # PSS/E finds it from the second point of the saturation
-        p["V_Rmax"] = (p["K_E"] + p["S_E2"]) * p["E_2"]
-        content, notes = _rotating("EXDC2", p)
-        return content, [*notes, f"V_Rmax = {p['V_Rmax']:.4g}, which its saturation asks for"]
-    return _rotating("EXDC2", p)
+    notes = []
+    if p["V_Rmax"] <= 0.0:  # PSS/E finds one that fits
+        p["V_Rmax"] = _HIGH
+        notes.append(f"V_Rmax = {_HIGH:g}: it names none")
+    content, more = _rotating("EXDC2", p)
+    return content, notes + more
 
 
 def _ieeet2(p: Numbers) -> Made:
@@ -195,7 +197,7 @@ def _scrx(p: Numbers) -> Made:
     if not by_terminals:
         return _sexs(p)
     content, notes = _exst1({
-        "T_R": 0.0, "V_Imax": 99.0, "V_Imin": -99.0, "T_C": p["T_A/T_B"] * p["T_B"],
+        "T_R": 0.0, "V_Imax": _HIGH, "V_Imin": -_HIGH, "T_C": p["T_A/T_B"] * p["T_B"],
         "T_B": p["T_B"], "K_A": p["K"], "T_A": p["T_E"], "V_Rmax": p["E_max"],
         "V_Rmin": p["E_min"], "K_C": 0.0, "K_F": 0.0, "T_F": 1.0,
     })  # fmt: skip

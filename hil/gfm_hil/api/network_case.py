@@ -22,7 +22,7 @@ from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario import load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant, make_plant
-from gfm_plant.components import COMPONENTS
+from gfm_plant.components import COMPONENTS, SynchronousMachine
 from gfm_runtime import LawError, discretise, load_law
 from gfm_runtime.signals import Y_NAMES
 
@@ -32,6 +32,7 @@ _NEAR = 1e-6  # p.u.; how far the network's steady state may lie from the power 
 # of PowerSimulationsDynamics.jl's inverter (scenarios/published/psid_inverter.toml), p.u.; its
 # line stands for the converter's own transformer
 _CONVERTER = {"L_f": 0.08, "R_f": 0.003, "C_f": 0.074, "L_g": 0.2, "R_g": 0.01}
+_ROOM = 1.05  # of a governor above the power that the case asks for
 _STORED_S = 0.03  # energy of its DC capacitor by its rating, as of the paper's converter
 _V_N, _V_DC = 690.0, 1500.0  # V
 _FILTER = 0.05  # p.u. of a static generator's rating; the capacitor of its filter
@@ -359,7 +360,25 @@ class _Build:
         P += float(_default("synchronous_machines", "R")) * abs(i) ** 2
         own = self._record("synchronous_machines", k)
         values |= {"P": P, "V": abs(bus.V), **(_MACHINE if own is None else own)}
+        if "governor" in values:
+            values["governor"] = self._opened(values, named(bus.name))
         self._put("synchronous_machines", f"G{self.names[k]}", values)
+
+    def _opened(self, machine: dict[str, Any], bus: str) -> dict[str, Any]:
+        """Its governor, which opens as far as the case asks for: in many published files machines
+        bring more than their governors let them by the rating."""
+        governor: dict[str, Any] = machine["governor"]
+        one = SynchronousMachine.model_validate(machine).governor
+        states, _ = one.rest(machine["P"], 0.0)
+        for place, (_, most) in one.limits_at(0.0).items():
+            for name in ("P_max", "V_max", "G_max"):
+                if states[place] >= most and governor.get(name) == most:
+                    governor = governor | {name: _ROOM * states[place]}
+                    self.ignored.append(
+                        f"{one.kind()} at {bus}: {name} = {governor[name]:.4g} instead of {most:g},"
+                        " for the power that the case has there."
+                    )
+        return governor
 
     def _record(self, table: str, k: int) -> dict[str, Any] | None:
         """What a dynamics file says of a part of a table at a bus."""

@@ -263,8 +263,8 @@ PUBLISHED = """\
         ),
         (
             "ESDC2A' 1 0.02 50 0.05 0.02 0 0 -3 0 0.512 0.07 1.3 0 3.9825 0.5 5.31 1.049 /",
-            {"type": "EXDC2", "T_B": 0.02, "V_Rmax": 1.049 * 5.31, "V_Rmin": -3.0, "K_E": 0.0},
-            ["V_Rmax = 5.57, which its saturation asks for"],
+            {"type": "EXDC2", "T_B": 0.02, "V_Rmax": 99.0, "V_Rmin": -3.0, "K_E": 0.0},
+            ["V_Rmax = 99: it names none"],
         ),
     ],
 )
@@ -490,6 +490,19 @@ def test_a_dynamics_file_of_more_buses_or_of_others(tmp_path):
     file.write_text(f"77 {machine}")
     with pytest.raises(UserError, match="bus 77: is no bus of case9"):
         gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+
+
+def test_a_governor_opens_as_far_as_the_case_asks_for(tmp_path):
+    """The generator of bus 2 brings 163 MW of 300 MVA, and a little for its winding."""
+    file = tmp_path / "small.dyr"
+    file.write_text(
+        DYNAMICS.replace("0.2 1.0 0.0 1.0 1.2 0.5 0.08", "0.2 0.5 0.0 1.0 1.2 0.5 0.08")
+    )
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    opened = case.content["network"]["synchronous_machines"]["G2"]["governor"]["G_max"]
+    assert opened == pytest.approx(1.05 * (163.0 / 300.0 / 1.2 + 0.08), rel=2e-3)
+    assert sum("HYGOV at bus 2: G_max = 0.5" in line for line in case.ignored) == 1
+    assert case.distance(case.save(tmp_path / "net")) < 1e-8
 
 
 def test_a_machine_beside_a_converter_stands_for_both_at_the_slack(tmp_path):
