@@ -22,7 +22,8 @@ from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario import load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant, make_plant
-from gfm_plant.components import COMPONENTS, SynchronousMachine
+from gfm_plant.components import COMPONENTS
+from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_runtime import LawError, discretise, load_law
 from gfm_runtime.signals import Y_NAMES
 
@@ -368,7 +369,7 @@ class _Build:
         """Its governor, which opens as far as the case asks for: in many published files machines
         bring more than their governors let them by the rating."""
         governor: dict[str, Any] = machine["governor"]
-        one = SynchronousMachine.model_validate(machine).governor
+        one: Any = SynchronousMachine.model_validate(machine).governor
         states, _ = one.rest(machine["P"], 0.0)
         for place, (_, most) in one.limits_at(0.0).items():
             for name in ("P_max", "V_max", "G_max"):
