@@ -42,7 +42,8 @@ def test_the_plant_s_own_reason_goes_before_what_the_controller_saw_of_it():
 def test_a_damaged_command_is_refused_and_never_applied(make, tmp_path, endpoint):
     def damage(k: int, message: bytes) -> bytes:
         tick = np.frombuffer(message, frame_dtype("u"))["tick"][0]  # not k: a slow plant repeats
-        return message if tick < 20 else message[:30] + b"\xff\xff" + message[32:]
+        flipped = bytes(255 - one for one in message[30:32])  # in the mantissa of omega_u
+        return message if tick < 20 else message[:30] + flipped + message[32:]
 
     def touch(role: Role, link: Link) -> Any:
         return Tampering(link, damage) if role == "controller" else link

@@ -12,6 +12,8 @@ from gfm_hil.run import checks
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import FAIL, LIMITED, PASS, Outcome, Verdict
 
+_ROUNDING = 1e-9  # p.u. of power; a droop that asks for no more than this beyond a limit is met
+
 
 class Settles(Windowed):
     """The one-cycle means of a signal come within a tolerance of a value and stay there. Where the
@@ -68,9 +70,10 @@ class Settles(Windowed):
         to = float(np.clip(asked, under.P_min, under.P_max))
         droop = "no droop" if math.isinf(m.droop) else f"the declared droop of {100 * m.droop:g} %"
         why = f"{droop} at {omega_u * m.f_n:.4g} Hz"
-        if to != asked:
+        limited = abs(to - asked) > _ROUNDING
+        if limited:
             why += f", which asks for {asked:.3g} p.u., limited to the declared power"
-        return to, why, to != asked
+        return to, why, limited
 
 
 CRITERION = Settles
