@@ -124,7 +124,9 @@ def perturbed_run(law: str, plant: dict[str, Any], ticks: int, angle: float, pla
         ("vsg-5", {**RIG, "sensors": {"bandwidth_hz": 300.0, "gain": {"p": 1.05, "V": 0.98}}}),
         ("vsg-2", {"dc_source": {"tau_s": 0.005}, "modulation": "space-vector"}),
         ("vsg-2", {"dc_source": {"mode": "regulated", "tau_s": 0.001}}),
-        ("vsg-2", {"grid": {"finite": {"S": 3.0, "H": 4.0, "D": 1.0}}}),
+        pytest.param(
+            "vsg-2", {"grid": {"finite": {"S": 3.0, "H": 4.0, "D": 1.0}}}, marks=pytest.mark.full
+        ),
         ("hybrid-angle", {}),
         ("matching-2", PV),
         ("mimo-gfm-deployable-rig", {**PV, "delay": {"samples": 1}}),

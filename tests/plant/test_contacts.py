@@ -247,6 +247,7 @@ def test_closed_contacts_have_the_modes_of_their_axes(kind, which, more, place):
         assert np.abs(found - rate).min() < 1e-6 * max(1.0, abs(rate))
 
 
+@pytest.mark.full
 def test_the_series_of_a_switched_bridge_has_the_equations_of_the_modes():
     plant, _ = network(3.0, bridge={"kind": "two-level"})
     short("LG", "b", 0.02)(plant, ThreePhases(plant, 3.0))

@@ -203,6 +203,7 @@ def test_a_literal_is_its_number_to_the_bit(value):
             assert found.tobytes() == rounded.tobytes()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("real", REALS)
 @pytest.mark.parametrize("laws", [SOME, SOME_STAGED], ids=["plain", "staged"])

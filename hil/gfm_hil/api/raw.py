@@ -32,7 +32,7 @@ _LEFT_OUT = {
 }
 #: where the fields of a record are that are read here; those of a transformer by its line
 _FIELDS = {
-    "bus": {"I": 0, "BASKV": 2, "IDE": 3, "VM": 7, "VA": 8},
+    "bus": {"I": 0, "IDE": 3, "VM": 7, "VA": 8},
     "load": {"I": 0, "STATUS": 2, "PL": 5, "QL": 6, "IP": 7, "IQ": 8, "YP": 9, "YQ": 10},
     "fixed shunt": {"I": 0, "STATUS": 2, "GL": 3, "BL": 4},
     "switched shunt": {"I": 0, "STATUS": 3, "BL": 9},
@@ -53,6 +53,12 @@ class _Record(NamedTuple):
     def number(self, name: str, at: int, otherwise: float = 0.0) -> float:
         text = self.fields[at] if at < len(self.fields) else ""
         return number(f"{self.where}, {name}", text) if text else otherwise
+
+    def positive(self, name: str, at: int, otherwise: float) -> float:
+        value = self.number(name, at) or otherwise
+        if value < 0.0:
+            raise UserError(f"{self.where}, {name}: {value:g}: must be above 0")
+        return value
 
     def numbers(self, kind: str) -> dict[str, float]:
         """Its fields by name; those that it leaves out have PSS/E's values."""
@@ -102,7 +108,7 @@ class _Case:
         if revision not in (31.0, 32.0, 33.0):
             raise UserError(f"{path}, line 1, REV: revision {revision:g}: must be 31, 32 or 33")
         self.path = path
-        self.S_b, self.f = head.number("SBASE", 1, 100.0), head.number("BASFRQ", 5, 60.0)
+        self.S_b, self.f = head.positive("SBASE", 1, 100.0), head.positive("BASFRQ", 5, 60.0)
         self.sections = self._divided(lines[3:])
         self.ignored: list[str] = []
         #: by number: type, P, Q of loads, G, B of shunts, MW and Mvar, VM, VA, kV
@@ -128,7 +134,8 @@ class _Case:
             p = record.numbers("bus")
             self.numbers.add(p["I"])
             if p["IDE"] != 4.0:  # isolated
-                values = [1.0, 0.0, 0.0, 0.0, 0.0, p["VM"], p["VA"], p["BASKV"] or 1.0]
+                kV = record.positive("BASKV", 2, 1.0)
+                values = [1.0, 0.0, 0.0, 0.0, 0.0, p["VM"], p["VA"], kV]
                 self.buses[int(p["I"])] = values
                 if p["IDE"] == 3.0:
                     values[0] = 3.0
@@ -251,7 +258,7 @@ class _Case:
             ]
             G, B = p["MAG1"], p["MAG2"]
             if p["CM"] == 2.0:  # W, and a current in p.u.
-                S = lines[1].number("SBASE1-2", 2, self.S_b)
+                S = lines[1].positive("SBASE1-2", 2, self.S_b)
                 G, B = G / 1e6 / self.S_b, -math.sqrt(max((B * S / self.S_b) ** 2 - G**2, 0.0))
             self._shunt(windings[0].bus, complex(G, B) * self.S_b)
             if not p["K"]:
@@ -319,18 +326,18 @@ class _Case:
     def _impedance(self, line: _Record, p: dict[str, float], at: int) -> complex:
         """That between two windings, p.u. of the case's power."""
         R, X = (line.number(name, at + j) for j, name in enumerate("RX"))
-        S = line.number("SBASE", at + 2, self.S_b)
+        S = line.positive("SBASE", at + 2, self.S_b)
         if p["CZ"] == 3.0:  # W, and the modulus
             R = R / 1e6 / S
             X = math.sqrt(max(X**2 - R**2, 0.0))
         return complex(R, X) * (1.0 if p["CZ"] == 1.0 else self.S_b / S)
 
     def _winding(self, line: _Record, k: int, unit: float) -> _Winding:
-        kV, tap = self.buses[k][7], line.number("WINDV", 0, 1.0)
+        kV, tap = self.buses[k][7], line.positive("WINDV", 0, 1.0)
         if unit == 2.0:
             tap /= kV
         elif unit == 3.0:
-            tap *= (line.number("NOMV", 1) or kV) / kV
+            tap *= line.positive("NOMV", 1, kV) / kV
         return _Winding(k, tap, line.number("ANG", 2))
 
     def _leg(self, a: _Winding, b: _Winding, Z: complex) -> None:

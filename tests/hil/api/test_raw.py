@@ -2,75 +2,17 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import gfmhil
 from gfm_hil.api.raw import read_raw
 from gfm_hil.cli import main
-from gfm_hil.core.errors import UserError
+
+from ...support.files import text_of
 
 pandapower = pytest.importorskip("pandapower")
 
-#: ANDES's kundur.raw, solved by PSS/E, with its parallel lines as one each
-KUNDUR = """\
-0,   100.00,  32, 0, 1, 60.00     / PSS(R)E 32
-MODIFIED KUNDUR'S TWO-AREA TEST SYSTEM, DISTRIBUTED WITH ANDES
-SEE THE BOOK "POWER SYSTEM STABILITY AND CONTROL" FOR ORIGINAL DATA
-     1,'1           ',  20.0000,3,   1,   1,   1,1.00000,  32.6732
-     2,'2           ',  20.0000,2,   1,   1,   1,1.00000,  21.6548
-     3,'12          ',  20.0000,2,   2,   1,   1,1.00000,  11.2148
-     4,'11          ',  20.0000,2,   2,   1,   1,1.00000,  21.6398
-     5,'101         ', 230.0000,1,   1,   1,   1,0.98337,  27.6488
-     6,'102         ', 230.0000,1,   1,   1,   1,0.96908,  16.8176
-     7,'3, of area 1', 230.0000,1,   1,   1,   1,0.95621,   8.1662
-     8,'13 / area 2 ', 230.0000,1,   2,   1,   1,0.95400,  -2.1295
-     9,'112         ', 230.0000,1,   2,   1,   1,0.96856,   6.3774
-    10,'111         ', 230.0000,1,   2,   1,   1,0.98377,  16.8036
-    11,'OUT         ', 230.0000,4,   2,   1,   1,1.00000,   0.0000
- 0 /End of Bus data, Begin Load data
-     7,'2 ',1,   1,   1,  1159.000,   -73.500,     0.000,     0.000,     0.000,     0.000,   1,1
-     8,'1 ',1,   1,   1,  1575.000,   -89.900,     0.000,     0.000,     0.000,     0.000,   1,1
-     8,'2 ',0,   1,   1,   100.000,     0.000,     0.000,     0.000,     0.000,     0.000,   1,1
- 0 /End of Load data, Begin Fixed shunt data
- 0 /End of Fixed shunt data, Begin Generator data
-     1,'1 ',   745.861,   143.612,   600.000,     0.000,1.00000,     0,   900.000, 0.0, 2.5E-1, 0.0, 0.0,1.0,1
-     2,'1 ',   400.000,   300.000,   600.000,  -600.000,1.00000,     0,   500.000, 0.0, 2.5E-1, 0.0, 0.0,1.0,1
-     2,'2 ',   300.000,   300.000,   600.000,  -600.000,1.00000,     0,   400.000, 0.0, 2.5E-1, 0.0, 0.0,1.0,1
-     3,'1 ',   700.000,   550.000,   600.000,  -600.000,1.00000,     0,   900.000, 0.0, 2.5E-1, 0.0, 0.0,1.0,1
-     4,'1 ',   700.000,  -100.000,   600.000,  -600.000,1.00000,     0,   900.000, 0.0, 2.5E-1, 0.0, 0.0,1.0,1
- 0 /End of Generator data, Begin Branch data
-     5,     6,'1 ', 5.00000E-3, 5.00000E-2,   0.07500
-     5,     6,'2 ', 5.01000E-3, 5.00100E-2,   0.07500
-     6,     7,'1 ', 2.00000E-3, 2.00000E-2,   0.03000
-     6,    -7,'2 ', 2.01000E-3, 2.00100E-2,   0.03000
-     7,     8,'1 ', 2.20100E-2, 2.20010E-1,   0.33000
-     7,     8,'2 ', 2.20200E-2, 2.20020E-1,   0.33000
-     7,     8,'3 ', 2.20000E-2, 2.20000E-1,   0.33000
-     8,     9,'1 ', 2.00000E-3, 2.00000E-2,   0.03000
-     8,     9,'2 ', 2.01000E-3, 2.00100E-2,   0.03000
-     9,    10,'1 ', 5.00000E-3, 5.00000E-2,   0.07500
-     9,    10,'2 ', 5.01000E-3, 5.00100E-2,   0.07500
- 0 /End of Branch data, Begin Transformer data
-     1,     5,     0,'1 ',1,1,1, 0.00000E+0, 0.00000E+0,2,'            ',1
- 1.00000E-3, 1.20000E-2,   100.00
-1.00000,   0.000,   0.000
-1.00000,   0.000
-     2,     6,     0,'1 ',2,2,1, 0.00000E+0, 0.00000E+0,2,'            ',1
- 9.00000E-3, 1.08000E-1,   900.00
-20.0000,   0.000,   0.000
-230.000,   0.000
-     3,     9,     0,'1 ',3,1,1, 0.00000E+0, 0.00000E+0,2,'            ',1
- 1.00000E-3, 1.20000E-2,   100.00
-1.00000,  20.000,   0.000
-1.00000, 230.000
-     4,    10,     0,'1 ',1,1,1, 0.00000E+0, 0.00000E+0,2,'            ',1
- 1.00000E-3, 1.20000E-2,   100.00
-1.00000,   0.000,   0.000
-1.00000,   0.000
- 0 /End of Transformer data
-Q
-"""  # noqa: E501
+#: ANDES's, solved by PSS/E, with its parallel lines as one each
+KUNDUR = text_of("kundur.raw")
 
 
 def test_a_published_case_has_the_voltages_of_its_file(tmp_path):
@@ -140,19 +82,3 @@ def test_a_file_that_is_none_is_one_line(old, new, line, tmp_path, capsys):
     said = capsys.readouterr().err
     assert (code == 2) == bool(line)
     assert line in said and (not line or (str(file) in said and said.count("\n") == 1))
-
-
-WORDS = st.sampled_from(
-    ["0", "Q", "1", "-1", "'a'", "1e9", "x", "/", "'", "\n", "\n", ",", "", "0\n", "1,2,3\n"]
-)
-
-
-@settings(max_examples=60)
-@given(text=st.one_of(st.text(), st.lists(WORDS, max_size=80).map(",".join)))
-def test_any_text_is_a_case_or_a_user_error(tmp_path_factory, text):
-    path = tmp_path_factory.getbasetemp() / "any.raw"
-    path.write_text("0,100,33\n\n\n1,'a',1,3\n" + text)
-    try:
-        read_raw(path)
-    except UserError as problem:
-        assert str(path) in str(problem) and "\n" not in str(problem)

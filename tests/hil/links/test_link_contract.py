@@ -100,10 +100,12 @@ WAYS: dict[str, tuple[str, dict[str, Any], Callable[[], str] | None]] = {
     "impaired": ("shm", {}, None),
 }
 WHOLE = [way for way in WAYS if not way.startswith("can")]  # a CAN link quantises frames
+#: the others compile a link of their own, and are of the tier full
+FAST = [way for way in WAYS if not way.startswith(("can", "serial", "impaired"))]
 Ends = dict[Role, Link]
 
 
-@pytest.fixture(params=WAYS)
+@pytest.fixture(params=slow_but(FAST, WAYS))
 def way(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -281,7 +283,7 @@ CONTENT = {
 
 
 @pytest.mark.parametrize("lossy", slow_but([True], [False, True]))
-@pytest.mark.parametrize("way", WHOLE, indirect=True)
+@pytest.mark.parametrize("way", slow_but(["shm"], WHOLE), indirect=True)
 def test_a_run_in_lockstep_has_the_bits_of_the_run_in_process(way, lossy, make, run, place):
     """Also if frames are lost or repeated: the plant asks for them again."""
     name, options, where = WAYS[way]
