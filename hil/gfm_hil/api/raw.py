@@ -80,7 +80,8 @@ def read_raw(path: str | Path) -> tuple[Any, list[str]]:
         UserError: the file cannot be read, is of another revision, or a record is none; the message
             has the file, the line and the field.
     """
-    return _Case(Path(path)).net()
+    case = Case(Path(path))
+    return case.net(), case.ignored
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -98,8 +99,9 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         yield k, fields
 
 
-class _Case:
-    """The tables of PYPOWER, being filled; p.u. of ``S_b`` in MVA."""
+class Case:
+    """The tables of a case, as those of PYPOWER; p.u. of ``S_b`` in MVA. Raises UserError: as
+    ``read_raw``."""
 
     def __init__(self, path: Path) -> None:
         lines = list(_lines(path))
@@ -116,6 +118,8 @@ class _Case:
         self.numbers: set[float] = set()  # of all buses, isolated ones too
         self.branches: list[list[float]] = []  # from, to, R, X, B, ratio, shift
         self.jumpers: list[tuple[int, int]] = []
+        self.generators: dict[int, tuple[float, float, float]] = {}
+        self._fill()
 
     def _divided(self, lines: list[tuple[int, list[str]]]) -> dict[str, list[_Record]]:
         sections = {name: list[_Record]() for name in _SECTIONS}
@@ -129,7 +133,7 @@ class _Case:
                 sections[name].append(_Record(f"{self.path}, line {k}, {name}", fields))
         return sections
 
-    def net(self) -> tuple[Any, list[str]]:
+    def _fill(self) -> None:
         for record in self.sections["bus"]:
             p = record.numbers("bus")
             self.numbers.add(p["I"])
@@ -141,7 +145,7 @@ class _Case:
                     values[0] = 3.0
         self._loads()
         self._shunts()
-        generators = self._generators()
+        self._generators()
         self._lines()
         self._transformers()
         self._series_capacitors()
@@ -149,9 +153,8 @@ class _Case:
         for kind, each in _LEFT_OUT.items():
             if count := len(self.sections[kind]) // each:
                 self.ignored.append(f"{count} {kind}{'s' * (count > 1)}: left out.")
-        return self._made(generators), self.ignored
 
-    def _made(self, generators: dict[int, tuple[float, float, float]]) -> Any:
+    def net(self) -> Any:
         """The net of pandapower."""
         import pandapower as pp
 
@@ -164,8 +167,8 @@ class _Case:
                 pp.create_load(net, k, P, Q)
             if G or B:
                 pp.create_shunt(net, k, -B, G)
-            if k in generators:
-                P, S, by_X = generators[k]
+            if k in self.generators:
+                P, S, by_X = self.generators[k]
                 if type == 3.0:
                     pp.create_ext_grid(net, k, V)
                 else:
@@ -216,16 +219,14 @@ class _Case:
         self.buses[k][3] += Y.real
         self.buses[k][4] += Y.imag
 
-    def _generators(self) -> dict[int, tuple[float, float, float]]:
+    def _generators(self) -> None:
         """P, MBASE, and MBASE by ZSOURCE of all generators of each bus, which holds its voltage."""
-        sums: dict[int, tuple[float, float, float]] = {}
         for _, p in self._working("generator"):
             k, S = int(p["I"]), p["MBASE"] or self.S_b
-            before = sums.get(k, (0.0, 0.0, 0.0))
+            before = self.generators.get(k, (0.0, 0.0, 0.0))
             by_X = S / p["ZX"] if p["ZX"] else math.inf
-            sums[k] = (before[0] + p["PG"], before[1] + S, before[2] + by_X)
+            self.generators[k] = (before[0] + p["PG"], before[1] + S, before[2] + by_X)
             self.buses[k][0] = max(self.buses[k][0], 2.0)
-        return sums
 
     def _lines(self) -> None:
         for _, p in self._working("branch"):
