@@ -15,7 +15,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from gfm_design.norms.performance import read_weights
-from gfm_hil.api.raw import Case
+from gfm_hil.api.raw import RawCase
 from gfm_hil.cli import main
 from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
@@ -398,6 +398,6 @@ FILES = (
         lambda: texts([RESULTS]),
     ),
     Parser("run_folder", _run_folder, _run_files),
-    Parser("raw", reading("case.raw", Case, UserError), lambda: texts([text_of("kundur.raw")])),
+    Parser("raw", reading("case.raw", RawCase, UserError), lambda: texts([text_of("kundur.raw")])),
     Parser("segment", _segment, _segments),
 )

@@ -32,7 +32,7 @@ class Machines(NamedTuple):
     file: str = ""  #: its path
 
 
-class _Record(NamedTuple):
+class _DyrRecord(NamedTuple):
     where: str  # file, line, model and bus
     content: dict[str, Any]
 
@@ -45,7 +45,7 @@ def read_machines(path: str | Path) -> Machines:
         UserError: the file cannot be read, has no machine, a record is none, or has a value that
             its part refuses; the message has the file, the line, the bus and the field.
     """
-    buses: dict[str, dict[str, _Record]] = {}
+    buses: dict[str, dict[str, _DyrRecord]] = {}
     ignored: list[str] = []
     for line, fields in records(path):
         where = f"{path}, line {line}"
@@ -71,7 +71,7 @@ def read_machines(path: str | Path) -> Machines:
         content, notes = make(numbers)
         ignored += [f"{model} at bus {bus}: {note}." for note in notes]
         if content:
-            buses[bus][role] = _Record(f"{where}: {model} at bus {bus}", content)
+            buses[bus][role] = _DyrRecord(f"{where}: {model} at bus {bus}", content)
     tables: dict[str, dict[str, dict[str, Any]]] = {}
     for bus, parts in buses.items():
         for table, content in _parts(bus, parts, ignored):
@@ -82,7 +82,7 @@ def read_machines(path: str | Path) -> Machines:
 
 
 def _parts(
-    bus: str, records: Mapping[str, _Record], ignored: list[str]
+    bus: str, records: Mapping[str, _DyrRecord], ignored: list[str]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """The table and the keys of each part that the records at a bus are; notes go to ``ignored``.
     Raises UserError: a value that its part refuses."""
@@ -118,7 +118,7 @@ def _parts(
 
 
 def _check(
-    table: str, content: dict[str, Any], own: _Record, controls: Mapping[str, _Record]
+    table: str, content: dict[str, Any], own: _DyrRecord, controls: Mapping[str, _DyrRecord]
 ) -> None:
     """Raise UserError with the record from which a value comes that a part refuses."""
     kind = COMPONENTS[table]

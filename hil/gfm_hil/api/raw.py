@@ -80,7 +80,7 @@ def read_raw(path: str | Path) -> tuple[Any, list[str]]:
         UserError: the file cannot be read, is of another revision, or a record is none; the message
             has the file, the line and the field.
     """
-    case = Case(Path(path))
+    case = RawCase(Path(path))
     return case.net(), case.ignored
 
 
@@ -99,7 +99,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         yield k, fields
 
 
-class Case:
+class RawCase:
     """The tables of a case, as those of PYPOWER; p.u. of ``S_b`` in MVA. Raises UserError: as
     ``read_raw``."""
 
