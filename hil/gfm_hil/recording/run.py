@@ -337,8 +337,10 @@ def bases(scenario: Scenario) -> Bases:
 
 
 def nominal_frequency(scenario: Scenario) -> float:
-    """Nominal frequency of the scenario's converter, Hz; raises as ``bases``."""
-    return bases(scenario).omega_b / (2 * math.pi)
+    """Nominal frequency of the scenario's converter, Hz, which all of a network have; raises as
+    ``bases``."""
+    one = next(iter(scenario.each.values()), scenario)
+    return bases(one).omega_b / (2 * math.pi)
 
 
 def _written_by_another(folder: Path) -> str:

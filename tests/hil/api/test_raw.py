@@ -6,6 +6,8 @@ import pytest
 import gfmhil
 from gfm_hil.api.raw import read_raw
 from gfm_hil.cli import main
+from gfm_hil.recording.run import nominal_frequency
+from gfm_hil.scenario import load_scenario
 
 from ...support.files import text_of
 
@@ -25,7 +27,9 @@ def test_a_published_case_has_the_voltages_of_its_file(tmp_path):
     own = np.array([case.voltages[f"bus{int(f[0])}"] for f in lines])
     turn = np.exp(1j * np.angle(np.vdot(own, exact)))
     assert np.abs(own * turn - exact).max() < 5e-5
-    assert case.distance(case.save(tmp_path / "net")) < 1e-8
+    network = case.save(tmp_path / "net")
+    assert case.distance(network) < 1e-8
+    assert nominal_frequency(load_scenario(network)) == pytest.approx(60.0)
     assert case.converters["converter2.toml"]["S_n"] == 900e6 and "bus11" not in case.voltages
     assert case.ignored == []
 
