@@ -152,7 +152,7 @@ def test_a_module_of_ours_ends_as_a_program(how, code, last, anew, tmp_path, mon
         program = start(module("gfm_ends", how, STUBBORN), output.fileno())
     assert isinstance(program, Copy) is not anew
     assert program.wait() == program.poll() == program.returncode == code
-    program.send_signal(signal.SIGKILL)  # in vain: it has ended
+    program.send_signal(signal.SIGKILL)  # has no effect: the program has ended
     said = log.read_text().split("\n")
     assert said[0] == "begins" and said[-2].startswith(last)
     assert gone([int(line.split()[1]) for line in said if line.startswith(("program", "forked"))])
