@@ -3,7 +3,9 @@ its turbine, or a stabiliser."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
+
+from pydantic import model_validator
 
 from gfm_plant.parameters import Options
 
@@ -45,6 +47,23 @@ class Control(Options):
     #: its states in their order: name, unit, meaning
     states: ClassVar[Sequence[tuple[str, str, str]]]
     rates: ClassVar[Callable[..., float]]
+    #: options between which something stays, named by these with min and max behind them
+    ranges: ClassVar[Sequence[str]] = ()
+    #: leads that need a lag, with it: their names
+    leads: ClassVar[Sequence[tuple[str, str]]] = ()
+
+    @model_validator(mode="after")
+    def _is_proper(self) -> Self:
+        for name in self.ranges:
+            least, most = getattr(self, f"{name}min"), getattr(self, f"{name}max")
+            if not least < most:
+                raise ValueError(f"{name}min = {least:g}: must be less than {name}max, {most:g}")
+        for lead, lag in self.leads:
+            if getattr(self, lag) == 0.0 and getattr(self, lead) > 0.0:
+                raise ValueError(
+                    f"{lag} = 0: must be above 0 with {lead} = {getattr(self, lead):g}"
+                )
+        return self
 
     @classmethod
     def kind(cls) -> str:

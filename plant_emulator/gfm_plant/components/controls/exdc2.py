@@ -10,9 +10,9 @@ with the saturation S of IEEET1.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Terminals
 from gfm_plant.components.controls.ieeet1 import Ieeet1
@@ -47,16 +47,11 @@ class Exdc2(Ieeet1):
 
     states: ClassVar = (*Ieeet1.states, ("y", "p.u.", "of its lead and lag"))
     rates: ClassVar = _rates
+    leads: ClassVar = (("T_C", "T_B"),)
 
     type: Literal["EXDC2"] = Field("EXDC2", description="which exciter")  # type: ignore[assignment]
     T_B: NonNegative = Field(0.0, description="lag before the regulator, s; 0: neither it nor T_C")
     T_C: NonNegative = Field(0.0, description="lead before the regulator, s")
-
-    @model_validator(mode="after")
-    def _is_proper(self) -> Self:
-        if self.T_B == 0.0 and self.T_C > 0.0:
-            raise ValueError(f"T_B = 0: must be above 0 with T_C = {self.T_C:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         return *super().numbers(), self.T_B, self.T_C, self.V_Rmin, self.V_Rmax

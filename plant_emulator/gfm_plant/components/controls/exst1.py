@@ -9,9 +9,9 @@ with the voltage V of the terminals and the current I_fd of the field, which loa
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Exciter, Terminals
 from gfm_plant.parameters import NonNegative, Positive
@@ -49,6 +49,8 @@ class Exst1(Exciter):
         ("x", "p.u.", "of the stabilising feedback"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = "V_I", "V_R"
+    leads: ClassVar = (("T_C", "T_B"),)
 
     type: Literal["EXST1"] = Field("EXST1", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
@@ -63,16 +65,6 @@ class Exst1(Exciter):
     K_C: NonNegative = Field(0.0, description="by how much the field's current lowers both")
     K_F: NonNegative = Field(0.01, description="gain of the stabilising feedback, s")
     T_F: Positive = Field(1.0, description="time constant of the stabilising feedback, s")
-
-    @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.V_Imin < self.V_Imax:
-            raise ValueError(f"V_Imin = {self.V_Imin:g}: must be less than V_Imax, {self.V_Imax:g}")
-        if not self.V_Rmin < self.V_Rmax:
-            raise ValueError(f"V_Rmin = {self.V_Rmin:g}: must be less than V_Rmax, {self.V_Rmax:g}")
-        if self.T_B == 0.0 and self.T_C > 0.0:
-            raise ValueError(f"T_B = 0: must be above 0 with T_C = {self.T_C:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         names = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_C",

@@ -9,9 +9,9 @@ head. Its permanent droop is R, the temporary one r.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Governor
 from gfm_plant.parameters import NonNegative, Positive
@@ -45,6 +45,7 @@ class Hygov(Governor):
         ("q", "p.u.", "flow of the water"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = ("G_",)
 
     type: Literal["HYGOV"] = Field("HYGOV", description="which governor")
     R: Positive = Field(0.05, description="permanent droop, frequency by gate, p.u./p.u.")
@@ -59,12 +60,6 @@ class Hygov(Governor):
     A_t: Positive = Field(1.2, description="gain of the turbine")
     D_turb: NonNegative = Field(0.5, description="damping of the turbine, p.u./p.u.")
     q_NL: NonNegative = Field(0.08, description="flow without load, p.u.")
-
-    @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.G_min < self.G_max:
-            raise ValueError(f"G_min = {self.G_min:g}: must be less than G_max, {self.G_max:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         names = ("R", "r", "T_r", "T_f", "T_g", "VELM", "T_W", "A_t", "D_turb", "q_NL")

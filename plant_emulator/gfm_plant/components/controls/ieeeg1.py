@@ -50,6 +50,8 @@ class Ieeeg1(Governor):
         ("x_4 … x_7", "p.u.", "power behind chest, reheater and crossovers"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = ("P_",)
+    leads: ClassVar = (("T2", "T1"),)
 
     type: Literal["IEEEG1"] = Field("IEEEG1", description="which governor")
     K: Positive = Field(20.0, description="gain, power by speed, p.u./p.u.")
@@ -71,10 +73,6 @@ class Ieeeg1(Governor):
 
     @model_validator(mode="after")
     def _turns(self) -> Self:
-        if not self.P_min < self.P_max:
-            raise ValueError(f"P_min = {self.P_min:g}: must be less than P_max, {self.P_max:g}")
-        if self.T1 == 0.0 and self.T2 > 0.0:
-            raise ValueError(f"T1 = 0: must be above 0 with T2 = {self.T2:g}")
         if not self.gain() > 0.0:
             raise ValueError("K1, K3, K5 and K7 are 0: it would bring no power")
         return self

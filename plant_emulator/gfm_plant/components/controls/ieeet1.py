@@ -45,6 +45,7 @@ class Ieeet1(Exciter):
         ("x", "p.u.", "of the stabilising feedback"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = ("V_R",)
 
     type: Literal["IEEET1"] = Field("IEEET1", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
@@ -62,9 +63,7 @@ class Ieeet1(Exciter):
     S_E2: NonNegative = Field(0.0, description="saturation S_E there; 0: none at all")
 
     @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.V_Rmin < self.V_Rmax:
-            raise ValueError(f"V_Rmin = {self.V_Rmin:g}: must be less than V_Rmax, {self.V_Rmax:g}")
+    def _saturates(self) -> Self:
         if self.S_E2 == 0.0 and self.S_E1 > 0.0:
             raise ValueError(f"S_E1 = {self.S_E1:g}: S_E2 must be above 0, too")
         if self.S_E2 > 0.0 and not self.E_1 < self.E_2:

@@ -5,9 +5,9 @@ V_s = K_S  1/(1 + s T6)  s T5/(1 + s T5)  1/(1 + A1 s + A2 s^2)
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Stabiliser
 from gfm_plant.parameters import NonNegative, Positive
@@ -49,6 +49,7 @@ class Pss1a(Stabiliser):
         ("x_2, x_4", "p.u.", "of both leads and lags"),
     )
     rates: ClassVar = _rates
+    leads: ClassVar = ("T1", "T2"), ("T3", "T4"), ("A2", "A1")
 
     type: Literal["PSS1A"] = Field("PSS1A", description="which stabiliser")
     K_S: NonNegative = Field(20.0, description="gain, voltage by speed, p.u./p.u.")
@@ -62,17 +63,6 @@ class Pss1a(Stabiliser):
     A2: NonNegative = Field(0.0, description="of the filter, s^2")
     V_STmax: float = Field(0.2, ge=0.0, le=100.0, description="largest output, p.u.")
     V_STmin: float = Field(-0.2, ge=-100.0, le=0.0, description="least output, p.u.")
-
-    @model_validator(mode="after")
-    def _are_proper(self) -> Self:
-        for lead, lag in (("T1", "T2"), ("T3", "T4")):
-            if getattr(self, lag) == 0.0 and getattr(self, lead) > 0.0:
-                raise ValueError(
-                    f"{lag} = 0: must be above 0 with {lead} = {getattr(self, lead):g}"
-                )
-        if self.A1 == 0.0 and self.A2 > 0.0:
-            raise ValueError(f"A1 = 0: must be above 0 with A2 = {self.A2:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         first = self.K_S, self.T5, self.T6, self.A1, self.A2

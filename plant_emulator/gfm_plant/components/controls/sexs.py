@@ -5,9 +5,9 @@ T_E dE_fd/dt = K (x + (V_set - V_m - x) T_A / T_B) - E_fd,    E_min <= E_fd <= E
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Exciter, Terminals
 from gfm_plant.parameters import NonNegative, Positive
@@ -35,6 +35,7 @@ class Sexs(Exciter):
         ("E_fd", "p.u.", "excitation"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = ("E_",)
 
     type: Literal["SEXS"] = Field("SEXS", description="which exciter")
     K: Positive = Field(200.0, description="gain, p.u. of excitation by p.u. of voltage")
@@ -44,12 +45,6 @@ class Sexs(Exciter):
     T_E: Positive = Field(0.05, description="lag of the exciter, s")
     E_min: float = Field(0.0, ge=-100.0, le=100.0, description="least excitation E_fd, p.u.")
     E_max: float = Field(5.0, ge=-100.0, le=100.0, description="largest excitation E_fd, p.u.")
-
-    @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.E_min < self.E_max:
-            raise ValueError(f"E_min = {self.E_min:g}: must be less than E_max, {self.E_max:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         return self.K, self.T_R, self.T_A, self.T_B, self.T_E

@@ -8,15 +8,13 @@ It is not cut off outside V_CU and V_CL.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Stabiliser
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
-
-_LEADS = (("T5", "T6"), ("T7", "T8"), ("T9", "T10"))
 
 
 @compiled
@@ -50,6 +48,7 @@ class St2cut(Stabiliser):
         ("x_6, x_8, x_10", "p.u.", "of the three leads and lags"),
     )
     rates: ClassVar = _rates
+    leads: ClassVar = ("T5", "T6"), ("T7", "T8"), ("T9", "T10")
 
     type: Literal["ST2CUT"] = Field("ST2CUT", description="which stabiliser")
     K1: float = Field(10.0, ge=-1e4, le=1e4, description="first gain, voltage by speed, p.u./p.u.")
@@ -66,15 +65,6 @@ class St2cut(Stabiliser):
     T10: NonNegative = Field(0.05, description="third lag, s; 0: T9 must be 0, too")
     L_Smax: float = Field(0.05, ge=0.0, le=100.0, description="largest output, p.u.")
     L_Smin: float = Field(-0.05, ge=-100.0, le=0.0, description="least output, p.u.")
-
-    @model_validator(mode="after")
-    def _are_proper(self) -> Self:
-        for lead, lag in _LEADS:
-            if getattr(self, lag) == 0.0 and getattr(self, lead) > 0.0:
-                raise ValueError(
-                    f"{lag} = 0: must be above 0 with {lead} = {getattr(self, lead):g}"
-                )
-        return self
 
     def numbers(self) -> Sequence[float]:
         times = [getattr(self, f"T{k}") for k in range(1, 11)]

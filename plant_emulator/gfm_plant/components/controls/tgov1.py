@@ -8,9 +8,9 @@ not pass the reheater. P_ref is in p.u. of power, that of PSS/E times R.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Governor
 from gfm_plant.parameters import NonNegative, Positive
@@ -34,6 +34,7 @@ class Tgov1(Governor):
         ("x_2", "p.u.", "power behind the reheater"),
     )
     rates: ClassVar = _rates
+    ranges: ClassVar = ("V_",)
 
     type: Literal["TGOV1"] = Field("TGOV1", description="which governor")
     R: Positive = Field(0.05, description="droop, frequency by power, p.u./p.u.")
@@ -43,12 +44,6 @@ class Tgov1(Governor):
     T2: NonNegative = Field(3.0, description="lead of the turbine, s")
     T3: Positive = Field(10.0, description="lag of the turbine, s: its reheater")
     D_t: NonNegative = Field(0.0, description="damping of the turbine by frequency, p.u./p.u.")
-
-    @model_validator(mode="after")
-    def _has_room(self) -> Self:
-        if not self.V_min < self.V_max:
-            raise ValueError(f"V_min = {self.V_min:g}: must be less than V_max, {self.V_max:g}")
-        return self
 
     def numbers(self) -> Sequence[float]:
         return self.R, self.T1, self.T2, self.T3, self.D_t
