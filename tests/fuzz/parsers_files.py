@@ -15,6 +15,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from gfm_design.norms.performance import read_weights
+from gfm_hil.api.mpc import MpcCase
 from gfm_hil.api.raw import RawCase
 from gfm_hil.cli import main
 from gfm_hil.core import temporary as scratch
@@ -398,6 +399,7 @@ FILES = (
         lambda: texts([RESULTS]),
     ),
     Parser("run_folder", _run_folder, _run_files),
+    Parser("mpc", reading("case.m", MpcCase, UserError), lambda: texts([text_of("case9.m")])),
     Parser("raw", reading("case.raw", RawCase, UserError), lambda: texts([text_of("kundur.raw")])),
     Parser("segment", _segment, _segments),
 )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from gfm_hil.api.law import Law
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import read_file
+from gfm_hil.core.files import lines_of
 from gfm_hil.scenario import toml_text
 from gfm_runtime import LawError
 
@@ -99,12 +99,8 @@ def read_dyr(path: str | Path) -> list[Record]:
 def records(path: str | Path) -> Iterator[tuple[int, list[str]]]:
     """The line at which each record of a file begins, and its fields. Raises UserError: it cannot
     be read, or its last record does not end."""
-    try:
-        text = read_file(Path(path)).decode("utf-8", "replace")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
     begin, fields = 0, list[str]()
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(lines_of(path), 1):
         for quoted, bare, end in _TOKEN.findall(line.split("//")[0]):
             if end:
                 if fields:

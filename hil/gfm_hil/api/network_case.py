@@ -123,7 +123,7 @@ def network_from(
 
     Args:
         case: a net of pandapower, the name of one of its cases (case9, case39, ...), or the path
-            of a net as JSON.
+            of a net as JSON, of a case of PSS/E (.raw) or of MATPOWER (.m).
         converters: by the name of a bus with generators, the law of the converter there, and, if
             it does not take all, its share, in (0, 1]; the rating of the first one, in the order
             of the case's buses, is the network's base.

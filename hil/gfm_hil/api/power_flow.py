@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.api.mpc import read_mpc
 from gfm_hil.api.raw import read_raw
 from gfm_hil.core.errors import UserError, need
 from gfm_runtime.errors import meant
 
 _MOST_BUSES = 500  # the matrices of a network are dense
 _NEAR = 1e-6  # p.u.; a smaller current comes from rounding
+_READERS = {".raw": read_raw, ".m": read_mpc}
 _IGNORED = {
     "controller": "they stand where the power flow leaves them",
     "motor": "impedances, as loads are",
@@ -72,8 +74,8 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     ignored: list[str] = []
     if isinstance(case, str | Path):
         title = title or Path(case).stem
-        if str(case).lower().endswith(".raw"):
-            case, ignored = read_raw(case)
+        if (read := _READERS.get(Path(case).suffix.lower())) is not None:
+            case, ignored = read(case)
         else:
             case = _load_pandapower(str(case))
     title = title or str(case.name or "case")
@@ -201,7 +203,7 @@ def _load_pandapower(case: str) -> Any:
     if case not in known:
         raise UserError(
             f"{case!r}: must be one of {', '.join(known)}, or the path of a net of pandapower"
-            f" (.json) or of PSS/E (.raw){meant(case, known)}"
+            f" (.json), PSS/E (.raw) or MATPOWER (.m){meant(case, known)}"
         )
     return getattr(shipped, case)()
 

@@ -7,14 +7,14 @@ the voltages at which the file's own power flow holds them.
 
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gfm_hil.api.case_tables import CaseTables, Winding
 from gfm_hil.api.dyr import number
 from gfm_hil.core.errors import UserError
-from gfm_hil.core.files import read_file
+from gfm_hil.core.files import lines_of
 
 _SECTIONS = (
     "bus", "load", "fixed shunt", "generator", "branch", "transformer", "area",
@@ -67,12 +67,6 @@ class _Record(NamedTuple):
         }
 
 
-class _Winding(NamedTuple):
-    bus: int
-    tap: float  # p.u. of the voltage of its bus
-    degrees: float
-
-
 def read_raw(path: str | Path) -> tuple[Any, list[str]]:
     """The net of a case, whose buses are called by their numbers, and what it leaves out.
 
@@ -86,11 +80,7 @@ def read_raw(path: str | Path) -> tuple[Any, list[str]]:
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The number of each line and its fields, without its comment."""
-    try:
-        text = read_file(path).decode("utf-8", "replace")
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    for k, line in enumerate(text.splitlines(), 1):
+    for k, line in enumerate(lines_of(path), 1):
         fields = []
         for one, end in re.findall(r"\s*('[^']*'|[^,/']*)\s*(,|/|$)", line):
             fields.append(one.strip("' "))
@@ -99,9 +89,8 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         yield k, fields
 
 
-class RawCase:
-    """The tables of a case, as those of PYPOWER; p.u. of ``S_b`` in MVA. Raises UserError: as
-    ``read_raw``."""
+class RawCase(CaseTables):
+    """A case of PSS/E. Raises UserError: as ``read_raw``."""
 
     def __init__(self, path: Path) -> None:
         lines = list(_lines(path))
@@ -109,16 +98,10 @@ class RawCase:
         revision = head.number("REV", 2)
         if revision not in (31.0, 32.0, 33.0):
             raise UserError(f"{path}, line 1, REV: revision {revision:g}: must be 31, 32 or 33")
+        super().__init__(head.positive("SBASE", 1, 100.0), head.positive("BASFRQ", 5, 60.0))
         self.path = path
-        self.S_b, self.f = head.positive("SBASE", 1, 100.0), head.positive("BASFRQ", 5, 60.0)
         self.sections = self._divided(lines[3:])
-        self.ignored: list[str] = []
-        #: by number: type, P, Q of loads, G, B of shunts, MW and Mvar, VM, VA, kV
-        self.buses: dict[int, list[float]] = {}
         self.numbers: set[float] = set()  # of all buses, isolated ones too
-        self.branches: list[list[float]] = []  # from, to, R, X, B, ratio, shift
-        self.jumpers: list[tuple[int, int]] = []
-        self.generators: dict[int, tuple[float, float, float]] = {}
         self._fill()
 
     def _divided(self, lines: list[tuple[int, list[str]]]) -> dict[str, list[_Record]]:
@@ -148,44 +131,11 @@ class RawCase:
         self._generators()
         self._lines()
         self._transformers()
-        self._series_capacitors()
-        self._dead_ends()
+        self.join_series_capacitors()
+        self.cut_dead_ends()
         for kind, each in _LEFT_OUT.items():
             if count := len(self.sections[kind]) // each:
                 self.ignored.append(f"{count} {kind}{'s' * (count > 1)}: left out.")
-
-    def net(self) -> Any:
-        """The net of pandapower."""
-        import pandapower as pp
-
-        net = pp.create_empty_network(f_hz=self.f, sn_mva=self.S_b)
-        for k, (type, P, Q, G, B, V, _, kV) in self.buses.items():
-            pp.create_bus(net, kV, index=k, name=str(k))
-            if P < 0.0:
-                pp.create_sgen(net, k, -P, -Q)
-            elif P or Q:
-                pp.create_load(net, k, P, Q)
-            if G or B:
-                pp.create_shunt(net, k, -B, G)
-            if k in self.generators:
-                P, S, by_X = self.generators[k]
-                if type == 3.0:
-                    pp.create_ext_grid(net, k, V)
-                else:
-                    pp.create_gen(net, k, P, V)
-                table = net.ext_grid if type == 3.0 else net.gen
-                table.loc[table.index[-1], ["sn_mva", "xdss_pu"]] = S, S / by_X or math.nan
-        for a, b, R, X, B, ratio, degrees in self.branches:
-            if ratio:
-                pp.create_transformer_from_parameters(
-                    net, a, b, self.S_b, self.buses[int(a)][7] * ratio, self.buses[int(b)][7],
-                    100.0 * R, math.copysign(100.0 * abs(complex(R, X)), X), 0.0, 0.0, degrees,
-                )  # fmt: skip
-            else:
-                pp.create_impedance(net, a, b, R, X, self.S_b, bf_pu=B / 2, bt_pu=B / 2)
-        for a, b in self.jumpers:
-            pp.create_switch(net, a, b, et="b")
-        return net
 
     def _working(self, kind: str) -> Iterator[tuple[_Record, dict[str, float]]]:
         """The records of a kind that are in service, as is their bus."""
@@ -213,11 +163,7 @@ class RawCase:
     def _shunts(self) -> None:
         for kind in ("fixed shunt", "switched shunt"):
             for _, p in self._working(kind):
-                self._shunt(int(p["I"]), complex(p.get("GL", 0.0), p["BL"]))
-
-    def _shunt(self, k: int, Y: complex) -> None:
-        self.buses[k][3] += Y.real
-        self.buses[k][4] += Y.imag
+                self.shunt(int(p["I"]), complex(p.get("GL", 0.0), p["BL"]))
 
     def _generators(self) -> None:
         """P, MBASE, and MBASE by ZSOURCE of all generators of each bus, which holds its voltage."""
@@ -237,7 +183,7 @@ class RawCase:
             for k, end in ((a, "I"), (b, "J")):
                 if p[f"G{end}"] < 0.0:
                     self.ignored.append(f"G{end} = {p[f'G{end}']:g} of line {a}-{b} is left out.")
-                self._shunt(k, complex(max(p[f"G{end}"], 0.0), p[f"B{end}"]) * self.S_b)
+                self.shunt(k, complex(max(p[f"G{end}"], 0.0), p[f"B{end}"]) * self.S_b)
             self.branches.append([a, b, p["R"], p["X"], p["B"], 0.0, 0.0])
 
     def _transformers(self) -> None:
@@ -261,9 +207,9 @@ class RawCase:
             if p["CM"] == 2.0:  # W, and a current in p.u.
                 S = lines[1].positive("SBASE1-2", 2, self.S_b)
                 G, B = G / 1e6 / self.S_b, -math.sqrt(max((B * S / self.S_b) ** 2 - G**2, 0.0))
-            self._shunt(windings[0].bus, complex(G, B) * self.S_b)
+            self.shunt(windings[0].bus, complex(G, B) * self.S_b)
             if not p["K"]:
-                self._leg(windings[0], windings[1], pairs[0])
+                self.leg(windings[0], windings[1], pairs[0])
                 continue
             Z12, Z23, Z31 = pairs
             star = max(self.buses) + 1
@@ -274,55 +220,7 @@ class RawCase:
             out = {2.0: 1, 3.0: 2, 4.0: 0}.get(p["STATUS"])  # the winding that is open
             for j, (winding, Z) in enumerate(zip(windings, legs, strict=True)):
                 if j != out:
-                    self._leg(winding, _Winding(star, 1.0, 0.0), Z)
-
-    def _passes(self, k: int) -> bool:
-        """Whether nothing but branches and shunts is at a bus."""
-        return self.buses[k][:3] == [1.0, 0.0, 0.0] and not any(k in one for one in self.jumpers)
-
-    def _series_capacitors(self) -> None:
-        """Join each with the line behind it where nothing is between them, as a part of that line's
-        reactance; charging and shunts between them then are at the far end."""
-        count = 0
-        while joint := next(self._joints(), None):
-            capacitor, line, between = joint
-            far = int(capacitor[0] if capacitor[1] == between else capacitor[1])
-            line[0 if line[0] == between else 1] = far
-            for j in (2, 3, 4):
-                line[j] += capacitor[j]
-            self._shunt(far, complex(*self.buses.pop(between)[3:5]))
-            self.branches.remove(capacitor)
-            count += 1
-        if count:
-            self.ignored.append(f"{count} series capacitors: a part of their lines' reactance.")
-
-    def _joints(self) -> Iterator[tuple[list[float], list[float], int]]:
-        """A branch of negative reactance, the line behind it, and the bus between them."""
-        for one in self.branches:
-            if one[3] >= 0.0 or one[5]:
-                continue
-            for between in map(int, one[:2]):
-                there = [b for b in self.branches if b is not one and between in b[:2]]
-                loop = len(there) == 1 and {*there[0][:2]} == {*one[:2]}
-                if len(there) == 1 and not there[0][5] and not loop and self._passes(between):
-                    yield one, there[0], between
-
-    def _dead_ends(self) -> None:
-        """Take out the buses that end a branch without charging and have nothing."""
-        while True:
-            ends = Counter(int(k) for b in self.branches for k in b[:2])
-            dead = [
-                (k, b)
-                for b in self.branches
-                for k in map(int, b[:2])
-                if ends[k] == 1 and b[4] == 0.0 and self._passes(k) and not any(self.buses[k][3:5])
-            ]
-            if not dead:
-                break
-            k, branch = dead[0]
-            self.branches.remove(branch)
-            del self.buses[k]
-            self.ignored.append(f"bus {k}: nothing is there, and it is left out with its branch.")
+                    self.leg(winding, Winding(star, 1.0, 0.0), Z)
 
     def _impedance(self, line: _Record, p: dict[str, float], at: int) -> complex:
         """That between two windings, p.u. of the case's power."""
@@ -333,19 +231,10 @@ class RawCase:
             X = math.sqrt(max(X**2 - R**2, 0.0))
         return complex(R, X) * (1.0 if p["CZ"] == 1.0 else self.S_b / S)
 
-    def _winding(self, line: _Record, k: int, unit: float) -> _Winding:
+    def _winding(self, line: _Record, k: int, unit: float) -> Winding:
         kV, tap = self.buses[k][7], line.positive("WINDV", 0, 1.0)
         if unit == 2.0:
             tap /= kV
         elif unit == 3.0:
             tap *= line.positive("NOMV", 1, kV) / kV
-        return _Winding(k, tap, line.number("ANG", 2))
-
-    def _leg(self, a: _Winding, b: _Winding, Z: complex) -> None:
-        """A transformer of two windings; pandapower has its taps at the side of high voltage."""
-        if self.buses[a.bus][7] < self.buses[b.bus][7]:
-            a, b = b, a
-        Z *= b.tap**2
-        self.branches.append(
-            [a.bus, b.bus, Z.real, Z.imag, 0.0, a.tap / b.tap, a.degrees - b.degrees]
-        )
+        return Winding(k, tap, line.number("ANG", 2))

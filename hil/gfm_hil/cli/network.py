@@ -21,7 +21,7 @@ def add(command: argparse.ArgumentParser) -> None:
     read.add_argument(
         "case",
         help="a case of pandapower (case9, case39, case118, ...), its net as .json, or a file"
-        " of PSS/E (.raw)",
+        " of PSS/E (.raw) or MATPOWER (.m)",
     )
     read.add_argument(
         "--converter", action="append", default=[], metavar="BUS=LAW[:SHARE]",

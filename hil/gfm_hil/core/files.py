@@ -46,6 +46,15 @@ def read_file(path: Path, most: int = SMALL) -> bytes:
         return read_regular(path, most, links=False)
 
 
+def lines_of(path: str | Path) -> list[str]:
+    """The lines of a text of another program, whose bytes that are no UTF-8 are replaced. Raises
+    UserError: it is not there, or as ``open_file``."""
+    try:
+        return read_file(Path(path)).decode("utf-8", "replace").splitlines()
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+
+
 @contextlib.contextmanager
 def _refused(path: Path) -> Iterator[None]:
     try:
