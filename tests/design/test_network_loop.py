@@ -130,7 +130,13 @@ def with_controls(place: Path | None = None) -> Scenario:
 
 def with_static_exciter(place: Path | None = None) -> Scenario:
     machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "avr": {"type": "EXST1", "K_C": 0.1}}
-    machine |= {"pss": {"type": "ST2CUT", "T1": 0.02}}
+    machine |= {"pss": {"type": "ST2CUT", "T1": 0.02}, "governor": {"type": "GAST"}}
+    return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
+
+
+def with_gas_turbine(place: Path | None = None) -> Scenario:
+    machine = {"node": "far", "S": 1.5, "H": 2.0, "P": 0.4, "governor": {"type": "GGOV1"}}
+    machine |= {"avr": {"type": "ESST4B", "K_C": 0.2, "T_A": 0.0}}
     return island(**MACHINE | {"machines": {}, "synchronous_machines": {"M": machine}})
 
 
@@ -205,6 +211,7 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
         with_synchronous_machine,
         with_controls,
         with_static_exciter,
+        with_gas_turbine,
         with_salient_poles,
         with_following,
         with_motor,

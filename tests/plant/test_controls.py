@@ -11,10 +11,20 @@ from scipy.integrate import solve_ivp
 
 from gfm_plant.components import SynchronousMachine
 from gfm_plant.components.controls import EXCITERS, GOVERNORS, STABILISERS
-from gfm_plant.components.controls.control import Control, Exciter, Stabiliser, Terminals
+from gfm_plant.components.controls.control import (
+    Control,
+    Exciter,
+    Governor,
+    Shaft,
+    Stabiliser,
+    Terminals,
+)
 from gfm_plant.components.controls.esst3a import Esst3a
+from gfm_plant.components.controls.esst4b import Esst4b
 from gfm_plant.components.controls.exdc2 import Exdc2
 from gfm_plant.components.controls.exst1 import Exst1
+from gfm_plant.components.controls.gast import Gast
+from gfm_plant.components.controls.ggov1 import Ggov1
 from gfm_plant.components.controls.hygov import Hygov
 from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
@@ -37,7 +47,9 @@ def product(*blocks: tuple[list[float], list[float]]) -> Polynomials:
 
 def sees(one: Control, seen: float, output: float) -> Any:
     """What a control sees: of an exciter the voltage, its own output as the field's current, and
-    phasors."""
+    phasors; of a governor the speed, and an electric power."""
+    if isinstance(one, Governor):
+        return Shaft(seen, 0.6)
     return (
         Terminals(seen, output, v=0.3 + 0.97j, i=0.6 + 0.5j) if isinstance(one, Exciter) else seen
     )
@@ -71,6 +83,11 @@ LAGGING = Esst3a(K_C=0.5, T_A=0.05)
 SOURCE = 3.67 * np.exp(1j * np.radians(3.33))
 V_E = abs(SOURCE * (0.3 + 0.97j) + 1j * (0.435 + 0.0098 * SOURCE) * (0.6 + 0.5j))
 V_B = V_E * (1.0 - 0.577 * 0.5 * 1.8 / V_E)
+WIDE = {"K_C": 0.5, "V_Rmax": 9.0, "V_Rmin": -9.0, "V_Mmax": 9.0, "V_Mmin": -9.0, "T_A": 0.05}
+ESST4B = Esst4b(**WIDE)
+PROPORTIONAL = Esst4b(**WIDE, K_IR=0.0, K_IM=0.0, K_G=0.0)
+GAST = Gast(T1=0.4, A_T=4.0, D_turb=0.2)
+GGOV1 = Ggov1(flag=False, T_rate=0.8, K_dgov=0.5, T_dgov=0.3, T_c=0.05, D_m=0.2)
 IEEEG1 = Ieeeg1(T1=0.1, T2=0.05, T6=0.4, K1=0.2, K3=0.3, K5=0.3, K7=0.1)  # T7 left out
 HYGOV = Hygov(D_turb=0.0)
 TGOV1 = Tgov1(D_t=0.3)
@@ -113,6 +130,12 @@ PLAIN = Pss1a(T1=0.0, T2=0.0, T3=0.0, T4=0.0, V_STmin=-9.0, V_STmax=9.0)
             ([-20.0], [0.02, 1]), ([1.0, 1], [5.0, 1]), ([1], [0.05, 1]),
             ([8.0 * V_B], [0.4, 1 + 8.0 * V_B]),
         ]),
+        # the inner regulator C = K_PM + K_IM/s with its feedback, V_B C/(1 + K_G V_B C)
+        (ESST4B, 1.8, 1.02, [
+            ([-1.0], [0.02, 1]), ([2.97, 2.97], [1, 0]), ([1], [0.05, 1]),
+            ([V_B, 0.2 * V_B], [1 + 0.1 * V_B, 0.1 * 0.2 * V_B]),
+        ]),
+        (PROPORTIONAL, 1.8, 1.02, [([-2.97 * V_B], [0.02, 1]), ([1], [0.05, 1])]),
         (Pss1a(T6=0.0, A1=0.0, A2=0.0), 0.0, 0.0, [
             ([200.0, 0], [10.0, 1]), ([0.05, 1], [0.02, 1]), ([3.0, 1], [5.4, 1]),
         ]),
@@ -180,6 +203,86 @@ def test_a_hydraulic_governor_by_its_linear_model():
     np.testing.assert_allclose(found, by * exact, atol=1e-9)
     assert found[-1] == pytest.approx(-by * 1.2 / 0.05, rel=1e-2)
     assert found[1] > 0
+
+
+def test_a_gas_turbine_by_its_block_diagram():
+    t, by = np.linspace(0.0, 10.0, 200), 1e-3
+    _, exact = signal.step(product(([-20.0], [0.4, 1]), ([1], [0.2, 1])), T=t)
+    np.testing.assert_allclose(stepped(GAST, 0.6, 1e-3, by, t), by * (exact - 0.2), atol=1e-8)
+    assert GAST.per_speed() == 20.2
+
+
+def test_the_general_governor_by_its_block_diagram():
+    """Under a constant power it has no droop: proportion, derivative and the integral of both, the
+    valve and the turbine, of 0.8 p.u., and its damping, which acts at once."""
+    t, by = np.linspace(0.0, 5.0, 200), 1e-4
+    controller = product(([10.0 * 0.3 + 0.5, 10.0], [0.3, 1]), ([1, 2.0 / 10.0], [1, 0]))
+    behind = product(([-0.8], [0.5, 1]), ([1.5 * 0.05, 1.5], [0.1, 1]))
+    _, exact = signal.step(product(controller, behind), T=t)
+    found = stepped(GGOV1, 0.5, 2e-4, by, t)
+    np.testing.assert_allclose(found, by * (exact - 0.8 * 0.2), atol=1e-8)
+    assert GGOV1.per_speed() == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    ("one", "by", "power"),
+    [
+        (Gast(V_max=1.6), -0.05, 1.0),  # A_T, the heat
+        (Gast(V_max=0.9), -0.05, 0.9),
+        (Ggov1(T_rate=0.9, L_dref=1.02), -0.02, 0.9 * 1.02),  # the heat
+        (Ggov1(V_max=0.7), -0.02, 1.5 * (0.7 * 0.98 - 0.2)),  # fuel follows the speed
+        (Ggov1(T_rate=0.8, V_min=0.3, flag=False), 0.02, 0.8 * 1.5 * (0.3 - 0.2)),
+    ],
+)
+def test_what_limits_a_gas_turbine(one, by, power):
+    """The limits without wind-up of its valve, which its machine applies, are applied here."""
+    states, asked = one.rest(0.6, Shaft(0.0, 0.6))
+    p, x, out, most = np.array(one.numbers()), np.array(states), np.zeros(8), one.limits()
+    for _ in range(20_000):
+        found = type(one).rates.py_func(p, x, 0, Shaft(by, 0.6), asked, out)
+        x += 5e-3 * out[: len(x)]
+        for place, ends in most.items():
+            x[place] = np.clip(x[place], *ends)
+    assert found == pytest.approx(power, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("more", "by", "expected"),
+    [
+        ({"R_open": 0.04}, -0.01, 1.5 * 0.04),  # p.u./s, by the valve
+        ({"R_close": -0.03, "K_pgov": 20.0}, 0.01, -1.5 * 0.03),
+        ({"db": 0.004, "K_igov": 0.0, "R_open": 9.0}, -0.006, 0.0),  # 10 · 0.002 at the end
+        ({"maxerr": 0.002, "K_igov": 0.0, "R_open": 9.0}, -0.006, 0.0),
+    ],
+)
+def test_rates_dead_band_and_error_of_the_general_governor(more, by, expected):
+    """The rate of its power 1 s after a step; without an integral it comes to 1.5 · 10 · 0.002."""
+    one, t = Ggov1(flag=False, T_act=0.05, T_b=0.01, **more), np.array([0.0, 0.9, 1.0])
+    found = stepped(one, 0.5, 0.0, by, t)
+    assert (found[2] - found[1]) / 0.1 == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    if expected == 0.0:
+        assert found[2] == pytest.approx(1.5 * 10.0 * 0.002, rel=1e-6)
+
+
+@pytest.mark.parametrize(("by", "ceiling"), [(-0.3, 1.0), (0.9, -0.87)])
+def test_the_integrals_of_an_exciter_do_not_wind_up(by, ceiling):
+    """V_M, and so E_fd = V_B V_M, comes to its limit, and leaves it at once with the error."""
+    one = Esst4b(K_C=0.0, K_G=0.0, T_A=0.0)
+    _, asked = one.rest(1.8, sees(one, 1.0, 1.8))
+    p, x, out = (
+        np.array(one.numbers()),
+        np.array(one.rest(1.8, sees(one, 1.0, 1.8))[0]),
+        np.zeros(4),
+    )
+    low, back = sees(one, 1.0 + by, 1.8), sees(one, 1.0 - 0.1 * np.sign(by), 1.8)
+    for seen, ticks in ((low, 40_000), (back, 2_000)):
+        at_once = Esst4b.rates.py_func(p, x, 0, seen, asked, out)
+        if seen is back:
+            assert at_once == pytest.approx(ceiling * min(V_E, 5.48))
+        for _ in range(ticks):
+            E_fd = Esst4b.rates.py_func(p, x, 0, seen, asked, out)
+            x += 1e-3 * out
+    assert abs(x[1]) < 2.0 and abs(E_fd) < 5.48 and (E_fd - at_once) * ceiling < 0.0
 
 
 def test_the_limits_of_a_commutator_exciter_follow_the_voltage():
@@ -266,14 +369,18 @@ def test_a_rest_does_not_move():
         EXST1,
         ESST3A,
         LAGGING,
+        ESST4B,
+        PROPORTIONAL,
         saturated,
         TGOV1,
         IEEEG1,
         HYGOV,
+        GAST,
+        GGOV1,
         PSS1A,
         PLAIN,
     ):
-        output = 0.0 if isinstance(one, Stabiliser) else 3.0
+        output = 0.0 if isinstance(one, Stabiliser) else 0.5 if one is GGOV1 else 3.0
         seen = sees(one, 1.0 if isinstance(one, Exciter) else 0.01, output)
         states, asked = one.rest(output, seen)
         out = np.zeros(len(states))
@@ -307,7 +414,9 @@ def kind_of(one: Control) -> str:
     ("more", "message"),
     [
         ({"avr": {"type": "IEEET2"}}, "'SEXS', 'IEEET1'"),
-        ({"governor": {"type": "GAST"}}, "'TGOV1', 'IEEEG1', 'HYGOV'"),
+        ({"avr": {"type": "ESST4B", "K_PM": 0.0, "K_IM": 0.0}}, "K_PM and K_IM are 0: it would"),
+        ({"governor": {"type": "GGOV1", "T_sb": 0.0}}, "T_sb = 0: must be above 0 with T_sa = 4"),
+        ({"governor": {"type": "GOV"}}, "'TGOV1', 'IEEEG1', 'HYGOV', 'GAST', 'GGOV1'"),
         ({"governor": {"type": "IEEEG1", "K1": 0.0, "K3": 0.0}}, "K1, K3, K5 and K7 are 0"),
         ({"governor": {"type": "IEEEG1", "T2": 0.1}}, "T1 = 0: must be above 0 with T2 = 0.1"),
         ({"governor": {"type": "HYGOV", "G_min": 1.0}}, "G_min = 1: must be less than G_max, 1"),

@@ -28,6 +28,10 @@ CONTROLLED: dict[str, Any] = {
 }
 SALIENT = {"X_q": 1.1, "X_q1": 1.1, "saturates_by": "E_q1", "S_10": 0.1, "S_12": 0.4, "T_gov": 0.2}
 COMPOUND = {"avr": {"type": "ESST3A", "K_C": 0.2}, "T_gov": 0.2, "S_10": 0.1, "S_12": 0.4}
+GAS: dict[str, Any] = {
+    "avr": {"type": "ESST4B", "K_C": 0.2, "V_Rmax": 3.0},
+    "governor": {"type": "GGOV1", "T_rate": 0.9, "T_pelec": 0.1, "D_m": 0.1, "R_open": 1.0},
+}
 SATURATED = {"S_10": 0.1, "S_12": 0.4, "avr": SEXS, "T_gov": 0.2}
 
 
@@ -183,6 +187,10 @@ class Compound:
         V_E = abs(K_P * v + 1j * (0.435 + 0.0098 * K_P) * i)
         return float(V_E - 0.577 * 0.2 * I_fd)
 
+    def excitation(self, x: np.ndarray, seen: tuple[complex, complex, float]) -> float:
+        """E_fd by the states of the plant's own control."""
+        return float(x[3] * self.V_B(seen))
+
     def given(self, c: np.ndarray, w: float, seen: Any) -> tuple[float, float, float]:
         return c[1], c[3] * self.V_B(seen), c[0]
 
@@ -193,6 +201,37 @@ class Compound:
         return [
             (self.P - w / 0.05 - P) / 0.2, (V - V_m) / 0.02, (off - y) / 5.0,
             (8.0 * (V_R - E_fd) - V_M) / 0.4,
+        ]  # fmt: skip
+
+
+class Gas(Compound):
+    """GAS within its limits: states of ESST4B, and of GGOV1 without its derivative. The load
+    limiter does not act."""
+
+    def rest(self, seen: tuple[complex, complex, float]) -> None:
+        v, i, _ = seen
+        P_e, V_R, V_M = (v * i.conjugate()).real / 0.9, 0.1 * self.E_fd, self.E_fd / self.V_B(seen)
+        burns = self.P / 0.9 / 1.5 + 0.2
+        self.asked = P_e
+        self.start = [1.01, V_R, V_R, V_M, P_e, *[burns] * 2, self.P / 0.9]
+
+    def excitation(self, x: np.ndarray, seen: tuple[complex, complex, float]) -> float:
+        V_B = self.V_B(seen)
+        return float(V_B * (x[2] + x[3]) / (1.0 + 0.1 * V_B))
+
+    def given(self, c: np.ndarray, w: float, seen: Any) -> tuple[float, float, float]:
+        return c[0], self.excitation(c, seen), 0.9 * (c[7] - 0.1 * w)
+
+    def slope(self, c: np.ndarray, V: float, w: float, seen: Any) -> list[float]:
+        V_m, x_R, V_A, _, P, x_I, v, y = c
+        off, u = 1.01 - V_m, V_A - 0.1 * self.given(c, w, seen)[1]
+        e = 0.04 * (self.asked - P) - w
+        f = 10.0 * e + x_I
+        assert -0.05 < f - v < 0.5  # the rates of the valve do not act
+        return [
+            (V - V_m) / 0.02, 2.97 * off, (2.97 * off + x_R - V_A) / 0.01, 0.2 * u,
+            ((seen[0] * seen[1].conjugate()).real / 0.9 - P) / 0.1, 2.0 * e, (f - v) / 0.5,
+            (1.5 * (v * (1.0 + w) - 0.2) - y) / 0.1,
         ]  # fmt: skip
 
 
@@ -246,8 +285,8 @@ def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.nd
     psi_0, angle_0, E_fd_0 = windings.start(i_0, 1.01)
     P_0 = float((np.conj(i_0) * (1.01 + 0.004 * i_0)).real)
     controls: Any
-    if machine.avr is not None and machine.avr.kind() == "ESST3A":
-        controls = Compound(machine, E_fd_0, P_0)
+    if machine.avr is not None and machine.avr.kind() in ("ESST3A", "ESST4B"):
+        controls = (Gas if "governor" in more else Compound)(machine, E_fd_0, P_0)
         controls.rest(windings.seen(psi_0, 1.0))
     else:
         controls = (Standard if "governor" in more else Simple)(machine, E_fd_0, P_0)
@@ -291,8 +330,8 @@ def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.nd
     assert now["omega_g"] == one["omega"]  # there is no other grid
     turbine = one["P_turbine"] if machine.governor is None else one["turbine"]
     regulator = one["x"][[AVR, AVR + 2]] if machine.avr else [1.01, E_fd_0]
-    if isinstance(controls, Compound):  # its E_fd is V_B times its state V_M
-        regulator = [one["x"][AVR], one["x"][AVR + 3] * controls.V_B(seen)]
+    if isinstance(controls, Compound):  # its E_fd is by the source, which is no state
+        regulator = [one["x"][AVR], controls.excitation(one["x"][AVR:], seen)]
     mine = [*now["w"][:6], one["omega"], turbine, *regulator]
     return np.array(mine), np.array(exact)
 
@@ -306,6 +345,7 @@ def stepped(T_s: float, duration: float, **more: Any) -> tuple[np.ndarray, np.nd
         (CONTROLLED, 2e-5),
         (SATURATED, 2e-5),
         (COMPOUND, 2e-5),
+        (GAS, 2e-5),
         (SALIENT, 5e-5),  # its q axis has one damper, whose flux moves faster
     ],
 )
@@ -318,7 +358,7 @@ def test_a_step_against_the_windings(machine, within):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    "controls", [{"avr": SEXS, "T_gov": 0.2}, CONTROLLED, COMPOUND, SATURATED, SALIENT]
+    "controls", [{"avr": SEXS, "T_gov": 0.2}, CONTROLLED, COMPOUND, GAS, SATURATED, SALIENT]
 )
 def test_its_error_falls_with_the_square_of_the_step(controls):
     errors = [np.abs(np.subtract(*stepped(T_s, 0.1, **controls))).max() for T_s in (2e-4, 1e-4)]

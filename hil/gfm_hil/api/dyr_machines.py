@@ -208,6 +208,38 @@ def _esst3a(p: Numbers) -> Made:
     return _lagging({"type": "ESST3A", **p}, "T_R", "T_M")
 
 
+def _esst4b(p: Numbers) -> Made:
+    return _lagging({"type": "ESST4B", **p}, "T_R", *["T_A"] * (p["T_A"] > 0.0))
+
+
+def _gast(p: Numbers) -> Made:
+    return _lagging({"type": "GAST", **p}, "T1", "T2", "T3")
+
+
+def _ggov1(p: Numbers) -> Made:
+    """Its limit by the acceleration would act below R_open, the rate of its valve, in a fall."""
+    notes = []
+    if (select := p.pop("R_select")) != 1.0:
+        notes.append(f"its droop is by the electric power, not by R_select = {select:g}")
+    p["flag"] = bool(p["flag"])
+    if p["T_rate"] == 0.0:
+        p.pop("T_rate")
+    left_out = {
+        "its limit by the acceleration": p.pop("K_a") > 0.0 and p["T_a"] > 0.0,
+        "K_imw": p.pop("K_imw") != 0.0,
+        "T_eng": p.pop("T_eng") > 0.0,
+        "D_m < 0": p["D_m"] < 0.0,
+    }
+    p["D_m"] = max(p["D_m"], 0.0)
+    for name in ("A_set", "T_a", "R_up", "R_down"):
+        p.pop(name)
+    if p["T_dgov"] == 0.0:
+        p["K_dgov"], p["T_dgov"] = 0.0, 1.0
+    notes += [f"{what} is left out" for what, uses in left_out.items() if uses]
+    content, more = _lagging(p, "T_pelec", "T_act", "T_b", "T_fload")
+    return {"type": "GGOV1", **content}, notes + more
+
+
 def _tgov1(p: Numbers) -> Made:
     return _lagging({"type": "TGOV1", **p}, "T1", "T3")
 
@@ -431,12 +463,27 @@ MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
          "K_P", "K_I", "V_Bmax", "K_C", "X_L", "V_Gmax", "theta_P", "T_M", "V_Mmax", "V_Mmin"),
         _esst3a,
     ),
+    "ESST4B": (
+        "avr",
+        ("T_R", "K_PR", "K_IR", "V_Rmax", "V_Rmin", "T_A", "K_PM", "K_IM", "V_Mmax", "V_Mmin",
+         "K_G", "K_P", "K_I", "V_Bmax", "K_C", "X_L", "theta_P"),
+        _esst4b,
+    ),
     "IEEEG1": ("governor", _STEAM, _ieeeg1),
     "WSIEG1": ("governor", (*_STEAM, *_CURVE, "block"), _wsieg1),
     "HYGOV": (
         "governor",
         ("R", "r", "T_r", "T_f", "T_g", "VELM", "G_max", "G_min", "T_W", "A_t", "D_turb", "q_NL"),
         _hygov,
+    ),
+    "GAST": ("governor", ("R", "T1", "T2", "T3", "A_T", "K_T", "V_max", "V_min", "D_turb"), _gast),
+    "GGOV1": (
+        "governor",
+        ("R_select", "flag", "R", "T_pelec", "maxerr", "minerr", "K_pgov", "K_igov", "K_dgov",
+         "T_dgov", "V_max", "V_min", "T_act", "K_turb", "W_fnl", "T_b", "T_c", "T_eng", "T_fload",
+         "K_pload", "K_iload", "L_dref", "D_m", "R_open", "R_close", "K_imw", "A_set", "K_a", "T_a",
+         "T_rate", "db", "T_sa", "T_sb", "R_up", "R_down"),
+        _ggov1,
     ),
     "TGOV1": ("governor", ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"), _tgov1),
     "PSS1A": ("pss", ("mode", "bus", "A1", "A2", *_LEADS), _stabiliser),

@@ -23,6 +23,7 @@ from gfm_hil.engine.setup import make_benches
 from gfm_hil.scenario import load_scenario, toml_text
 from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.components import COMPONENTS
+from gfm_plant.components.controls.control import Shaft
 from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_runtime import LawError, discretise, load_law
 from gfm_runtime.signals import Y_NAMES
@@ -348,7 +349,7 @@ class _Build:
     def _machine(self, k: int, share: float) -> None:
         bus, S = self.flow.buses[k], self._rating(k)
         i = (bus.machine / bus.V).conjugate() * self.flow.S_b / S
-        values = {"node": self._node(k), "S": share * S / self.S_b}
+        values: dict[str, Any] = {"node": self._node(k), "S": share * S / self.S_b}
         P = bus.machine.real * self.flow.S_b / S
         if (classical := self._record("machines", k)) is not None:
             X = bus.X_source
@@ -362,6 +363,9 @@ class _Build:
         own = self._record("synchronous_machines", k)
         values |= {"P": P, "V": abs(bus.V), **(_MACHINE if own is None else own)}
         if "governor" in values:
+            governor: dict[str, Any] = values["governor"]
+            if "T_rate" in governor:  # MW
+                values["governor"] = governor | {"T_rate": governor["T_rate"] * 1e6 / S}
             values["governor"] = self._opened(values, named(bus.name))
         self._put("synchronous_machines", f"G{self.names[k]}", values)
 
@@ -369,17 +373,23 @@ class _Build:
         """Its governor, which opens as far as the case asks for: in many published files machines
         bring more than their governors let them by the rating."""
         governor: dict[str, Any] = machine["governor"]
-        one: Any = SynchronousMachine.model_validate(machine).governor
-        states, _ = one.rest(machine["P"], 0.0)
-        for place, (_, most) in one.limits_at(0.0).items():
-            for name in ("P_max", "V_max", "G_max"):
-                if states[place] >= most and governor.get(name) == most:
-                    governor = governor | {name: _ROOM * states[place]}
-                    self.ignored.append(
-                        f"{one.kind()} at {bus}: {name} = {governor[name]:.4g} instead of {most:g},"
-                        " for the power that the case has there."
-                    )
-        return governor
+        P, changed = machine["P"], dict[str, Any]()
+        while True:
+            whole = machine | {"governor": governor | changed}
+            one: Any = SynchronousMachine.model_validate(whole).governor
+            states, _ = one.rest(P, Shaft(0.0, P))
+            ends = one.limits_at(Shaft(0.0, P))
+            over = [(states[at], most) for at, (_, most) in ends.items() if states[at] >= most]
+            if not over:
+                break
+            state, most = over[0]
+            changed |= {name: _ROOM * state * (getattr(one, name) / most) for name in one.opens}
+        for name, value in changed.items():
+            self.ignored.append(
+                f"{one.kind()} at {bus}: {name} = {value:.4g} instead of {governor[name]:g}, for"
+                " the power that the case has there."
+            )
+        return governor | changed
 
     def _record(self, table: str, k: int) -> dict[str, Any] | None:
         """What a dynamics file says of a part of a table at a bus."""

@@ -55,7 +55,7 @@ from gfm_plant.components.controls import (
     govern,
     stabilise,
 )
-from gfm_plant.components.controls.control import Control, Terminals, parabola
+from gfm_plant.components.controls.control import Control, Shaft, Terminals, parabola
 from gfm_plant.components.machine import SPEED, Rotating
 from gfm_plant.components.part import LinearPart, Matrix, emf
 from gfm_plant.components.swing import (
@@ -133,6 +133,13 @@ def _terminals(
 
 
 @compiled
+def _shaft(one: Any, w: float, i: complex, psi: complex) -> Shaft:
+    """Return what the governor sees, at a flux psi''."""
+    torque = psi.real * i.imag - psi.imag * i.real
+    return Shaft(w, (1.0 + w) * torque - one.R * (i.real * i.real + i.imag * i.imag))
+
+
+@compiled
 def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     """Write d/dt of the states x, (N_STATES,), 1/s, at a terminal voltage of size V, a speed of
     1 + w and a current i; returns the torque of the turbine, if it has a governor."""
@@ -143,7 +150,8 @@ def _rates(one: Any, x: Any, V: float, w: float, i: complex, out: Any) -> float:
     seen = _terminals(one, x, V, w, i, psi, iron, S)
     E_fd = excite(one.avr, one.avr_p, x, AVR, seen, one.avr_set + V_s, out)
     _windings(one, x, E_fd, i, iron, S, out)
-    turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, w, one.governor_set, out)
+    shaft = _shaft(one, w, i, psi)
+    turbine: float = govern(one.governor, one.governor_p, x, GOVERNOR, shaft, one.governor_set, out)
     return turbine
 
 
@@ -423,7 +431,7 @@ class SynchronousMachine(Rotating):
         record["x"][:AVR] = E_q, E_d, psi_kd, psi_kq
         seen: Mapping[str, tuple[float, Any]] = {
             "avr": (E_fd, Terminals(abs(v), E_fd, v * unit.conjugate(), own)),
-            "governor": (torque, omega - 1.0),
+            "governor": (torque, Shaft(omega - 1.0, (v * i.conjugate()).real)),
             "pss": (0.0, omega - 1.0),
         }
         for role, at, one in self._controls():
@@ -508,4 +516,4 @@ class SynchronousMachine(Rotating):
         S = _saturation.py_func(one, iron)
         seen = _terminals.py_func(one, x, V, w, i, psi, iron, S)
         _windings.py_func(one, x, output("avr", seen, one.avr_set + V_s), i, iron, S, out)
-        return output("governor", w, one.governor_set)
+        return output("governor", _shaft.py_func(one, w, i, psi), one.governor_set)

@@ -207,7 +207,7 @@ DYNAMICS = """\
 2 'SEXS' 1 0.1 10.0 100.0 0.05 0.0 5.0 /
 2 'IEEEST' 1 1 0 0 0 0 0 0 0 0.05 0.02 3.0 5.4 10.0 5.0 20.0 0.2 -0.2 0 0 /
 2 'HYGOV' 1 0.05 0.5 5.0 0.05 0.2 0.2 1.0 0.0 1.0 1.2 0.5 0.08 /
-2 'ESST4B' 1 0 0 /
+2 'AC8B' 1 0 0 /
 """
 
 
@@ -266,6 +266,12 @@ PUBLISHED = """\
             {"type": "EXDC2", "T_B": 0.02, "V_Rmax": 99.0, "V_Rmin": -3.0, "K_E": 0.0},
             ["V_Rmax = 99: it names none"],
         ),
+        # of GridPACK's kundur-twoarea_esst4b.dyr
+        (
+            "ESST4B' 1 0.05 10.75 10.75 1 -0.87 0.02 1 0.05 99 -99 0 9.3 0.05 11.63 .113 .124 0 /",
+            {"K_IR": 10.75, "V_Rmin": -0.87, "T_A": 0.02, "V_Mmax": 99.0, "K_G": 0.0, "X_L": 0.124},
+            [],
+        ),
     ],
 )
 def test_published_controls(record, known, notes, tmp_path):
@@ -275,6 +281,35 @@ def test_published_controls(record, known, notes, tmp_path):
     one = SynchronousMachine(node="a", S=1.0, P=0.5, **tables["synchronous_machines"]["1"])
     assert {name: getattr(one.avr, name) for name in known} == known
     assert [line.rstrip(".").partition(": ")[2] for line in ignored] == notes
+
+
+def test_published_governors_of_gas_turbines(tmp_path):
+    """GAST of the WECC's 240 buses, and GGOV1 of ACTIVSg2000, by MW, as far as a case asks for."""
+    file = tmp_path / "published.dyr"
+    first, machine = (DYNAMICS.splitlines()[k] for k in (0, 3))
+    file.write_text(
+        f"{first}\n1 'GAST' 1 0.08 0.3 0.3 3.0 1.0 2.0 1.0 0.0 0.0 /\n{machine}\n"
+        f"{DYNAMICS.splitlines()[4]}\n2 'GGOV1' 1 1 1 0.04 1 0.05 -0.05 21.071 0.0553 0 1 1 0.15"
+        " 0.2767 1.5 0.2 0.5 0 0 3 2 1 1 0 1 -1 0 0.01 10 0.1 107.28 0 4 5 99 -99 /\n"
+    )
+    case = gfmhil.network_from("case9", {"3": "droop-3"}, dynamics=file)
+    one, two = (case.content["network"]["synchronous_machines"][f"G{k}"] for k in "12")
+    assert one["governor"] == {
+        "type": "GAST", "R": 0.08, "T1": 0.3, "T2": 0.3, "T3": 3.0, "A_T": 1.0, "K_T": 2.0,
+        "V_max": 1.0, "V_min": 0.0, "D_turb": 0.0,
+    }  # fmt: skip
+    own = SynchronousMachine.model_validate(two).governor
+    known = {"flag": True, "K_igov": 0.0553, "T_b": 0.5, "T_c": 0.0, "R_close": -1.0, "T_sb": 5.0}
+    assert {name: getattr(own, name) for name in known} == known
+    # 163 MW of 300 MVA, and a little for its winding; by its valve 107.28 MW are the most
+    assert own.T_rate * 300.0 == pytest.approx(1.05 * 163.0, rel=0.1) and own.T_rate > 0.5433
+    for line in (
+        "GGOV1 at bus 2: its limit by the acceleration is left out.",
+        f"GGOV1 at bus 2: T_rate = {own.T_rate:.4g} instead of 0.3576, for the power that the case"
+        " has there.",
+    ):
+        assert line in case.ignored
+    assert case.distance(case.save(tmp_path / "net")) < 1e-8
 
 
 def test_a_published_stabiliser_with_three_leads(tmp_path):
@@ -473,7 +508,7 @@ def test_machines_of_a_dynamics_file_run(tmp_path):
     assert [two["governor"][key] for key in ("type", "T_W", "q_NL")] == ["HYGOV", 1.0, 0.08]
     # its washout 20 · 10 s/(1 + 5 s), as ours is written
     assert (two["pss"]["K_S"], two["pss"]["T5"], two["pss"]["T6"]) == (40.0, 5.0, 0.0)
-    for line in ("T_R = 0.001 s instead of 0", "ESST4B at bus 2 is"):
+    for line in ("T_R = 0.001 s instead of 0", "AC8B at bus 2 is"):
         assert sum(line in said for said in case.ignored) in (1, 2), line
     run = gfmhil.run_network(case.save(tmp_path / "net"), duration=0.5)
     p = run["C3"].signals["p"]

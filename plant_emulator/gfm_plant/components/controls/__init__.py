@@ -8,10 +8,20 @@ from typing import Annotated, Any, Union
 
 from pydantic import BeforeValidator, Field
 
-from gfm_plant.components.controls.control import Control, Exciter, Governor, Stabiliser, Terminals
+from gfm_plant.components.controls.control import (
+    Control,
+    Exciter,
+    Governor,
+    Shaft,
+    Stabiliser,
+    Terminals,
+)
 from gfm_plant.components.controls.esst3a import Esst3a
+from gfm_plant.components.controls.esst4b import Esst4b
 from gfm_plant.components.controls.exdc2 import Exdc2
 from gfm_plant.components.controls.exst1 import Exst1
+from gfm_plant.components.controls.gast import Gast
+from gfm_plant.components.controls.ggov1 import Ggov1
 from gfm_plant.components.controls.hygov import Hygov
 from gfm_plant.components.controls.ieeeg1 import Ieeeg1
 from gfm_plant.components.controls.ieeet1 import Ieeet1
@@ -21,8 +31,8 @@ from gfm_plant.components.controls.st2cut import St2cut
 from gfm_plant.components.controls.tgov1 import Tgov1
 from gfm_runtime.compiled import inlined_as
 
-EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1, Esst3a)
-GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov)
+EXCITERS: tuple[type[Exciter], ...] = (Sexs, Ieeet1, Exdc2, Exst1, Esst3a, Esst4b)
+GOVERNORS: tuple[type[Governor], ...] = (Tgov1, Ieeeg1, Hygov, Gast, Ggov1)
 STABILISERS: tuple[type[Stabiliser], ...] = (Pss1a, St2cut)
 
 
@@ -78,4 +88,4 @@ _EACH = (*EXCITERS, *GOVERNORS, *STABILISERS)
 #: numbers and states of one of each role, at most
 MOST_NUMBERS = max(len(kind().numbers()) for kind in _EACH)
 OF_EXCITER = _most(EXCITERS, Terminals(1.0, 1.0, 1.0 + 0j, 0j))
-OF_GOVERNOR, OF_STABILISER = _most(GOVERNORS, 0.0), _most(STABILISERS, 0.0)
+OF_GOVERNOR, OF_STABILISER = _most(GOVERNORS, Shaft(0.0, 1.0)), _most(STABILISERS, 0.0)

@@ -34,13 +34,20 @@ class Terminals(NamedTuple):
     i: complex
 
 
+class Shaft(NamedTuple):
+    """What a governor sees of its machine, p.u."""
+
+    w: float  #: deviation of the speed
+    P_e: float  #: power that the terminals bring
+
+
 class Control(Options):
     """Base of all controls; the options of one are its standard parameters, in p.u. of the
     machine's rating and s.
 
-    Its ``rates`` is a compiled function (p, x, at, seen, asked, out) -> output. What it sees is a
-    number, of an exciter ``Terminals``. p are its
-    ``numbers``, its states are x from ``at`` on, and their d/dt, 1/s, go to the same places of out.
+    Its ``rates`` is a compiled function (p, x, at, seen, asked, out) -> output. What a stabiliser
+    sees is a number, an exciter ``Terminals`` and a governor ``Shaft``. p are its ``numbers``, its
+    states are x from ``at`` on, and their d/dt, 1/s, go to the same places of out.
     A time constant of 0 that it allows leaves its block out, whose states then do not move.
     """
 
@@ -99,8 +106,11 @@ class Exciter(Control):
 
 
 class Governor(Control):
-    """A governor with its turbine: sees the deviation of the speed, is asked for a power, gives the
-    torque of the turbine."""
+    """A governor with its turbine: sees ``Shaft``, is asked for a power, gives the torque of the
+    turbine."""
+
+    #: options of which a larger one lets it bring more at rest
+    opens: ClassVar[Sequence[str]]
 
     def per_speed(self) -> float:
         """How much more torque it gives at rest by a lower speed, p.u./p.u."""

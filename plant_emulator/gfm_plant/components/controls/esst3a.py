@@ -8,40 +8,20 @@ the field's voltage inside (ST3A of IEEE Std 421.5):
     E_fd = V_B V_M,    V_B = min(V_E F(K_C I_fd / V_E), V_Bmax),
     V_E = |K_Pp v + j (K_I + K_Pp X_L) i|,    K_Pp = K_P e^(j theta_P),
 
-with the phasors v and i of the terminals and the current I_fd of the field. F is what a rectifier
-of six pulses keeps of its voltage under that current: 1 - 0.577 I up to I = 0.433,
-sqrt(0.75 - I^2) up to 0.75, 1.732 (1 - I) up to 1, and 0 beyond. The gate for a limiter of
-under-excitation is left out.
+with the phasors v and i of the terminals and the current I_fd of the field (`rectifier`). The gate
+for a limiter of under-excitation is left out.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from gfm_plant.components.controls.control import Exciter, Terminals
+from gfm_plant.components.controls.control import Terminals
+from gfm_plant.components.controls.rectifier import CompoundExciter, rectified
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
-
-_LEAST = 1e-6  # p.u.; of V_E, by which the field's current is divided
-
-
-@compiled
-def _rectified(p: Any, seen: Terminals) -> float:
-    """Return V_B."""
-    K_P, K_I, X_L, K_C, V_Bmax = complex(p[12], p[13]), p[14], p[15], p[16], p[17]
-    feeds = K_P * seen.v + 1j * (K_I + K_P * X_L) * seen.i
-    V_E = math.sqrt(feeds.real * feeds.real + feeds.imag * feeds.imag)
-    load = K_C * seen.I_fd / max(V_E, _LEAST)
-    if load <= 0.433:
-        keeps = min(1.0 - 0.577 * load, 1.0)
-    elif load < 0.75:
-        keeps = math.sqrt(0.75 - load * load)
-    else:
-        keeps = max(1.732 * (1.0 - load), 0.0)
-    V_B: float = min(V_E * keeps, V_Bmax)
-    return V_B
 
 
 @compiled
@@ -58,12 +38,12 @@ def _rates(p: Any, x: Any, at: int, seen: Terminals, asked: float, out: Any) -> 
         out[at + 2] = (K_A * V_I - V_R) / T_A
     else:
         V_R = min(max(K_A * V_I, V_Rmin), V_Rmax)
-    E_fd: float = _rectified(p, seen) * V_M
+    E_fd: float = rectified(p, 12, seen) * V_M
     out[at + 3] = (K_M * (V_R - min(K_G * E_fd, V_Gmax)) - V_M) / T_M
     return E_fd
 
 
-class Esst3a(Exciter):
+class Esst3a(CompoundExciter):
     """A static exciter fed by voltage and current, with a regulator inside, ESST3A. The defaults
     are those of IEEE's case of 14 buses (ANDES, ieee14.dyr)."""
 
@@ -89,30 +69,15 @@ class Esst3a(Exciter):
     V_Rmax: float = Field(99.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
     V_Rmin: float = Field(-99.0, ge=-1e4, le=1e4, description="least output of it, p.u.")
     K_G: NonNegative = Field(1.0, description="gain of the feedback of E_fd")
-    K_P: NonNegative = Field(3.67, description="what the voltage gives to the rectifier")
-    K_I: NonNegative = Field(0.435, description="what the current gives to it")
-    V_Bmax: Positive = Field(5.48, description="largest voltage behind the rectifier, p.u.")
-    K_C: NonNegative = Field(0.01, description="how the field's current loads the rectifier")
-    X_L: NonNegative = Field(0.0098, description="reactance of the source of voltage, p.u.")
     V_Gmax: Positive = Field(3.86, description="largest feedback of E_fd, p.u.")
-    theta_P: float = Field(3.33, ge=-180.0, le=180.0, description="angle of that source, degrees")
     T_M: Positive = Field(0.4, description="lag of the inner regulator, s")
     V_Mmax: float = Field(99.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
     V_Mmin: float = Field(0.0, ge=-1e4, le=1e4, description="least output of it, p.u.")
 
-    @model_validator(mode="after")
-    def _is_fed(self) -> Self:
-        if self.K_P == 0.0 and self.K_I == 0.0:
-            raise ValueError("K_P and K_I are 0: nothing would feed it")
-        return self
-
     def numbers(self) -> Sequence[float]:
         names = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_G",
                  "K_M", "T_M")  # fmt: skip
-        angle = math.radians(self.theta_P)
-        K_P = self.K_P * math.cos(angle), self.K_P * math.sin(angle)
-        behind = self.K_I, self.X_L, self.K_C, self.V_Bmax, self.V_Gmax
-        return *(getattr(self, name) for name in names), *K_P, *behind
+        return *(getattr(self, name) for name in names), *self.source(), self.V_Gmax
 
     def lags(self) -> Mapping[str, float]:
         own = {name: getattr(self, name) for name in ("T_R", "T_B", "T_A")}
@@ -127,7 +92,7 @@ class Esst3a(Exciter):
         return {1: (self.V_Imin, self.V_Imax), **self.limits()}
 
     def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
-        V_B = _rectified.py_func(self.numbers(), seen)
+        V_B = rectified.py_func(self.source(), 0, seen)
         V_M = output / V_B if V_B > 0.0 else math.inf
         V_R = V_M / self.K_M + min(self.K_G * output, self.V_Gmax)
         error = V_R / self.K_A

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from gfm_plant.components.controls.control import Governor
+from gfm_plant.components.controls.control import Governor, Shaft
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
@@ -21,18 +21,18 @@ _LEAST = 0.01  # p.u.; of the gate by which the flow is divided
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Shaft, asked: float, out: Any) -> float:
     R, r, T_r, T_f, T_g, VELM = p[0], p[1], p[2], p[3], p[4], p[5]
     T_W, A_t, D_turb, q_NL = p[6], p[7], p[8], p[9]
     e, c, g, q = x[at], x[at + 1], x[at + 2], x[at + 3]
-    slope = (asked - seen - R * c - e) / T_f
+    slope = (asked - seen.w - R * c - e) / T_f
     out[at] = slope
     out[at + 1] = min(max((slope + e / T_r) / r, -VELM), VELM)
     out[at + 2] = (c - g) / T_g
     flow = q / max(g, _LEAST)
     h = flow * flow
     out[at + 3] = (1.0 - h) / T_W
-    return A_t * h * (q - q_NL) - D_turb * g * seen
+    return A_t * h * (q - q_NL) - D_turb * g * seen.w
 
 
 class Hygov(Governor):
@@ -45,6 +45,7 @@ class Hygov(Governor):
         ("q", "p.u.", "flow of the water"),
     )
     rates: ClassVar = _rates
+    opens: ClassVar = ("G_max",)
     ranges: ClassVar = ("G_",)
 
     type: Literal["HYGOV"] = Field("HYGOV", description="which governor")
@@ -74,6 +75,6 @@ class Hygov(Governor):
     def per_speed(self) -> float:
         return self.A_t / self.R
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
-        g = (output + self.A_t * self.q_NL) / (self.A_t - self.D_turb * seen)
-        return (0.0, g, g, g), seen + self.R * g
+    def rest(self, output: float, seen: Shaft) -> tuple[Sequence[float], float]:
+        g = (output + self.A_t * self.q_NL) / (self.A_t - self.D_turb * seen.w)
+        return (0.0, g, g, g), seen.w + self.R * g

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from gfm_plant.components.controls.control import Governor
+from gfm_plant.components.controls.control import Governor, Shaft
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
@@ -23,9 +23,9 @@ _LAGS = ("T4", "T5", "T6", "T7")
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Shaft, asked: float, out: Any) -> float:
     K, T1, T2, T3, U_o, U_c = p[0], p[1], p[2], p[3], p[4], p[5]
-    s = K * seen
+    s = K * seen.w
     if T1 > 0.0:
         out[at] = (s - x[at]) / T1
         s = x[at] + T2 / T1 * (s - x[at])
@@ -50,6 +50,7 @@ class Ieeeg1(Governor):
         ("x_4 … x_7", "p.u.", "power behind chest, reheater and crossovers"),
     )
     rates: ClassVar = _rates
+    opens: ClassVar = ("P_max",)
     ranges: ClassVar = ("P_",)
     leads: ClassVar = (("T2", "T1"),)
 
@@ -95,6 +96,6 @@ class Ieeeg1(Governor):
     def per_speed(self) -> float:
         return self.K * self.gain()
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
-        g, s = output / self.gain(), self.K * seen
+    def rest(self, output: float, seen: Shaft) -> tuple[Sequence[float], float]:
+        g, s = output / self.gain(), self.K * seen.w
         return (s if self.T1 > 0.0 else 0.0, g, g, g, g, g), g + s

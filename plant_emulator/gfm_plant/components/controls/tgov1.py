@@ -12,18 +12,18 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from gfm_plant.components.controls.control import Governor
+from gfm_plant.components.controls.control import Governor, Shaft
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
 
 @compiled
-def _rates(p: Any, x: Any, at: int, seen: float, asked: float, out: Any) -> float:
+def _rates(p: Any, x: Any, at: int, seen: Shaft, asked: float, out: Any) -> float:
     R, T1, T2, T3, D_t = p[0], p[1], p[2], p[3], p[4]
     valve, behind = x[at], x[at + 1]
-    out[at] = (asked - seen / R - valve) / T1
+    out[at] = (asked - seen.w / R - valve) / T1
     out[at + 1] = (valve - behind) / T3
-    return behind + T2 / T3 * (valve - behind) - D_t * seen
+    return behind + T2 / T3 * (valve - behind) - D_t * seen.w
 
 
 class Tgov1(Governor):
@@ -34,6 +34,7 @@ class Tgov1(Governor):
         ("x_2", "p.u.", "power behind the reheater"),
     )
     rates: ClassVar = _rates
+    opens: ClassVar = ("V_max",)
     ranges: ClassVar = ("V_",)
 
     type: Literal["TGOV1"] = Field("TGOV1", description="which governor")
@@ -57,6 +58,6 @@ class Tgov1(Governor):
     def per_speed(self) -> float:
         return 1.0 / self.R + self.D_t
 
-    def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
-        valve = output + self.D_t * seen
-        return (valve, valve), valve + seen / self.R
+    def rest(self, output: float, seen: Shaft) -> tuple[Sequence[float], float]:
+        valve = output + self.D_t * seen.w
+        return (valve, valve), valve + seen.w / self.R
