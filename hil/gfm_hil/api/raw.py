@@ -1,13 +1,13 @@
-"""Power-flow cases of PSS/E (.raw, revisions 31 to 33) as nets of pandapower.
+"""Power-flow cases of PSS/E (.raw, revisions 30 to 35) as nets of pandapower.
 
 A file is three lines of title, and then sections of records, one a line (a transformer takes four
-or five), whose fields are divided by commas. A line that begins with 0 ends a section. Buses keep
-the voltages at which the file's own power flow holds them.
+or five), whose fields are divided by commas. A line that begins with 0 ends a section, one that
+begins with @! is a comment. Buses keep the voltages at which the file's own power flow holds them.
 """
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,18 @@ _SECTIONS = (
     "multi-section line", "zone", "transfer", "owner", "FACTS device", "switched shunt",
     "GNE device", "induction machine",
 )  # fmt: skip
+_SWITCHES = "system switching device"
+_NEWER = ("system-wide data", *_SECTIONS[:5], _SWITCHES, *_SECTIONS[5:], "substation")
+#: of revisions 30, 34 and 35; the others have those above
+_OTHER_SECTIONS = {
+    30: (
+        "bus", "load", "generator", "branch", "transformer", "area", "two-terminal DC line",
+        "VSC DC line", "switched shunt", "impedance correction", "multi-terminal DC line",
+        "multi-section line", "zone", "transfer", "owner", "FACTS device",
+    ),
+    34: _NEWER,
+    35: _NEWER,
+}  # fmt: skip
 #: those that a network has not, and the lines that a record of them takes
 _LEFT_OUT = {
     "two-terminal DC line": 3,
@@ -39,9 +51,25 @@ _FIELDS = {
     "generator": {"I": 0, "PG": 2, "MBASE": 8, "ZX": 10, "STATUS": 14},
     "branch": {"I": 0, "J": 1, "R": 3, "X": 4, "B": 5, "GI": 9, "BI": 10, "GJ": 11, "BJ": 12,
                "STATUS": 13},
+    _SWITCHES: {"I": 0, "J": 1, "STATUS": 16},
     "transformer": {"I": 0, "J": 1, "K": 2, "CW": 4, "CZ": 5, "CM": 6, "MAG1": 7, "MAG2": 8,
                     "STATUS": 11},
 }  # fmt: skip
+_NEWER_BRANCH = {"I": 0, "J": 1, "R": 3, "X": 4, "B": 5, "GI": 19, "BI": 20, "GJ": 21, "BJ": 22,
+                 "STATUS": 23}  # fmt: skip
+#: where these revisions have them otherwise; a bus of revision 30 has its shunt with it
+_OTHER_FIELDS: dict[int, dict[str, dict[str, int]]] = {
+    30: {
+        "bus": {"I": 0, "IDE": 3, "GL": 4, "BL": 5, "VM": 8, "VA": 9},
+        "switched shunt": {"I": 0, "BL": 7},
+    },
+    34: {"branch": _NEWER_BRANCH},
+    35: {
+        "branch": _NEWER_BRANCH,
+        "generator": {"I": 0, "PG": 2, "MBASE": 9, "ZX": 11, "STATUS": 15},
+        "switched shunt": {"I": 0, "STATUS": 4, "BL": 11},
+    },
+}
 _ELSE = {"STATUS": 1.0, "CW": 1.0, "CZ": 1.0, "CM": 1.0, "IDE": 1.0, "VM": 1.0, "ZX": 1.0}
 _JUMPER = 1e-4  # p.u.; a branch of less is none to PSS/E (THRSHZ), and makes two buses one
 
@@ -60,11 +88,9 @@ class _Record(NamedTuple):
             raise UserError(f"{self.where}, {name}: {value:g}: must be above 0")
         return value
 
-    def numbers(self, kind: str) -> dict[str, float]:
+    def numbers(self, places: Mapping[str, int]) -> dict[str, float]:
         """Its fields by name; those that it leaves out have PSS/E's values."""
-        return {
-            name: self.number(name, at, _ELSE.get(name, 0.0)) for name, at in _FIELDS[kind].items()
-        }
+        return {name: self.number(name, at, _ELSE.get(name, 0.0)) for name, at in places.items()}
 
 
 def read_raw(path: str | Path) -> tuple[Any, list[str]]:
@@ -79,8 +105,10 @@ def read_raw(path: str | Path) -> tuple[Any, list[str]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The number of each line and its fields, without its comment."""
+    """The number of each line that is no comment, and its fields, without its comment."""
     for k, line in enumerate(lines_of(path), 1):
+        if line.startswith("@!"):
+            continue
         fields = []
         for one, end in re.findall(r"\s*('[^']*'|[^,/']*)\s*(,|/|$)", line):
             fields.append(one.strip("' "))
@@ -94,10 +122,13 @@ class RawCase(CaseTables):
 
     def __init__(self, path: Path) -> None:
         lines = list(_lines(path))
-        head = _Record(f"{path}, line 1", lines[0][1] if lines else [])
+        line, fields = lines[0] if lines else (1, list[str]())
+        head = _Record(f"{path}, line {line}", fields)
         revision = head.number("REV", 2)
-        if revision not in (31.0, 32.0, 33.0):
-            raise UserError(f"{path}, line 1, REV: revision {revision:g}: must be 31, 32 or 33")
+        if revision not in range(30, 36):
+            raise UserError(f"{head.where}, REV: revision {revision:g}: must be from 30 to 35")
+        self.places = _FIELDS | _OTHER_FIELDS.get(int(revision), {})
+        self.names = _OTHER_SECTIONS.get(int(revision), _SECTIONS)
         super().__init__(head.positive("SBASE", 1, 100.0), head.positive("BASFRQ", 5, 60.0))
         self.path = path
         self.sections = self._divided(lines[3:])
@@ -105,8 +136,8 @@ class RawCase(CaseTables):
         self._fill()
 
     def _divided(self, lines: list[tuple[int, list[str]]]) -> dict[str, list[_Record]]:
-        sections = {name: list[_Record]() for name in _SECTIONS}
-        names = iter(_SECTIONS)
+        sections = {name: list[_Record]() for name in _NEWER}
+        names = iter(self.names)
         name = next(names)
         for k, fields in lines:
             if fields[0] in ("0", "Q") and len(fields) == 1:
@@ -118,11 +149,12 @@ class RawCase(CaseTables):
 
     def _fill(self) -> None:
         for record in self.sections["bus"]:
-            p = record.numbers("bus")
+            p = record.numbers(self.places["bus"])
             self.numbers.add(p["I"])
             if p["IDE"] != 4.0:  # isolated
                 kV = record.positive("BASKV", 2, 1.0)
-                values = [1.0, 0.0, 0.0, 0.0, 0.0, p["VM"], p["VA"], kV]
+                Y = p.get("GL", 0.0), p.get("BL", 0.0)
+                values = [1.0, 0.0, 0.0, *Y, p["VM"], p["VA"], kV]
                 self.buses[int(p["I"])] = values
                 if p["IDE"] == 3.0:
                     values[0] = 3.0
@@ -140,8 +172,8 @@ class RawCase(CaseTables):
     def _working(self, kind: str) -> Iterator[tuple[_Record, dict[str, float]]]:
         """The records of a kind that are in service, as is their bus."""
         for record in self.sections[kind]:
-            p = record.numbers(kind)
-            if p["STATUS"] and all(
+            p = record.numbers(self.places[kind])
+            if p.get("STATUS", 1.0) and all(
                 self._has(record, n, p) for n in "IJK" if n in p and (p[n] or n != "K")
             ):
                 yield record, p
@@ -175,6 +207,7 @@ class RawCase(CaseTables):
             self.buses[k][0] = max(self.buses[k][0], 2.0)
 
     def _lines(self) -> None:
+        self.jumpers += [(int(p["I"]), int(p["J"])) for _, p in self._working(_SWITCHES)]
         for _, p in self._working("branch"):
             a, b = int(p["I"]), int(p["J"])
             if abs(complex(p["R"], p["X"])) < _JUMPER:

@@ -1,10 +1,12 @@
 """Power-flow cases of PSS/E, against the voltages that their files hold."""
 
+import re
+
 import numpy as np
 import pytest
 
 import gfmhil
-from gfm_hil.api.raw import read_raw
+from gfm_hil.api.raw import RawCase, read_raw
 from gfm_hil.cli import main
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import load_scenario
@@ -32,6 +34,63 @@ def test_a_published_case_has_the_voltages_of_its_file(tmp_path):
     assert nominal_frequency(load_scenario(network)) == pytest.approx(60.0)
     assert case.converters["converter2.toml"]["S_n"] == 900e6 and "bus11" not in case.voltages
     assert case.ignored == []
+
+
+def rewritten(revision: int) -> str:
+    """KUNDUR in another revision, with shunts at buses 7 and 8 and parts out of service besides.
+
+    The columns are those that published files have in their comments: case25_v35_savnwb.raw and
+    RTS_30.raw of PowerSystems.jl, and 240busWECC_2018_PSS_fixedshunt.raw of GridPACK.
+    """
+    title, *rest = KUNDUR.split("\n", 3)
+    parts = re.split(r"^ 0 .*\n", rest[-1], flags=re.MULTILINE)
+    buses, loads, _, machines, branches, transformers = (
+        [line.split(",") for line in part.splitlines()] for part in parts[:6]
+    )
+    machines += [[*machines[0][:14], "0"]]
+    branches = [[*one, *["0"] * 3, *["0"] * 4, "1"] for one in branches]
+    branches += [[*branches[0][:13], "0"], ["7", "8", "", "1", "1", "0", *["0"] * 3, "0", ".2"]]
+    switched = ["8", "0", "0", "1", "1", "1", "0", "100", "''", "20"]
+    fixed, switches = [["7", "'1'", "1", "10", "50"]], list[list[str]]()
+    if revision == 30:
+        Y = {"7": ("10", "50")}
+        buses = [[*b[:-5], *Y.get(b[0].strip(), "00"), *b[-5:-3], *b[-2:], "1"] for b in buses]
+        switched = [*switched[:2], *switched[4:]]
+    if revision >= 34:
+        branches = [[*b[:6], "''", *["0"] * 12, *b[9:]] for b in branches]
+        off, on = (["7", "8", "'@'", ".0001", *["0"] * 12, one, "1"] for one in "01")
+        switches = [off, ["10", "11", *on[2:]]]  # bus 11 is out of service
+    if revision == 35:
+        machines = [[*m[:8], "0", *m[8:]] for m in machines]
+        switched = ["8", "'1'", *switched[1:7], "0", *switched[7:]]
+    none = list[list[str]]()
+    more = [switched]
+    sections = {
+        30: [buses, loads, machines, branches, transformers, none, none, none, more],
+        34: [[["GENERAL", "THRSHZ=1"]], buses, loads, fixed, machines, branches, switches],
+    }.get(min(revision, 34), [buses, loads, fixed, machines, branches])
+    if revision != 30:
+        sections += [transformers, *[none] * 10, more]
+    text = "".join(
+        "@! I, J\n" * (revision > 33) + "".join(",".join(one) + "\n" for one in rows) + "0 / END\n"
+        for rows in sections
+    )
+    comment = "@!IC,SBASE,REV\n" * (revision > 33)
+    return f"{comment}{title.replace('32', str(revision))}\n\n\n{text}Q\n"
+
+
+@pytest.mark.parametrize("revision", [30, 31, 33, 34, 35])
+def test_all_revisions_are_one_case(revision, tmp_path):
+    cases = []
+    for one in (32, revision):
+        file = tmp_path / f"{one}.raw"
+        file.write_text(rewritten(one))
+        cases.append(RawCase(file))
+    first, other = cases
+    assert first.buses[7][3:5] == [10.0, 50.0 + 20.0] and first.buses[8][4] == 20.0
+    assert len(first.branches) == 16 and first.generators[1][1] == 900.0
+    for table in ("buses", "branches", "generators", "jumpers", "ignored"):
+        assert getattr(other, table) == getattr(first, table), table
 
 
 def test_three_windings_are_three_transformers(tmp_path):
@@ -71,7 +130,7 @@ def test_a_series_capacitor_is_a_part_of_its_line(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
-        ("  32, 0", "  35, 0", "line 1, REV: revision 35: must be 31, 32 or 33"),
+        ("  32, 0", "  36, 0", "line 1, REV: revision 36: must be from 30 to 35"),
         ("0.98337", "0.98x37", "line 8, bus, VM: '0.98x37' is no number from -1e6 to 1e6"),
         ("     7,'2 ',1", "    77,'2 ',1", "line 16, load, I: 77: there is no such bus"),
         ("\n 0 /End of Transformer data\nQ", "", ""),
