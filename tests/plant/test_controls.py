@@ -414,7 +414,7 @@ def kind_of(one: Control) -> str:
     ("more", "message"),
     [
         ({"avr": {"type": "IEEET2"}}, "'SEXS', 'IEEET1'"),
-        ({"avr": {"type": "ESST4B", "K_PM": 0.0, "K_IM": 0.0}}, "K_PM and K_IM are 0: it would"),
+        ({"avr": {"type": "ESST4B", "V_Mmin": 1.0}}, "V_Mmin = 1: must be less than V_Mmax, 1"),
         ({"governor": {"type": "GGOV1", "T_sb": 0.0}}, "T_sb = 0: must be above 0 with T_sa = 4"),
         ({"governor": {"type": "GOV"}}, "'TGOV1', 'IEEEG1', 'HYGOV', 'GAST', 'GGOV1'"),
         ({"governor": {"type": "IEEEG1", "K1": 0.0, "K3": 0.0}}, "K1, K3, K5 and K7 are 0"),

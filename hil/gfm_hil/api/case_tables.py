@@ -27,7 +27,7 @@ class CaseTables:
         self.generators: dict[int, tuple[float, float, float]] = {}
 
     def net(self) -> Any:
-        """The net of pandapower."""
+        """The net of pandapower, whose buses are called by their numbers."""
         import pandapower as pp
 
         net = pp.create_empty_network(f_hz=self.f, sn_mva=self.S_b)

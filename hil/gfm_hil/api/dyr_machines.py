@@ -171,8 +171,12 @@ def _ieeet2(p: Numbers) -> Made:
     return content, [*notes, f"its feedback has one lag, T_F = {p['T_F']:g} s"]
 
 
-def _exst1(p: Numbers) -> Made:
-    return _lagging({"type": "EXST1", **p}, "T_R", "T_A", "T_F")
+def _plain(type: str, lags: str, p: Numbers) -> Made:
+    """A record that has the parameters of ours; ``lags`` are those that ours must have."""
+    return _lagging({"type": type, **p}, *lags.split())
+
+
+_exst1 = partial(_plain, "EXST1", "T_R T_A T_F")
 
 
 def _esst1a(p: Numbers) -> Made:
@@ -204,44 +208,24 @@ def _scrx(p: Numbers) -> Made:
     return content, [*notes, "its gain does not follow the voltage"]
 
 
-def _esst3a(p: Numbers) -> Made:
-    return _lagging({"type": "ESST3A", **p}, "T_R", "T_M")
-
-
-def _esst4b(p: Numbers) -> Made:
-    return _lagging({"type": "ESST4B", **p}, "T_R", *["T_A"] * (p["T_A"] > 0.0))
-
-
-def _gast(p: Numbers) -> Made:
-    return _lagging({"type": "GAST", **p}, "T1", "T2", "T3")
-
-
 def _ggov1(p: Numbers) -> Made:
     """Its limit by the acceleration would act below R_open, the rate of its valve, in a fall."""
-    notes = []
-    if (select := p.pop("R_select")) != 1.0:
-        notes.append(f"its droop is by the electric power, not by R_select = {select:g}")
-    p["flag"] = bool(p["flag"])
-    if p["T_rate"] == 0.0:
-        p.pop("T_rate")
-    left_out = {
-        "its limit by the acceleration": p.pop("K_a") > 0.0 and p["T_a"] > 0.0,
-        "K_imw": p.pop("K_imw") != 0.0,
-        "T_eng": p.pop("T_eng") > 0.0,
-        "D_m < 0": p["D_m"] < 0.0,
-    }
-    p["D_m"] = max(p["D_m"], 0.0)
-    for name in ("A_set", "T_a", "R_up", "R_down"):
+    select, K_a, T_a, K_imw, T_eng, *_ = (
         p.pop(name)
+        for name in ("R_select", "K_a", "T_a", "K_imw", "T_eng", "A_set", "R_up", "R_down")
+    )
+    parts = {"its limit by the acceleration": K_a and T_a, "K_imw": K_imw, "T_eng": T_eng,
+             "D_m < 0": p["D_m"] < 0.0}  # fmt: skip
+    notes = [f"{part} is left out" for part, acts in parts.items() if acts]
+    if select != 1.0:
+        notes.append(f"its droop is by the electric power, not by R_select = {select:g}")
+    p["flag"], p["D_m"] = bool(p["flag"]), max(p["D_m"], 0.0)
+    if p["T_rate"] == 0.0:  # that of the machine
+        p.pop("T_rate")
     if p["T_dgov"] == 0.0:
         p["K_dgov"], p["T_dgov"] = 0.0, 1.0
-    notes += [f"{what} is left out" for what, uses in left_out.items() if uses]
-    content, more = _lagging(p, "T_pelec", "T_act", "T_b", "T_fload")
-    return {"type": "GGOV1", **content}, notes + more
-
-
-def _tgov1(p: Numbers) -> Made:
-    return _lagging({"type": "TGOV1", **p}, "T1", "T3")
+    content, more = _plain("GGOV1", "T_pelec T_act T_b T_fload", p)
+    return content, notes + more
 
 
 def _ieeeg1(p: Numbers) -> Made:
@@ -257,10 +241,6 @@ def _wsieg1(p: Numbers) -> Made:
     more = [p.pop(name) for name in (*_CURVE, "block")]
     content, notes = _ieeeg1(p)
     return content, notes + ["its dead bands and its curve are left out"] * any(more)
-
-
-def _hygov(p: Numbers) -> Made:
-    return _lagging({"type": "HYGOV", **p}, "T_r", "T_f", "T_g", "T_W")
 
 
 def _stabiliser(p: Numbers) -> Made:
@@ -461,22 +441,26 @@ MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
         "avr",
         ("T_R", "V_Imax", "V_Imin", "K_M", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_G",
          "K_P", "K_I", "V_Bmax", "K_C", "X_L", "V_Gmax", "theta_P", "T_M", "V_Mmax", "V_Mmin"),
-        _esst3a,
+        partial(_plain, "ESST3A", "T_R T_M"),
     ),
     "ESST4B": (
         "avr",
         ("T_R", "K_PR", "K_IR", "V_Rmax", "V_Rmin", "T_A", "K_PM", "K_IM", "V_Mmax", "V_Mmin",
          "K_G", "K_P", "K_I", "V_Bmax", "K_C", "X_L", "theta_P"),
-        _esst4b,
+        partial(_plain, "ESST4B", "T_R"),
     ),
     "IEEEG1": ("governor", _STEAM, _ieeeg1),
     "WSIEG1": ("governor", (*_STEAM, *_CURVE, "block"), _wsieg1),
     "HYGOV": (
         "governor",
         ("R", "r", "T_r", "T_f", "T_g", "VELM", "G_max", "G_min", "T_W", "A_t", "D_turb", "q_NL"),
-        _hygov,
+        partial(_plain, "HYGOV", "T_r T_f T_g T_W"),
     ),
-    "GAST": ("governor", ("R", "T1", "T2", "T3", "A_T", "K_T", "V_max", "V_min", "D_turb"), _gast),
+    "GAST": (
+        "governor",
+        ("R", "T1", "T2", "T3", "A_T", "K_T", "V_max", "V_min", "D_turb"),
+        partial(_plain, "GAST", "T1 T2 T3"),
+    ),
     "GGOV1": (
         "governor",
         ("R_select", "flag", "R", "T_pelec", "maxerr", "minerr", "K_pgov", "K_igov", "K_dgov",
@@ -485,7 +469,11 @@ MODELS: dict[str, tuple[str, tuple[str, ...], Callable[[Numbers], Made]]] = {
          "T_rate", "db", "T_sa", "T_sb", "R_up", "R_down"),
         _ggov1,
     ),
-    "TGOV1": ("governor", ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"), _tgov1),
+    "TGOV1": (
+        "governor",
+        ("R", "T1", "V_max", "V_min", "T2", "T3", "D_t"),
+        partial(_plain, "TGOV1", "T1 T3"),
+    ),
     "PSS1A": ("pss", ("mode", "bus", "A1", "A2", *_LEADS), _stabiliser),
     "IEEEST": ("pss", ("mode", "bus", "A1", "A2", "A3", "A4", "A5", "A6", *_LEADS), _stabiliser),
     "ST2CUT": (

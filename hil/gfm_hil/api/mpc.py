@@ -9,7 +9,6 @@ transformer at its from bus, and behind it the impedance with half of the chargi
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 from gfm_hil.api.case_tables import CaseTables, Winding
 from gfm_hil.api.dyr import number
@@ -30,23 +29,11 @@ _COMMENT = re.compile(r"((?:'[^']*'|[^%])*)%?.*")
 _NUMBER = re.compile(r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _AROUND = re.compile(r"\s*(?:function\b.*|(?:end|return)\s*;?\s*)?")
 
-_Row = tuple[str, list[str]]  # file, line and field, and its numbers
 
-
-def read_mpc(path: str | Path) -> tuple[Any, list[str]]:
-    """The net of a case, whose buses are called by their numbers, and what it leaves out.
-
-    Raises:
-        UserError: the file cannot be read, is of another version, computes, or a row is none; the
-            message has the file, the line and the column.
-    """
-    case = MpcCase(Path(path))
-    return case.net(), case.ignored
-
-
-def _fields(path: Path) -> dict[str, list[_Row]]:
-    """The rows of the matrices of a file, and its numbers and texts as such of one."""
-    fields: dict[str, list[_Row]] = {}
+def _fields(path: Path) -> dict[str, list[tuple[str, list[str]]]]:
+    """The rows of the matrices of a file, and its numbers and texts as such of one: file, line and
+    field, and numbers."""
+    fields: dict[str, list[tuple[str, list[str]]]] = {}
     name, closing = "", ""
     for k, whole in enumerate(lines_of(path), 1):
         line = _COMMENT.fullmatch(whole)[1]  # type: ignore[index]
@@ -57,22 +44,17 @@ def _fields(path: Path) -> dict[str, list[_Row]]:
             if match is None:
                 if not _AROUND.fullmatch(line):
                     text = line.strip()[:40]
-                    raise UserError(
-                        f"{path}, line {k}: {text!r}: only mpc.NAME = numbers is read, not what"
-                        " computes"
-                    )
+                    raise UserError(f"{path}, line {k}: {text!r}: only mpc.NAME = numbers is read")
                 continue
-            name, opening, line = match[1], match[2], match[3]
+            name, line, closing = match[1], match[3], {"[": "]", "{": "}", "": ""}[match[2]]
             fields[name] = []
-            closing = {"[": "]", "{": "}", "": ""}[opening]
         content, end, rest = line.strip("; "), "", ""
         if closing:
             content, end, rest = re.sub("'[^']*'", "''", line).partition(closing)
         for row in content.split(";"):
             if numbers := row.replace(",", " ").split():
                 fields[name].append((f"{path}, line {k}, mpc.{name}", numbers))
-        if end:
-            closing = ""
+        closing = "" if end else closing
         if rest := rest.strip("; "):
             raise UserError(f"{path}, line {k}: {rest!r}: only one mpc.NAME = ... a line is read")
     if closing:
@@ -81,7 +63,12 @@ def _fields(path: Path) -> dict[str, list[_Row]]:
 
 
 class MpcCase(CaseTables):
-    """A case of MATPOWER. Raises UserError: as ``read_mpc``."""
+    """A case of MATPOWER.
+
+    Raises:
+        UserError: the file cannot be read, is of another version, computes, or a row is none; the
+            message has the file, the line and the column.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path, self.fields = path, _fields(path)

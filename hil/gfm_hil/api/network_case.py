@@ -373,21 +373,20 @@ class _Build:
         """Its governor, which opens as far as the case asks for: in many published files machines
         bring more than their governors let them by the rating."""
         governor: dict[str, Any] = machine["governor"]
-        P, changed = machine["P"], dict[str, Any]()
-        while True:
+        changed, before, shaft = dict[str, Any](), dict[str, float](), Shaft(0.0, machine["P"])
+        for _ in range(9):  # the valve of GGOV1 does not follow its T_rate in proportion
             whole = machine | {"governor": governor | changed}
             one: Any = SynchronousMachine.model_validate(whole).governor
-            states, _ = one.rest(P, Shaft(0.0, P))
-            ends = one.limits_at(Shaft(0.0, P))
-            over = [(states[at], most) for at, (_, most) in ends.items() if states[at] >= most]
-            if not over:
-                break
-            state, most = over[0]
-            changed |= {name: _ROOM * state * (getattr(one, name) / most) for name in one.opens}
+            states, _ = one.rest(machine["P"], shaft)
+            for at, (_, most) in one.limits_at(shaft).items():
+                if states[at] >= most:
+                    for name in one.opens or [f"{name}max" for name in one.stops.values()]:
+                        before.setdefault(name, getattr(one, name))
+                        changed[name] = _ROOM * states[at] * (getattr(one, name) / most)
         for name, value in changed.items():
             self.ignored.append(
-                f"{one.kind()} at {bus}: {name} = {value:.4g} instead of {governor[name]:g}, for"
-                " the power that the case has there."
+                f"{one.kind()} at {bus}: {name} = {value:.4g} instead of {before[name]:g}, for the"
+                " power that the case has there."
             )
         return governor | changed
 

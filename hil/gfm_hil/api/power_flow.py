@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_hil.api.mpc import read_mpc
-from gfm_hil.api.raw import read_raw
+from gfm_hil.api.mpc import MpcCase
+from gfm_hil.api.raw import RawCase
 from gfm_hil.core.errors import UserError, need
 from gfm_runtime.errors import meant
 
 _MOST_BUSES = 500  # the matrices of a network are dense
 _NEAR = 1e-6  # p.u.; a smaller current comes from rounding
-_READERS = {".raw": read_raw, ".m": read_mpc}
+_READERS: dict[str, type[RawCase | MpcCase]] = {".raw": RawCase, ".m": MpcCase}
 _IGNORED = {
     "controller": "they stand where the power flow leaves them",
     "motor": "impedances, as loads are",
@@ -74,8 +74,9 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     ignored: list[str] = []
     if isinstance(case, str | Path):
         title = title or Path(case).stem
-        if (read := _READERS.get(Path(case).suffix.lower())) is not None:
-            case, ignored = read(case)
+        if (reader := _READERS.get(Path(case).suffix.lower())) is not None:
+            tables = reader(Path(case))
+            case, ignored = tables.net(), tables.ignored
         else:
             case = _load_pandapower(str(case))
     title = title or str(case.name or "case")

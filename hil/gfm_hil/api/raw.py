@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gfm_hil.api.case_tables import CaseTables, Winding
 from gfm_hil.api.dyr import number
@@ -93,17 +93,6 @@ class _Record(NamedTuple):
         return {name: self.number(name, at, _ELSE.get(name, 0.0)) for name, at in places.items()}
 
 
-def read_raw(path: str | Path) -> tuple[Any, list[str]]:
-    """The net of a case, whose buses are called by their numbers, and what it leaves out.
-
-    Raises:
-        UserError: the file cannot be read, is of another revision, or a record is none; the message
-            has the file, the line and the field.
-    """
-    case = RawCase(Path(path))
-    return case.net(), case.ignored
-
-
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The number of each line that is no comment, and its fields, without its comment."""
     for k, line in enumerate(lines_of(path), 1):
@@ -118,7 +107,12 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 class RawCase(CaseTables):
-    """A case of PSS/E. Raises UserError: as ``read_raw``."""
+    """A case of PSS/E.
+
+    Raises:
+        UserError: the file cannot be read, is of another revision, or a record is none; the message
+            has the file, the line and the field.
+    """
 
     def __init__(self, path: Path) -> None:
         lines = list(_lines(path))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gfmhil
-from gfm_hil.api.mpc import read_mpc
+from gfm_hil.api.mpc import MpcCase
 from gfm_hil.cli import main
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import load_scenario
@@ -52,7 +52,8 @@ def test_branches_are_those_of_the_manual(tmp_path):
     """The admittances of MATPOWER's manual, (3.2), give the powers of all generators and loads."""
     file = tmp_path / "mesh.m"
     file.write_text(MESH)
-    net, ignored = read_mpc(file)
+    case = MpcCase(file)
+    net = case.net()
     pandapower.runpp(net, init="dc", tolerance_mva=1e-9, numba=False, trafo_model="pi")
     V = net.res_bus.vm_pu * np.exp(1j * np.radians(net.res_bus.va_degree))
     assert [*V.index] == [1, 20, 3, 4] and (V[1], abs(V[4])) == pytest.approx((1.02, 1.01))
@@ -73,7 +74,7 @@ def test_branches_are_those_of_the_manual(tmp_path):
     assert abs(drawn[20]) < 1e-10 and abs(drawn[3]) < 1e-10
     assert drawn[4].real == pytest.approx(15 / 50)
     assert [*net.gen.sn_mva] == [50.0] and [*net.ext_grid.sn_mva] == [80.0]  # 10 + 40, and PMAX
-    assert len(ignored) == 1
+    assert len(case.ignored) == 1
 
 
 @pytest.mark.parametrize(

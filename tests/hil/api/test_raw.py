@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gfmhil
-from gfm_hil.api.raw import RawCase, read_raw
+from gfm_hil.api.raw import RawCase
 from gfm_hil.cli import main
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.scenario import load_scenario
@@ -101,8 +101,9 @@ def test_three_windings_are_three_transformers(tmp_path):
         "2,'1',1,1,1,20.,5.\n3,'1',1,1,1,10.,0.\n0\n0\n1,'1',30.,0,0,0,1,0,60.\n0\n0\n"
         "1,2,3,'1',1,2,1,0,0,2,'x',1\n0,.1,50,0,.2,50,0,.15,50,1,0\n1,0,0\n1,0,0\n1.1,0,0\n0\nQ\n"
     )
-    net, ignored = read_raw(file)
-    assert len(net.bus) == 4 and net.f_hz == 50.0 and ignored == []
+    case = RawCase(file)
+    net = case.net()
+    assert len(net.bus) == 4 and net.f_hz == 50.0 and case.ignored == []
     pandapower.runpp(net, init="dc", tolerance_mva=1e-9, numba=False)
     V = net.res_bus.vm_pu * np.exp(1j * np.radians(net.res_bus.va_degree))
     i2, i3 = np.conj((0.2 + 0.05j) / V[2]), 1.1 * np.conj(0.1 / V[3])

@@ -58,10 +58,15 @@ class Control(Options):
     ranges: ClassVar[Sequence[str]] = ()
     #: leads that need a lag, with it: their names
     leads: ClassVar[Sequence[tuple[str, str]]] = ()
+    #: options that ``rates`` takes first, in their order, and those that are time constants
+    order: ClassVar[Sequence[str]]
+    times: ClassVar[Sequence[str]]
+    #: by the place of a state, options between which it stays, named as in ``ranges``
+    stops: ClassVar[Mapping[int, str]] = {}
 
     @model_validator(mode="after")
     def _is_proper(self) -> Self:
-        for name in self.ranges:
+        for name in (*self.ranges, *self.stops.values()):
             least, most = getattr(self, f"{name}min"), getattr(self, f"{name}max")
             if not least < most:
                 raise ValueError(f"{name}min = {least:g}: must be less than {name}max, {most:g}")
@@ -79,15 +84,18 @@ class Control(Options):
 
     def numbers(self) -> Sequence[float]:
         """What ``rates`` takes as p."""
-        raise NotImplementedError
+        return [float(getattr(self, name)) for name in self.order]
 
     def lags(self) -> Mapping[str, float]:
-        """Its time constants by their names, s."""
-        raise NotImplementedError
+        """Its time constants by their names, s, but for those that leave a block out."""
+        return {name: T for name in self.times if (T := getattr(self, name)) > 0.0}
 
     def limits(self) -> Mapping[int, tuple[float, float]]:
         """Between which values a state stays, by its place: a limit without wind-up."""
-        return {}
+        return {
+            place: (getattr(self, f"{name}min"), getattr(self, f"{name}max"))
+            for place, name in self.stops.items()
+        }
 
     def limits_at(self, seen: Any) -> Mapping[int, tuple[float, float]]:
         """The limits at what it sees at a rest, those that follow it included."""
@@ -109,8 +117,8 @@ class Governor(Control):
     """A governor with its turbine: sees ``Shaft``, is asked for a power, gives the torque of the
     turbine."""
 
-    #: options of which a larger one lets it bring more at rest
-    opens: ClassVar[Sequence[str]]
+    #: options of which a larger one lets it bring more at rest, if not those of its stops
+    opens: ClassVar[Sequence[str]] = ()
 
     def per_speed(self) -> float:
         """How much more torque it gives at rest by a lower speed, p.u./p.u."""

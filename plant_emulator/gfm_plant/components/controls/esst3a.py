@@ -5,11 +5,9 @@ the field's voltage inside (ST3A of IEEE Std 421.5):
     T_B dy/dt = V_I - y,
     T_A dV_R/dt = K_A (y + (V_I - y) T_C / T_B) - V_R,    V_Rmin <= V_R <= V_Rmax,
     T_M dV_M/dt = K_M (V_R - min(K_G E_fd, V_Gmax)) - V_M,    V_Mmin <= V_M <= V_Mmax,
-    E_fd = V_B V_M,    V_B = min(V_E F(K_C I_fd / V_E), V_Bmax),
-    V_E = |K_Pp v + j (K_I + K_Pp X_L) i|,    K_Pp = K_P e^(j theta_P),
+    E_fd = V_B V_M,
 
-with the phasors v and i of the terminals and the current I_fd of the field (`rectifier`). The gate
-for a limiter of under-excitation is left out.
+with V_B of `rectifier`. The gate for a limiter of under-excitation is left out.
 """
 
 import math
@@ -54,8 +52,12 @@ class Esst3a(CompoundExciter):
         ("V_M", "p.u.", "output of the inner regulator"),
     )
     rates: ClassVar = _rates
-    ranges: ClassVar = "V_I", "V_R", "V_M"
+    ranges: ClassVar = ("V_I",)
     leads: ClassVar = (("T_C", "T_B"),)
+    order: ClassVar = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin",
+                       "K_G", "K_M", "T_M")  # fmt: skip
+    times: ClassVar = "T_R", "T_B", "T_A"
+    stops: ClassVar = {2: "V_R", 3: "V_M"}
 
     type: Literal["ESST3A"] = Field("ESST3A", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
@@ -75,18 +77,12 @@ class Esst3a(CompoundExciter):
     V_Mmin: float = Field(0.0, ge=-1e4, le=1e4, description="least output of it, p.u.")
 
     def numbers(self) -> Sequence[float]:
-        names = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_G",
-                 "K_M", "T_M")  # fmt: skip
-        return *(getattr(self, name) for name in names), *self.source(), self.V_Gmax
+        return *super().numbers(), *self.source(), self.V_Gmax
 
     def lags(self) -> Mapping[str, float]:
-        own = {name: getattr(self, name) for name in ("T_R", "T_B", "T_A")}
         V_B = min(self.K_P * (1.0 + self.X_L) + self.K_I, self.V_Bmax)  # at 1 p.u. of both
-        own["T_M / (1 + K_M K_G V_B)"] = self.T_M / (1.0 + self.K_M * self.K_G * V_B)
-        return {name: T for name, T in own.items() if T > 0.0}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {2: (self.V_Rmin, self.V_Rmax), 3: (self.V_Mmin, self.V_Mmax)}
+        inner = self.T_M / (1.0 + self.K_M * self.K_G * V_B)
+        return {**super().lags(), "T_M / (1 + K_M K_G V_B)": inner}
 
     def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
         return {1: (self.V_Imin, self.V_Imax), **self.limits()}

@@ -12,9 +12,9 @@ gate for a limiter of over-excitation is left out.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from gfm_plant.components.controls.control import Terminals
 from gfm_plant.components.controls.rectifier import CompoundExciter, rectified
@@ -56,34 +56,25 @@ class Esst4b(CompoundExciter):
     )
     rates: ClassVar = _rates
     ranges: ClassVar = "V_R", "V_M"
+    order: ClassVar = ("T_R", "K_PR", "K_IR", "V_Rmax", "V_Rmin", "T_A", "K_PM", "K_IM", "V_Mmax",
+                       "V_Mmin", "K_G")  # fmt: skip
+    times: ClassVar = "T_R", "T_A"
 
     type: Literal["ESST4B"] = Field("ESST4B", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
-    K_PR: NonNegative = Field(2.97, description="gain of the outer regulator")
+    K_PR: Positive = Field(2.97, description="gain of the outer regulator")
     K_IR: NonNegative = Field(2.97, description="its gain of the integral, 1/s; 0: none")
     V_Rmax: float = Field(1.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
     V_Rmin: float = Field(-0.87, ge=-1e4, le=1e4, description="least output of it, p.u.")
     T_A: NonNegative = Field(0.01, description="lag of the outer regulator, s; 0: none")
-    K_PM: NonNegative = Field(1.0, description="gain of the inner regulator")
+    K_PM: Positive = Field(1.0, description="gain of the inner regulator")
     K_IM: NonNegative = Field(0.2, description="its gain of the integral, 1/s; 0: none")
     V_Mmax: float = Field(1.0, ge=-1e4, le=1e4, description="largest output of it, p.u.")
     V_Mmin: float = Field(-0.87, ge=-1e4, le=1e4, description="least output of it, p.u.")
     K_G: NonNegative = Field(0.1, description="gain of the feedback of E_fd")
 
-    @model_validator(mode="after")
-    def _regulates(self) -> Self:
-        for one in "RM":
-            if not getattr(self, f"K_P{one}") + getattr(self, f"K_I{one}") > 0.0:
-                raise ValueError(f"K_P{one} and K_I{one} are 0: it would regulate nothing")
-        return self
-
     def numbers(self) -> Sequence[float]:
-        names = ("T_R", "K_PR", "K_IR", "V_Rmax", "V_Rmin", "T_A", "K_PM", "K_IM", "V_Mmax",
-                 "V_Mmin", "K_G")  # fmt: skip
-        return *(getattr(self, name) for name in names), *self.source()
-
-    def lags(self) -> Mapping[str, float]:
-        return {name: T for name in ("T_R", "T_A") if (T := getattr(self, name)) > 0.0}
+        return *super().numbers(), *self.source()
 
     def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
         return {2: (self.V_Rmin, self.V_Rmax), 3: (self.V_Mmin, self.V_Mmax)}

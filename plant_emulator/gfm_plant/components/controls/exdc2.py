@@ -48,6 +48,9 @@ class Exdc2(Ieeet1):
     states: ClassVar = (*Ieeet1.states, ("y", "p.u.", "of its lead and lag"))
     rates: ClassVar = _rates
     leads: ClassVar = (("T_C", "T_B"),)
+    ranges: ClassVar = ("V_R",)
+    times: ClassVar = *Ieeet1.times, "T_B"
+    stops: ClassVar[Mapping[int, str]] = {}
 
     type: Literal["EXDC2"] = Field("EXDC2", description="which exciter")  # type: ignore[assignment]
     T_B: NonNegative = Field(0.0, description="lag before the regulator, s; 0: neither it nor T_C")
@@ -55,12 +58,6 @@ class Exdc2(Ieeet1):
 
     def numbers(self) -> Sequence[float]:
         return *super().numbers(), self.T_B, self.T_C, self.V_Rmin, self.V_Rmax
-
-    def lags(self) -> Mapping[str, float]:
-        return {**super().lags(), **({"T_B": self.T_B} if self.T_B > 0.0 else {})}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {}
 
     def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
         return {1: (self.V_Rmin * seen.V, self.V_Rmax * seen.V)}

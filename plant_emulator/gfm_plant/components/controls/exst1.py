@@ -51,6 +51,9 @@ class Exst1(Exciter):
     rates: ClassVar = _rates
     ranges: ClassVar = "V_I", "V_R"
     leads: ClassVar = (("T_C", "T_B"),)
+    order: ClassVar = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin",
+                       "K_C", "K_F", "T_F")  # fmt: skip
+    times: ClassVar = "T_R", "T_B", "T_A", "T_F"
 
     type: Literal["EXST1"] = Field("EXST1", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
@@ -65,15 +68,6 @@ class Exst1(Exciter):
     K_C: NonNegative = Field(0.0, description="by how much the field's current lowers both")
     K_F: NonNegative = Field(0.01, description="gain of the stabilising feedback, s")
     T_F: Positive = Field(1.0, description="time constant of the stabilising feedback, s")
-
-    def numbers(self) -> Sequence[float]:
-        names = ("T_R", "V_Imax", "V_Imin", "T_C", "T_B", "K_A", "T_A", "V_Rmax", "V_Rmin", "K_C",
-                 "K_F", "T_F")  # fmt: skip
-        return [getattr(self, name) for name in names]
-
-    def lags(self) -> Mapping[str, float]:
-        own = {name: getattr(self, name) for name in ("T_R", "T_B", "T_A", "T_F")}
-        return {name: T for name, T in own.items() if T > 0.0}
 
     def limits_at(self, seen: Terminals) -> Mapping[int, tuple[float, float]]:
         drop = self.K_C * seen.I_fd

@@ -37,7 +37,9 @@ class Gast(Governor):
     )
     rates: ClassVar = _rates
     opens: ClassVar = "V_max", "A_T"
-    ranges: ClassVar = ("V_",)
+    order: ClassVar = "R", "T1", "T2", "T3", "A_T", "K_T", "D_turb"
+    times: ClassVar = "T1", "T2", "T3"
+    stops: ClassVar = {0: "V_"}
 
     type: Literal["GAST"] = Field("GAST", description="which governor")
     R: Positive = Field(0.05, description="droop, frequency by power, p.u./p.u.")
@@ -49,15 +51,6 @@ class Gast(Governor):
     V_max: float = Field(1.1, ge=-100.0, le=100.0, description="largest opening of it, p.u.")
     V_min: float = Field(0.0, ge=-100.0, le=100.0, description="least opening of it, p.u.")
     D_turb: NonNegative = Field(0.0, description="damping of the turbine by frequency, p.u./p.u.")
-
-    def numbers(self) -> Sequence[float]:
-        return self.R, self.T1, self.T2, self.T3, self.A_T, self.K_T, self.D_turb
-
-    def lags(self) -> Mapping[str, float]:
-        return {"T1": self.T1, "T2": self.T2, "T3": self.T3}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {0: (self.V_min, self.V_max)}
 
     def limits_at(self, seen: Shaft) -> Mapping[int, tuple[float, float]]:
         return {0: (self.V_min, min(self.V_max, self.A_T))}

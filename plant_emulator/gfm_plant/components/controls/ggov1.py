@@ -27,10 +27,6 @@ from gfm_plant.components.controls.control import Governor, Shaft
 from gfm_plant.parameters import NonNegative, Positive
 from gfm_runtime.compiled import compiled
 
-_NAMES = ("R", "T_pelec", "maxerr", "minerr", "K_pgov", "K_igov", "K_dgov", "T_dgov", "V_max",
-          "V_min", "T_act", "K_turb", "W_fnl", "T_b", "T_c", "T_fload", "K_pload", "K_iload",
-          "D_m", "R_open", "R_close", "T_rate", "db", "T_sa", "T_sb")  # fmt: skip
-
 
 @compiled
 def _rates(p: Any, x: Any, at: int, seen: Shaft, asked: float, out: Any) -> float:
@@ -38,7 +34,7 @@ def _rates(p: Any, x: Any, at: int, seen: Shaft, asked: float, out: Any) -> floa
     T_dgov, V_max, V_min, T_act, K_turb, W_fnl = p[7], p[8], p[9], p[10], p[11], p[12]
     T_b, T_c, T_fload, K_pload, K_iload, D_m = p[13], p[14], p[15], p[16], p[17], p[18]
     R_open, R_close, T_rate, db, T_sa, T_sb = p[19], p[20], p[21], p[22], p[23], p[24]
-    allowed, flag = p[25], p[26]
+    flag, allowed = p[25], p[26]
     P, e_d, x_I, x_L = x[at], x[at + 1], x[at + 2], x[at + 3]
     v, y, s, t = x[at + 4], x[at + 5], x[at + 6], x[at + 7]
     out[at] = (seen.P_e / T_rate - P) / T_pelec
@@ -82,6 +78,12 @@ class Ggov1(Governor):
     opens: ClassVar = ("T_rate",)
     ranges: ClassVar = ("V_",)
     leads: ClassVar = (("T_sa", "T_sb"),)
+    order: ClassVar = (
+        "R", "T_pelec", "maxerr", "minerr", "K_pgov", "K_igov", "K_dgov", "T_dgov", "V_max",
+        "V_min", "T_act", "K_turb", "W_fnl", "T_b", "T_c", "T_fload", "K_pload", "K_iload", "D_m",
+        "R_open", "R_close", "T_rate", "db", "T_sa", "T_sb", "flag",
+    )  # fmt: skip
+    times: ClassVar = "T_pelec", "T_dgov", "T_act", "T_b", "T_fload", "T_sb"
 
     type: Literal["GGOV1"] = Field("GGOV1", description="which governor")
     flag: bool = Field(True, description="whether the flow of fuel follows the speed")
@@ -117,11 +119,10 @@ class Ggov1(Governor):
         return self.L_dref / self.K_turb + self.W_fnl
 
     def numbers(self) -> Sequence[float]:
-        return *(getattr(self, name) for name in _NAMES), self._allowed(), float(self.flag)
+        return *super().numbers(), self._allowed()
 
     def lags(self) -> Mapping[str, float]:
-        names = ("T_pelec", "T_act", "T_b", "T_fload", "T_sb", *["T_dgov"] * (self.K_dgov > 0.0))
-        own = {name: T for name in names if (T := getattr(self, name)) > 0.0}
+        own = {**super().lags()}
         for one in ("gov", "load"):
             K_p, K_i = getattr(self, f"K_p{one}"), getattr(self, f"K_i{one}")
             if K_i > 0.0:

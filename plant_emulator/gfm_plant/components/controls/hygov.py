@@ -8,7 +8,7 @@ where w is the deviation of the speed, c the gate that is wanted, g the gate, q 
 head. Its permanent droop is R, the temporary one r.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -45,8 +45,9 @@ class Hygov(Governor):
         ("q", "p.u.", "flow of the water"),
     )
     rates: ClassVar = _rates
-    opens: ClassVar = ("G_max",)
-    ranges: ClassVar = ("G_",)
+    order: ClassVar = "R", "r", "T_r", "T_f", "T_g", "VELM", "T_W", "A_t", "D_turb", "q_NL"
+    times: ClassVar = "T_r", "T_f", "T_g", "T_W"
+    stops: ClassVar = {1: "G_"}
 
     type: Literal["HYGOV"] = Field("HYGOV", description="which governor")
     R: Positive = Field(0.05, description="permanent droop, frequency by gate, p.u./p.u.")
@@ -61,16 +62,6 @@ class Hygov(Governor):
     A_t: Positive = Field(1.2, description="gain of the turbine")
     D_turb: NonNegative = Field(0.5, description="damping of the turbine, p.u./p.u.")
     q_NL: NonNegative = Field(0.08, description="flow without load, p.u.")
-
-    def numbers(self) -> Sequence[float]:
-        names = ("R", "r", "T_r", "T_f", "T_g", "VELM", "T_W", "A_t", "D_turb", "q_NL")
-        return [getattr(self, name) for name in names]
-
-    def lags(self) -> Mapping[str, float]:
-        return {name: getattr(self, name) for name in ("T_r", "T_f", "T_g", "T_W")}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {1: (self.G_min, self.G_max)}
 
     def per_speed(self) -> float:
         return self.A_t / self.R

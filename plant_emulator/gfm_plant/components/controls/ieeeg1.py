@@ -9,7 +9,7 @@ where w is the deviation of the speed and g the valves. A time constant of 0 lea
 the shaft of low pressure, K2, K4, K6 and K8, is not there.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -50,9 +50,10 @@ class Ieeeg1(Governor):
         ("x_4 … x_7", "p.u.", "power behind chest, reheater and crossovers"),
     )
     rates: ClassVar = _rates
-    opens: ClassVar = ("P_max",)
-    ranges: ClassVar = ("P_",)
     leads: ClassVar = (("T2", "T1"),)
+    order: ClassVar = "K", "T1", "T2", "T3", "U_o", "U_c", *_LAGS, *_SHARES
+    times: ClassVar = "T1", "T3", *_LAGS
+    stops: ClassVar = {1: "P_"}
 
     type: Literal["IEEEG1"] = Field("IEEEG1", description="which governor")
     K: Positive = Field(20.0, description="gain, power by speed, p.u./p.u.")
@@ -81,17 +82,6 @@ class Ieeeg1(Governor):
     def gain(self) -> float:
         """The power by the position of the valves."""
         return sum(getattr(self, name) for name in _SHARES)
-
-    def numbers(self) -> Sequence[float]:
-        names = ("K", "T1", "T2", "T3", "U_o", "U_c", *_LAGS, *_SHARES)
-        return [getattr(self, name) for name in names]
-
-    def lags(self) -> Mapping[str, float]:
-        each = {name: getattr(self, name) for name in ("T1", "T3", *_LAGS)}
-        return {name: T for name, T in each.items() if T > 0.0}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {1: (self.P_min, self.P_max)}
 
     def per_speed(self) -> float:
         return self.K * self.gain()

@@ -45,7 +45,9 @@ class Ieeet1(Exciter):
         ("x", "p.u.", "of the stabilising feedback"),
     )
     rates: ClassVar = _rates
-    ranges: ClassVar = ("V_R",)
+    order: ClassVar[Sequence[str]] = "T_R", "K_A", "T_A", "K_E", "T_E", "K_F", "T_F"
+    times: ClassVar[Sequence[str]] = "T_R", "T_A", "T_E", "T_F"
+    stops: ClassVar[Mapping[int, str]] = {1: "V_R"}
 
     type: Literal["IEEET1"] = Field("IEEET1", description="which exciter")
     T_R: Positive = Field(0.02, description="lag of its measurement of the voltage, s")
@@ -82,14 +84,7 @@ class Ieeet1(Exciter):
         return self.K_E * E_fd + b * max(E_fd - a, 0.0) ** 2
 
     def numbers(self) -> Sequence[float]:
-        own = self.T_R, self.K_A, self.T_A, self.K_E, self.T_E, self.K_F, self.T_F
-        return *own, *self.saturation()
-
-    def lags(self) -> Mapping[str, float]:
-        return {"T_R": self.T_R, "T_A": self.T_A, "T_E": self.T_E, "T_F": self.T_F}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {1: (self.V_Rmin, self.V_Rmax)}
+        return *super().numbers(), *self.saturation()
 
     def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
         V_R = self.field(output)

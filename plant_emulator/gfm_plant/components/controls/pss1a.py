@@ -50,6 +50,8 @@ class Pss1a(Stabiliser):
     )
     rates: ClassVar = _rates
     leads: ClassVar = ("T1", "T2"), ("T3", "T4"), ("A2", "A1")
+    order: ClassVar = "K_S", "T5", "T6", "A1", "A2", "T1", "T2", "T3", "T4", "V_STmin", "V_STmax"
+    times: ClassVar = "T2", "T4", "T5", "T6"
 
     type: Literal["PSS1A"] = Field("PSS1A", description="which stabiliser")
     K_S: NonNegative = Field(20.0, description="gain, voltage by speed, p.u./p.u.")
@@ -64,14 +66,9 @@ class Pss1a(Stabiliser):
     V_STmax: float = Field(0.2, ge=0.0, le=100.0, description="largest output, p.u.")
     V_STmin: float = Field(-0.2, ge=-100.0, le=0.0, description="least output, p.u.")
 
-    def numbers(self) -> Sequence[float]:
-        first = self.K_S, self.T5, self.T6, self.A1, self.A2
-        return *first, self.T1, self.T2, self.T3, self.T4, self.V_STmin, self.V_STmax
-
     def lags(self) -> Mapping[str, float]:
-        own = {name: getattr(self, name) for name in ("T2", "T4", "T5", "T6")}
-        own["A1"] = self.A1 if self.A2 == 0.0 else min(self.A1, self.A2 / self.A1)
-        return {name: lag for name, lag in own.items() if lag > 0.0}
+        A1 = self.A1 if self.A2 == 0.0 else min(self.A1, self.A2 / self.A1)
+        return {**super().lags(), **({"A1": A1} if A1 > 0.0 else {})}
 
     def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
         return (seen if self.T6 > 0.0 else 0.0, self.K_S * seen, 0.0, 0.0, 0.0, 0.0), 0.0

@@ -4,7 +4,7 @@ T_R dV_m/dt = V - V_m,    T_B dx/dt = V_set - V_m - x,
 T_E dE_fd/dt = K (x + (V_set - V_m - x) T_A / T_B) - E_fd,    E_min <= E_fd <= E_max.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -35,7 +35,9 @@ class Sexs(Exciter):
         ("E_fd", "p.u.", "excitation"),
     )
     rates: ClassVar = _rates
-    ranges: ClassVar = ("E_",)
+    order: ClassVar = "K", "T_R", "T_A", "T_B", "T_E"
+    times: ClassVar = "T_R", "T_B", "T_E"
+    stops: ClassVar = {2: "E_"}
 
     type: Literal["SEXS"] = Field("SEXS", description="which exciter")
     K: Positive = Field(200.0, description="gain, p.u. of excitation by p.u. of voltage")
@@ -45,15 +47,6 @@ class Sexs(Exciter):
     T_E: Positive = Field(0.05, description="lag of the exciter, s")
     E_min: float = Field(0.0, ge=-100.0, le=100.0, description="least excitation E_fd, p.u.")
     E_max: float = Field(5.0, ge=-100.0, le=100.0, description="largest excitation E_fd, p.u.")
-
-    def numbers(self) -> Sequence[float]:
-        return self.K, self.T_R, self.T_A, self.T_B, self.T_E
-
-    def lags(self) -> Mapping[str, float]:
-        return {"T_R": self.T_R, "T_B": self.T_B, "T_E": self.T_E}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {2: (self.E_min, self.E_max)}
 
     def rest(self, output: float, seen: Terminals) -> tuple[Sequence[float], float]:
         ahead = output / self.K

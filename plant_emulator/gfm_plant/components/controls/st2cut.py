@@ -7,7 +7,7 @@
 It is not cut off outside V_CU and V_CL.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -49,6 +49,8 @@ class St2cut(Stabiliser):
     )
     rates: ClassVar = _rates
     leads: ClassVar = ("T5", "T6"), ("T7", "T8"), ("T9", "T10")
+    order: ClassVar = "K1", "K2", *(f"T{k}" for k in range(1, 11)), "L_Smin", "L_Smax"
+    times: ClassVar = "T1", "T2", "T4", "T6", "T8", "T10"
 
     type: Literal["ST2CUT"] = Field("ST2CUT", description="which stabiliser")
     K1: float = Field(10.0, ge=-1e4, le=1e4, description="first gain, voltage by speed, p.u./p.u.")
@@ -65,14 +67,6 @@ class St2cut(Stabiliser):
     T10: NonNegative = Field(0.05, description="third lag, s; 0: T9 must be 0, too")
     L_Smax: float = Field(0.05, ge=0.0, le=100.0, description="largest output, p.u.")
     L_Smin: float = Field(-0.05, ge=-100.0, le=0.0, description="least output, p.u.")
-
-    def numbers(self) -> Sequence[float]:
-        times = [getattr(self, f"T{k}") for k in range(1, 11)]
-        return self.K1, self.K2, *times, self.L_Smin, self.L_Smax
-
-    def lags(self) -> Mapping[str, float]:
-        own = {name: getattr(self, name) for name in ("T1", "T2", "T4", "T6", "T8", "T10")}
-        return {name: T for name, T in own.items() if T > 0.0}
 
     def rest(self, output: float, seen: float) -> tuple[Sequence[float], float]:
         first, second = self.K1 * seen, self.K2 * seen

@@ -7,7 +7,7 @@ where w is the deviation of the speed, x_1 the valve, and T2 / T3 the part of th
 not pass the reheater. P_ref is in p.u. of power, that of PSS/E times R.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -34,8 +34,9 @@ class Tgov1(Governor):
         ("x_2", "p.u.", "power behind the reheater"),
     )
     rates: ClassVar = _rates
-    opens: ClassVar = ("V_max",)
-    ranges: ClassVar = ("V_",)
+    order: ClassVar = "R", "T1", "T2", "T3", "D_t"
+    times: ClassVar = "T1", "T3"
+    stops: ClassVar = {0: "V_"}
 
     type: Literal["TGOV1"] = Field("TGOV1", description="which governor")
     R: Positive = Field(0.05, description="droop, frequency by power, p.u./p.u.")
@@ -45,15 +46,6 @@ class Tgov1(Governor):
     T2: NonNegative = Field(3.0, description="lead of the turbine, s")
     T3: Positive = Field(10.0, description="lag of the turbine, s: its reheater")
     D_t: NonNegative = Field(0.0, description="damping of the turbine by frequency, p.u./p.u.")
-
-    def numbers(self) -> Sequence[float]:
-        return self.R, self.T1, self.T2, self.T3, self.D_t
-
-    def lags(self) -> Mapping[str, float]:
-        return {"T1": self.T1, "T3": self.T3}
-
-    def limits(self) -> Mapping[int, tuple[float, float]]:
-        return {0: (self.V_min, self.V_max)}
 
     def per_speed(self) -> float:
         return 1.0 / self.R + self.D_t
