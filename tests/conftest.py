@@ -3,8 +3,8 @@
 ``python -m pytest`` runs the fast tier: what needs no process of its own, in parallel. The other
 tiers are marked; the last two run one test at a time unless ``-n`` says otherwise:
 
-* ``full``: every law where the fast tier takes one of each structure, long computations, and
-  compilers from apt,
+* ``full``: every law where the fast tier takes one of each structure, long computations, the
+  paper's comparisons in ``examples``, and compilers from apt,
 * ``processes``: real processes, sockets, real time,
 * ``systems``: a browser, user-mode Linux, systemd, a C compiler, kills, soaks.
 
@@ -41,8 +41,9 @@ for number, handler in (
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, handler)
 
-# The first example may compile a kernel, which takes longer than hypothesis' deadline.
-settings.register_profile("gfmhil", deadline=None)
+# The first example may compile a kernel, which takes longer than hypothesis' deadline. Each run
+# draws others.
+settings.register_profile("gfmhil", deadline=None, max_examples=50)
 settings.load_profile("gfmhil")
 # Fuzzing of any length, see CONTRIBUTING.md. An input that exceeds the deadline is a bug.
 settings.register_profile("fuzz", deadline=60_000, max_examples=20_000)

@@ -96,6 +96,7 @@ def test_the_command_names_a_grid_that_makes_a_law_unstable(capsys) -> None:
     assert "ends as oscillating" in out
 
 
+@pytest.mark.full
 def test_the_command_certifies(capsys, tmp_path) -> None:
     given = ["certify", "vsg-2", "--inner", "virtual-stator", "--power", "0.5", "-q", "--loads"]
     assert main([*given, "--network", "line_fault", "--out", str(tmp_path / "c.svg")]) == 0

@@ -65,6 +65,7 @@ def test_step_is_that_of_the_nonlinear_bench(law):
     assert np.abs(p / size - y[:ticks, 1]).max() < 2e-3 * np.abs(y[:, 1]).max()
 
 
+@pytest.mark.full
 def test_step_settles_where_the_response_at_rest_says():
     for of in (loop("mimo-gfm-deployable", RIG), loop("mimo-gfm-deployable", ideal=True)):
         rest = of.frequency_response([0.0])[0].real

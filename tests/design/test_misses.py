@@ -187,6 +187,7 @@ def test_the_mean_square_decays_as_the_eigenvalues_of_all_second_moments_say(see
         assert found.sigma() == pytest.approx(np.log(size) / (2 * T_S), rel=1e-9)
 
 
+@pytest.mark.full
 def test_mean_square_against_a_thousand_drawn_runs(ideal):
     """The variance of p under white noise of the grid's voltage, with one miss in twenty, after a
     second, within four standard deviations of the estimate."""

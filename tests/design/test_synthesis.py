@@ -78,6 +78,7 @@ def test_vsg_2_is_no_worse_than_printed():
     assert found.values == pytest.approx([5.9801, 1.9048], rel=1e-4)  # the printed gains
 
 
+@pytest.mark.full
 def test_the_same_for_a_seed():
     one, again = (paper("droop-5", 3, evaluations=400, starts=1).values for _ in range(2))
     np.testing.assert_array_equal(one, again)
@@ -90,6 +91,7 @@ def test_unstable_start_is_stabilised_first():
     assert paper("vsg-2", start=start).cost < 16.0
 
 
+@pytest.mark.full
 def test_gains_that_move_the_operating_point():
     """k_34 sets the equilibrium of E_u of droop-4: gamma is that of the loop at that point."""
     found = paper("droop-4")

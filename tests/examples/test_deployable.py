@@ -21,6 +21,8 @@ from gfm_runtime import discretise, get_law, law_file
 
 from ..support.loops import reference_loop
 
+pytestmark = pytest.mark.full
+
 LAW = "mimo-gfm-deployable"
 CONTROLLED, RIG = Box(dc=("controlled",)), Box(dc=("regulated",))
 RIG_LAW = "mimo-gfm-deployable-rig"
@@ -101,7 +103,6 @@ def test_gamma_and_delay_margin():
     assert delay_margin(LAW) >= 1e-3
 
 
-@pytest.mark.full
 def test_every_corner_decays():
     assert sigma(CONTROLLED.corners()).max() <= -1.0
     assert sigma(RIG.corners()).max() < 0.0  # stable, but slower: see docs/deployable.md
@@ -112,7 +113,6 @@ def test_random_points_decay():
     assert sigma(RIG.random(100, seed=12)).max() < 0.0
 
 
-@pytest.mark.full
 def test_the_rigs_law_holds_beside_its_source():
     box = replace(RIG, R_f=THIRD, R_g=THIRD)
     assert sigma(box.corners(), RIG_LAW).max() <= -1.0

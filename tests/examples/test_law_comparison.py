@@ -12,6 +12,8 @@ from law_comparison.experiments import AT, EXPERIMENTS, TRACE_EVERY, experiment
 from law_comparison.row import as_shipped
 from law_comparison.tables import markdown, number
 
+pytestmark = pytest.mark.full
+
 Capture = pytest.CaptureFixture[str]
 SHORT = ("--evaluations", "320", "--starts", "1", "--quiet")
 

@@ -12,6 +12,8 @@ from law_comparison.search import ALPHA, LateProblem, as_it_is, gamma, late_loop
 
 from ..support.loops import reference_loop
 
+pytestmark = pytest.mark.full
+
 SHORT = {"seed": 0, "evaluations": 64, "starts": 1}
 
 
@@ -107,7 +109,6 @@ def test_gains_that_cannot_be_run_cost_as_much_as_unstable_ones():
     assert late(printed) == pytest.approx(UNSTABLE + ALPHA + late.sigma(printed[None])[0])
 
 
-@pytest.mark.full
 def test_the_search_ends_at_gains_that_can_be_run():
     file = law_file("vsg-5")
     found = search(file, seed=0, evaluations=64, starts=1)

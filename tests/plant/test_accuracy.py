@@ -60,6 +60,7 @@ def test_one_second_open_loop(rest):
     assert_exact(x, reference(plant, segments))
 
 
+@pytest.mark.full
 def test_one_second_with_the_regulated_source(rest):
     """The angle moves for 50 ms at +0.001 p.u., which is 0.45 p.u. of power; then it is held."""
     plant = rest(dc_source={"mode": "regulated"})

@@ -41,6 +41,7 @@ def test_lag_comes_after_the_limit(rest):
     assert plant.truth()["i_dc"] == pytest.approx(-0.6 + (start + 0.6) * np.exp(-1.0), abs=1e-9)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("tau", [0.0, 1e-3])
 def test_a_source_that_reaches_its_limit(rest, tau):
     """Between two ticks; against SciPy in steps of 2 us, which see when."""

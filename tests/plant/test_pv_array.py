@@ -61,6 +61,7 @@ def test_most_power_slope_and_open_circuit(G):
     assert array_slope(r, v) == pytest.approx(slope, rel=1e-7)
 
 
+@pytest.mark.full
 def test_v_dc_follows_the_array(rest):
     """Against SciPy, up to 1.38 p.u., where the array takes current; the error falls with T_s."""
     errors = []

@@ -136,6 +136,7 @@ def test_a_start_file_runs_is_stable_and_is_never_overwritten(call, here):
         assert gfmhil.run("sag.toml", law).status == "completed"
 
 
+@pytest.mark.full
 def test_other_start_files_run(call, here):
     for kind in ("network", "campaign", "conformity"):
         assert call("new", kind, f"a-{kind}")[:2] == (0, f"a-{kind}.toml\n")
@@ -296,6 +297,7 @@ def test_compare_takes_the_laws_of_the_scenario_runs_them_in_process_and_prints_
     assert found == dict.fromkeys(content["compare"], ("inproc", "lockstep"))
 
 
+@pytest.mark.full
 def test_compare_lays_a_recording_beside_the_runs(call):
     content = {**STEP, "compare": ["vsg-2"]}
     made = gfmhil.run(scenario(**content), "vsg-2")

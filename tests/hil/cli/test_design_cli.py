@@ -153,6 +153,7 @@ def test_gamma_and_poles_behind_an_inner_stage(capsys):
     assert step["y"]["p"]["end"] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.full
 def test_tune_behind_an_inner_stage(capsys, tmp_path):
     path = tmp_path / "mine.toml"
     before = said(capsys, "gamma", "--law", "mimo-gfm-practical", "--inner", "virtual-stator")

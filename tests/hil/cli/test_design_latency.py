@@ -21,6 +21,7 @@ def result(tmp_path):
     return write
 
 
+@pytest.mark.full
 def test_a_law_that_two_misses_in_a_row_make_unstable(result, capsys):
     """The bench missed 5 of 1000 ticks, two of them in a row."""
     asked = ["design", "latency", "--law", "mimo-gfm", "--from", result()]

@@ -27,6 +27,7 @@ def test_the_edge_of_a_whole_row_is_its_gain_margin():
         assert (one.sigma() < 0.0) == stable
 
 
+@pytest.mark.full
 def test_a_map_has_a_sweep_in_each_row():
     found = stability_map("mimo-gfm", "k_34", 1.0, 50.0, scr=(2.0, 8.0), points=4)
     on = gfmhil.load_scenario("pref_step", plant__grid={"scr": 8.0, "x_over_r": 10.0})
@@ -58,6 +59,7 @@ def test_a_figure_s_csv_has_what_its_colours_show(tmp_path):
         np.testing.assert_allclose(told, points, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.full
 def test_both_commands_print_and_draw(capsys, tmp_path):
     where = ["k_34", "--law", "mimo-gfm", "--range", "1:20", "--points", "5"]
     assert main(["design", "sweep", *where, "-o", str(tmp_path / "sweep.svg")]) == 0

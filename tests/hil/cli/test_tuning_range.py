@@ -11,6 +11,7 @@ CONTENT = {
 }  # fmt: skip
 
 
+@pytest.mark.full
 def test_gamma_is_the_largest_of_all_grids_and_none_of_them_is_left_out():
     on = gfmhil.load_scenario(CONTENT)
     found = gfmhil.design.tune(

@@ -57,6 +57,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "report.html"
 
 
+@pytest.mark.full
 def test_a_network_has_one_report(network):
     text = network.read_text("utf-8")
     titles = re.findall(r'<h2 id="([^"]*)"', text)

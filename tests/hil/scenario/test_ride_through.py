@@ -54,6 +54,7 @@ def test_it_starts_at_rest(inner):
 RANDOM_FAULTS = int(os.environ.get("GFMHIL_FAULTS", "40"))
 
 
+@pytest.mark.full
 def test_no_clearing_on_the_line_stops_the_law():
     """Random faults: kind, place, resistance, power, SCR 1.5 to 20. At once, the most of them end
     as safe or tripped within a cycle and a half of their clearing."""

@@ -70,6 +70,7 @@ def test_a_map_has_the_regions_of_its_places():
     assert (np.diff(-made.values("low"), axis=1) < 0.0).all()
 
 
+@pytest.mark.full
 def test_the_protection_may_end_it_first(capsys, tmp_path):
     figure = tmp_path / "region.png"
     asked = ["--law", "vsg-2", "--after", "1", "--scr", "2,4", "--out", str(figure)]

@@ -44,9 +44,10 @@ def test_choice_is_one_of_its_values(values, u):
 
 @given(shares, shares)
 def test_quantiles_rise(u, v):
+    """But for the last digit, to which `NormalDist.inv_cdf` is right."""
     low, high = bounded(u, v)
     normal = Normal(type="normal", path="x", mean=1.0, sigma=0.1, low=0.7, high=1.2)
-    assert normal.quantile(low) <= normal.quantile(high)
+    assert normal.quantile(low) <= normal.quantile(high) * (1 + 1e-15)
 
 
 def test_draws_have_the_distribution():

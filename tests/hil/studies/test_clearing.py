@@ -116,6 +116,7 @@ def test_a_run_that_falls_out_of_step_says_so_and_no_other():
     assert turned == "+360° from before"
 
 
+@pytest.mark.full
 def test_a_run_goes_on_until_its_angle_is_back_or_lost():
     """After 1 s it still creeps along near half a turn."""
     soon, late = (gfmhil.clearing_time("vsg-2", after=after, within=5e-4) for after in (1.0, 12.0))
@@ -177,6 +178,7 @@ def test_a_map_has_the_clearing_times_of_its_places(workers):
     assert (np.diff(seconds, axis=2) >= 0.0).all()
 
 
+@pytest.mark.full
 def test_the_command_has_a_row_for_each_grid_and_a_figure(tmp_path, capsys):
     figure = tmp_path / "times.png"
     options = ["--scr", "2,4", "--longest", "0.3", "--after", "0.5", "--out", str(figure)]

@@ -599,6 +599,7 @@ def test_every_shipped_test_loads_and_makes_its_scenarios(tmp_path):
                 assert made.plant.modulation == "space-vector"
 
 
+@pytest.mark.full
 def test_a_law_without_inertia_fails_the_clause_of_inertia_alone():
     found = gfmhil.conform(["droop-1", "vsg-2"], "ercot/1-inertia", inner="virtual-stator")
     wrong = {(f.law, v.kind) for f in found.parts for v in f.verdicts if v.verdict == FAIL}
@@ -1093,6 +1094,7 @@ def test_parts_without_a_criterion_are_refused():
         load_cases(["nowhere"])
 
 
+@pytest.mark.full
 def test_the_gate_fails_a_test_with_each_part_and_the_report(lab):
     (lab / "strict.toml").write_text(STRICT)
     folders = iter([lab.parent / "first", lab.parent / "second"])

@@ -92,6 +92,7 @@ def test_a_switched_bridge_has_the_admittance_of_its_average():
     assert at.deviation is not None and at.deviation.max() < 0.1
 
 
+@pytest.mark.full
 def test_dead_time_changes_the_admittance_as_its_describing_function_says():
     """From 60 Hz on it is off by more, but without it all is wrong. VSG-2 has an unstable swing."""
     how = {"start_hz": 5, "stop_hz": 40, "points": 5, "settle_s": 1.0}
