@@ -35,7 +35,7 @@ TRUE = {
     "TPf": 1 / GAINS["k_22"],
 }
 CHANNELS = ("p", "q", "V", "f")
-DRAWS = 100
+DRAWS = 40
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def record(run: gfmhil.Run, place: Path, seed: int, sigma: float, lag: float) ->
 
 
 @pytest.mark.full
-def test_the_intervals_hold_what_is_true_in_95_of_100_draws(run, tmp_path):
+def test_the_intervals_hold_what_is_true_in_95_percent_of_draws(run, tmp_path):
     """Half of them with a meter that is slow."""
     inside = dict.fromkeys(TRUE, 0)
     for seed in range(DRAWS):
@@ -67,9 +67,8 @@ def test_the_intervals_hold_what_is_true_in_95_of_100_draws(run, tmp_path):
         fit = envelopes.fit_run(read)
         for name, (low, high) in fit.interval.items():
             inside[name] += low <= TRUE[name] <= high
-    print(inside)
-    # 95 % of 100 draws: 90 or more in 98.9 % of all sets of draws
-    assert min(inside.values()) >= 90, inside
+    # 95 % of 40 draws: 35 or more in 98.6 % of all sets of draws
+    assert min(inside.values()) >= 35, inside
 
 
 def test_the_fit_of_a_run_without_noise_is_its_law(run):
