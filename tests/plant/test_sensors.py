@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gfm_plant import Plant, make_plant, plant_sample
 from gfm_plant.noise import gaussians
@@ -97,6 +99,21 @@ def test_noise_depends_on_seed_tick_and_channel_alone():
     assert samples[0][1] == pytest.approx(0.01 * gaussians(7, 5, 0)[1])
     assert samples[0][1] != samples[0][3]
     assert gaussians(8, 5, 0) != gaussians(7, 5, 0)
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 10**9), st.integers(0, 7))
+def test_noise_is_box_and_mullers_of_splitmix64(seed, tick, pair):
+    """But for the series of the sine, which ends at x^9: 1.8e-9 of the length at 45 degrees."""
+    bits = seed + 0x9E3779B97F4A7C15 * (8 * tick + pair)
+    for _ in range(2):  # Steele, Lea and Flood, 2014
+        bits %= 2**64
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
+            bits = (bits ^ (bits >> shift)) * factor % 2**64
+    length = math.sqrt(-2.0 * math.log((bits // 2**32 + 1) * 2.0**-32))
+    quarter, share = divmod(bits % 2**32, 2**30)
+    angle = (quarter + share * 2.0**-30 - 0.5) * math.pi / 2
+    expected = length * math.cos(angle), length * math.sin(angle)
+    assert gaussians(seed, tick, pair) == pytest.approx(expected, abs=2e-9 * length)
 
 
 def test_noise_is_white_and_normal():

@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
-from numba.core import config
 from numpy.typing import NDArray
 
 from gfm_hil.engine.inproc import Steps, Stretch
@@ -20,7 +19,7 @@ from gfm_hil.engine.setup import Bench
 from gfm_hil.realtime.atomics import row_at
 from gfm_hil.recording.parts import MemoryPart
 from gfm_plant.model import DELTA, V_DC, terminal
-from gfm_plant.noise import normal_pair, random_bits, share_of
+from gfm_plant.noise import normal_pair, random_bits
 from gfm_plant.quantise import quantise
 from gfm_plant.records import MAX_DELAY, N_TRIPS
 from gfm_runtime.compiled import compiled, inlined
@@ -76,7 +75,7 @@ fixed_dtype = _record(
 moving_dtype = _record(
     ("upset", "i8"), ("tick", "i8"), ("x", "f8", 8), ("i_reg", "f8"), ("sensed", "f8", 4),
     ("u", "f8", _AGES, NU), ("E_q", "f8"), ("u_now", "f8", NU), ("E", "f8", 2), ("E_most", "f8"),
-    ("drawn", "f8", 3), ("seen", "f8", 3, 3), ("bits", "u8", 2), ("log", "f8", 2),
+    ("drawn", "f8", 3), ("seen", "f8", 3, 3),
     ("noise", "f8", 4), ("z", "f8", 2, _MODES), ("forced", "f8", 2, 2, _MODES),
     ("w", "f8", 2, _MODES), ("unit", "f8", 2, 2), ("halfway", "f8", 2, 1), ("turn", "f8", 2, 1),
     ("y", "f8", NY), ("seen_y", "f8", NY), ("x_law", "f8", _ORDER), ("x_next", "f8", _ORDER),
@@ -87,17 +86,11 @@ moving_dtype = _record(
 
 @inlined
 def _sample(n, c, s):
-    """As `gfm_plant.sensors.read_sensors`. What the compiler takes of all lanes at a time must not
-    call a library, so that the logarithms are apart."""
+    """As `gfm_plant.sensors.read_sensors`."""
     for pair in range(2):
         for j in range(n):
-            s.bits[pair, j] = random_bits(c.seed[j], s.tick[j], pair)
-            s.log[pair, j] = share_of(s.bits[pair, j])
-        for j in range(n):
-            s.log[pair, j] = math.log(s.log[pair, j])
-        for j in range(n):
-            one, other = normal_pair(s.bits[pair, j], s.log[pair, j])
-            s.noise[2 * pair, j], s.noise[2 * pair + 1, j] = one, other
+            bits = random_bits(c.seed[j], s.tick[j], pair)
+            s.noise[2 * pair, j], s.noise[2 * pair + 1, j] = normal_pair(bits)
     for k in range(4):
         y = k if k < 2 else k + 1
         for j in range(n):
@@ -117,16 +110,11 @@ def _sample(n, c, s):
 def _control(n, c, s, order):
     """As `look` and `advance` of `gfm_runtime.kernel`. A loop over lanes holds those of fixed
     length that it can, so that sums stay in registers."""
-    for j in range(n):
-        for i in range(NU):
-            s.raw[i, j] = c.u_0[i, j] + s.off[i, j]
-    for k in range(order):
-        for j in range(n):
-            for i in range(NU):
-                s.raw[i, j] += c.C[i, k, j] * s.x_law[k, j]
     for i in range(NU):
         for j in range(n):
-            raw = s.raw[i, j]
+            raw = c.u_0[i, j] + s.off[i, j]
+            for k in range(_ORDER):
+                raw += c.C[i, k, j] * s.x_law[k, j]
             for k in range(NY):
                 raw += c.from_ref[i, k, j]
             for k in range(NY):
@@ -159,10 +147,9 @@ def _control(n, c, s, order):
             x = c.x_ref[i, j]
             for k in range(NY):
                 x += c.B_y[i, k, j] * s.seen_y[k, j]
+            for k in range(_ORDER):
+                x += c.A[i, k, j] * s.x_law[k, j]
             s.x_next[i, j] = x
-        for k in range(order):
-            for j in range(n):
-                s.x_next[i, j] += c.A[i, k, j] * s.x_law[k, j]
     for i in range(order):
         for j in range(n):
             s.x_law[i, j] = faded(s.x_next[i, j])
@@ -578,8 +565,6 @@ def is_plain(bench: Bench) -> bool:
         and r["chopper"][0] == 0 and r["delay"] > 0 and not bench.inner
         and (laws["n"] <= _ORDER).all() and (laws["error_map"] == LINEAR).all()
         and laws.dtype["A"].base == np.float64 and len(bench.trace.plan) == 0
-        # Intel's library has other last bits in a logarithm of several numbers at a time
-        and not config.USING_SVML  # type: ignore[attr-defined]
     )  # fmt: skip
 
 
