@@ -8,7 +8,8 @@ not finite, the run goes on by itself from before it.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -29,6 +30,7 @@ from gfm_runtime.signals import NU, NY, REF_NAMES
 from gfm_runtime.states import RUNNING
 
 T = TypeVar("T")
+_Places = tuple[NDArray[np.int64], NDArray[np.int64], int]
 
 LANES = 8
 BLOCK = 50  # ticks after which one that was not calm is noticed
@@ -387,7 +389,11 @@ class Lanes:
     """Runs side by side, each in a lane; a lane may be empty."""
 
     def __init__(self) -> None:
-        self._fixed, self._moving = np.zeros(1, fixed_dtype), np.zeros(1, moving_dtype)
+        stays = fixed_dtype.itemsize // 8
+        words = np.zeros(stays + moving_dtype.itemsize // 8, np.int64)
+        self._fixed = words[:stays].view(fixed_dtype)
+        self._moving = words[stays:].view(moving_dtype)
+        self._words = words.reshape(-1, LANES)  # of all lanes
         self._before, self._used = self._moving.copy(), np.zeros(LANES, np.int64)
         self._kind: tuple[int, int] = 0, 0  # what all lanes have in common: order and parts
         # where the next tick of each lane is recorded, by columns; an empty one's nowhere
@@ -402,53 +408,21 @@ class Lanes:
             return False
         self._kind, self._used[j] = kind, 1
         self._columns[:, j] = [columns[name][stretch.start :].ctypes.data for name in MOVING]
-        fixed, moving, parts = self._fixed[0], self._moving[0], kind[1]
-        plant, c = bench.plant, bench.controller
-        r, s, n, now, ctl = plant.par[0], plant.st[0], plant.net[0], plant.now[0], c.ctl[0]
-        law, state = (one[int(ctl["active"])] for one in (c.laws, c.states))
-        for name in _PLANT:
-            fixed[name][j] = r[name]
-        for name in _SENSORS:
-            fixed[name][:, j] = r[name][:4]
-        for name in _DAC:
-            fixed[name][:, j] = r[name][:NU]
-        for name in _LAW:
-            to = fixed[name][..., j]
-            to[...] = law[name][tuple(map(slice, to.shape))]
-        fixed["i_most"][:, j] = s["i_most"]
-        fixed["half_h"][:parts, j], fixed["age"][:parts, j] = n["half_h"][:parts], n["age"][:, 0]
-        fixed["lag_weights"][:parts, :, j] = n["lag_weights"][:parts, 0]
-        _put(fixed["rate"][..., j], n["rate"][0, :_MODES])
-        _put(fixed["drive"][..., j], n["drive"][0, 0, :_MODES, 0])
-        _put(fixed["decay_z"][..., j].swapaxes(0, 1), n["decay"][0, :parts, :_MODES])
-        _put(fixed["states"][..., j].swapaxes(0, 1), n["states"][0, :_MODES, :_MODES])
-        _put(fixed["grid_gain"][..., j].swapaxes(0, 1), now["gain"][:parts, 1, :_MODES])
-        _put(fixed["grid_turn"][..., j], now["turn"][:parts, 1])
+        for words, rows, places, _ in _copied(bench):
+            self._words[rows, j] = words[places]
+        plant, c, fixed = bench.plant, bench.controller, self._fixed[0]
+        r, now, ctl = plant.par[0], plant.now[0], c.ctl[0]
+        law = c.laws[int(ctl["active"])]
         E = now["sequence"][0]
         fixed["E_grid"][:, 0, j] = now["V_g"] * E.real, now["V_g"] * E.imag
-        fixed["omega_grid"][j] = now["omega_g"]
-        fixed["trips"][:, j], fixed["trip_limit"][:, j] = (
-            r["trip_ticks"][:N_TRIPS] >= 0, r["trip_limit"][:N_TRIPS]
-        )  # fmt: skip
-        for name in ("y_low", "y_high"):
-            fixed[name][:, j] = ctl[name][:NY]
+        fixed["trips"][:, j] = r["trip_ticks"][:N_TRIPS] >= 0
         ref, x_ref = ctl["ref"], fixed["x_ref"][:, j]  # what the references bring to a law
         fixed["from_ref"][..., j] = law["D_u0"] * ref + law["D_r"] * ref
         by_ref = law["B_r"][: len(x_ref)] * ref
         x_ref[:] = by_ref[:, 0]
         for column in by_ref.T[1:]:
             x_ref += column
-        moving["upset"][j] = 0
-        for name in ("tick", "i_reg", "E_most"):
-            moving[name][j] = s[name]
-        moving["x"][:, j], moving["sensed"][:, j] = s["x"], s["sensed"]
-        moving["u"][:, :, j], moving["E_q"][j] = s["u"][:, :NU], s["u"][0, NU]
-        moving["u_now"][:, j] = s["u_now"][:NU]
-        for name, count in _PHASORS.items():
-            _put(moving[name][..., j], now[name][:count])
-        moving["E"][:, j], moving["y"][:, j] = s["E"], ctl["y"][:NY]
-        for name, of in _STATE.items():
-            moving[name][:, j] = state[of][: len(moving[name])]
+        self._moving["upset"][0, j] = 0
         return True
 
     def leave(self, j: int, stretch: Stretch, k: int) -> None:
@@ -456,21 +430,12 @@ class Lanes:
         its columns, and empty the lane."""
         bench = stretch.those.benches[0]
         self._used[j] = 0
-        moving, plant, c = self._moving[0], bench.plant, bench.controller
-        s, now, ctl = plant.st[0], plant.now[0], c.ctl[0]
-        state = c.states[int(ctl["active"])]
-        for name in ("tick", "i_reg", "E_most"):
-            s[name] = moving[name][j]
-        s["x"], s["sensed"] = moving["x"][:, j], moving["sensed"][:, j]
-        s["u"][:, :NU], s["u_now"][:NU] = moving["u"][:, :, j], moving["u_now"][:, j]
-        s["E"] = s["E_commanded"] = moving["E"][:, j]
-        for name, count in _PHASORS.items():
-            z = now[name][:count]
-            z.real, z.imag = moving[name][..., j]
-        for name, of in _STATE.items():
-            state[of][: len(moving[name])] = moving[name][:, j]
-        ctl["y"][:NY], ctl["u"] = moving["y"][:, j], moving["u_law"][:, j]
-        bench.y[:], bench.u[:] = moving["y"][:, j], moving["u_law"][:, j]
+        for words, rows, places, stay in _copied(bench):
+            words[places[stay:]] = self._words[rows[stay:], j]
+        s, now, ctl = bench.plant.st[0], bench.plant.now[0], bench.controller.ctl[0]
+        s["E_commanded"] = s["E"]
+        bench.y[:], bench.u[:] = ctl["y"][:NY], self._moving[0]["u_law"][:, j]
+        ctl["u"] = bench.u
         stayed = {"true_omega_g": now["omega_g"], "true_V_g": now["V_g"], "law": ctl["active"]}
         stayed |= zip(_REFS, ctl["ref"], strict=True)
         for name, column in _columns(stretch).items():
@@ -504,8 +469,59 @@ def _columns(stretch: Stretch) -> dict[str, NDArray[np.float64]]:
     }
 
 
+def _copied(bench: Bench) -> Iterator[tuple[NDArray[np.int64], *_Places]]:
+    """The words of each of a run's records, with the `_places` of those that a lane has."""
+    plant, c = bench.plant, bench.controller
+    k, parts = int(c.ctl[0]["active"]), int(plant.net[0]["n_parts"])
+    law, state = c.laws[k : k + 1], c.states[k : k + 1]
+    records = plant.par, plant.st, plant.net, plant.now, c.ctl, law, state
+    for record, places in zip(records, _places(parts, *(r.dtype for r in records)), strict=True):
+        yield record.view(np.int64), *places
+
+
+@lru_cache(maxsize=8)
+def _places(parts: int, *kinds: np.dtype[np.void]) -> list[_Places]:
+    """Which words of a run's records of these kinds are those of a lane: of each record the rows
+    of the lane, the places in the record, and how many of both belong to what stays.
+
+    All fields have 8 bytes. A lane is filled with records whose words are their own places.
+    """
+    lanes, ends = Lanes(), np.cumsum([kind.itemsize // 8 for kind in kinds])
+    lanes._words[:], fixed, moving = -1, lanes._fixed[0], lanes._moving[0]
+    words = np.split(np.arange(ends[-1]), ends[:-1])
+    r, s, n, now, ctl, law, state = (w.view(kind)[0] for w, kind in zip(words, kinds, strict=True))
+    for lane, record, names in (
+        (fixed, r, (*_PLANT, *_SENSORS, *_DAC, "trip_limit")), (fixed, s, ("i_most",)),
+        (fixed, law, _LAW), (fixed, ctl, ("y_low", "y_high")), (moving, ctl, ("y",)),
+        (moving, s, ("tick", "x", "i_reg", "sensed", "u_now", "E", "E_most")),
+    ):  # fmt: skip
+        for name in names:
+            to = lane[name][..., 0]
+            to[...] = record[name][tuple(map(slice, to.shape))]
+    fixed["half_h"][:parts, 0], fixed["age"][:parts, 0] = n["half_h"][:parts], n["age"][:, 0]
+    fixed["lag_weights"][:parts, :, 0] = n["lag_weights"][:parts, 0]
+    _put(fixed["rate"][..., 0], n["rate"][0])
+    _put(fixed["drive"][..., 0], n["drive"][0, 0, :, 0])
+    _put(fixed["decay_z"][..., 0].swapaxes(0, 1), n["decay"][0, :parts, :_MODES])
+    _put(fixed["states"][..., 0].swapaxes(0, 1), n["states"][0, :_MODES, :_MODES])
+    _put(fixed["grid_gain"][..., 0].swapaxes(0, 1), now["gain"][:parts, 1, :_MODES])
+    _put(fixed["grid_turn"][..., 0], now["turn"][:parts, 1])
+    fixed["omega_grid"][0], moving["E_q"][0] = now["omega_g"], s["u"][0, NU]
+    moving["u"][..., 0] = s["u"][:, :NU]
+    for name in ("z", "w", "unit"):
+        _put(moving[name][..., 0], now[name])
+    for name, of in _STATE.items():
+        moving[name][:, 0] = state[of][: len(moving[name])]
+    found, lane, stays = list[_Places](), lanes._words[:, 0], fixed_dtype.itemsize // (8 * LANES)
+    for own in words:
+        rows = np.flatnonzero((own[0] <= lane) & (lane <= own[-1]))
+        found.append((rows, lane[rows] - own[0], int(np.searchsorted(rows, stays))))
+    return found
+
+
 def _put(parts: NDArray[np.float64], z: NDArray[np.complex128]) -> None:
-    """Put z (n, ...) into real and imaginary parts, (2, n or more, ...)."""
+    """Put z (n, ...) into real and imaginary parts, (2, m, ...): as many as both have."""
+    z = z[: parts.shape[1]]
     parts[0, : len(z)], parts[1, : len(z)] = z.real, z.imag
 
 
@@ -544,8 +560,6 @@ def run_together(runs: Iterable[Steps[T]]) -> list[T]:
     return [results[k] for k in range(len(results))]
 
 
-#: of the state of a plant's circuits, and how many of each
-_PHASORS = {"z": _MODES, "w": _MODES, "unit": 2}
 #: of a law's state, by their names here
 _STATE = {"x_law": "x", "off": "offset", "u_law": "u", "trend": "trend", "seen_y": "y",
           "now": "now", "raw": "raw"}  # fmt: skip
