@@ -136,8 +136,9 @@ def fast_mode(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
     rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
     if len(rest) < _FEW:
         return None
-    spectrum = np.abs(np.fft.rfft(rest * hann(len(rest))))
-    lines = np.fft.rfftfreq(len(rest), T_s)
+    length = fast_length(len(rest))
+    spectrum = np.abs(np.fft.rfft(rest * hann(len(rest)), length))
+    lines = np.fft.rfftfreq(length, T_s)
     spectrum[lines < 0.5 * f_n] = 0.0
     hertz = max(float(lines[np.argmax(spectrum)]), 0.5 * f_n)
     stride = 1 << max(0, int(np.log2(1.0 / (_A_PERIOD * hertz * T_s))))  # so that filters are few
