@@ -413,7 +413,7 @@ def _allocate(header: np.dtype[np.void], lengths: tuple[tuple[str, int], ...]) -
     whole, numbers = _laid_out(header, lengths)
     memory = np.zeros(whole.itemsize + _LINE, np.uint8)
     first = -memory.ctypes.data % _LINE
-    record: Record = memory[first : first + whole.itemsize].view(whole)
+    record: Record = np.ndarray(1, whole, memory, first)
     for name, value in numbers:
         record[name] = value
     return record
@@ -443,7 +443,7 @@ def _laid_out(
 def head(record: Record) -> Record:
     """The same memory as compiled functions see it, shape (1,): its scalars."""
     header = now_dtype if "w" in (record.dtype.names or ()) else net_dtype
-    return np.ndarray(1, header, record.view(np.uint8))
+    return np.ndarray(1, header, record)
 
 
 @intrinsic

@@ -476,7 +476,7 @@ def _copied(bench: Bench) -> Iterator[tuple[NDArray[np.int64], *_Places]]:
     law, state = c.laws[k : k + 1], c.states[k : k + 1]
     records = plant.par, plant.st, plant.net, plant.now, c.ctl, law, state
     for record, places in zip(records, _places(parts, *(r.dtype for r in records)), strict=True):
-        yield record.view(np.int64), *places
+        yield np.ndarray(record.nbytes // 8, np.int64, record), *places
 
 
 @lru_cache(maxsize=8)

@@ -39,7 +39,7 @@ from gfm_plant.names import MAY_START
 from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
-from gfm_runtime.assembly import Controller
+from gfm_runtime.assembly import Controller, copied
 from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, SET_REF, Vector, carried
 from gfm_runtime.states import READY, SAFE, STATES
 
@@ -87,7 +87,7 @@ class Bench:
         the plant, one for all converters."""
         c = self.controller
         self._plant = plant
-        self._controller = c.ctl.copy(), c.laws.copy(), c.states.copy(), c.est.copy()
+        self._controller = tuple(map(copied, (c.ctl, c.laws, c.states, c.est)))
         self._asked = c.asked
 
     @property
