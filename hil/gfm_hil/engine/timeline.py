@@ -62,14 +62,7 @@ class Timeline:
 
     def __init__(self, bench: Bench, log: Path, roles: tuple[Role, ...]) -> None:
         self._bench, self._roles = bench, roles
-        self._path, self._room = log, log.with_suffix(".room")
-        try:
-            self._log = log.open("ab", buffering=0)
-            if log.is_file():  # not /dev/null
-                with self._room.open("wb") as room:
-                    os.posix_fallocate(room.fileno(), 0, _ROOM)
-        except OSError as problem:
-            raise UserError(f"{log}: {problem.strerror}") from None
+        self._open(log)
         self._unwritten = b""
         self.failed = ""  # why the log cannot be written; empty if it can
         scenario = bench.scenario
@@ -89,6 +82,15 @@ class Timeline:
         self._fault: tuple[Status, str] | None = None  # the run waits for its reset
         self._waits = NOT_ASKED  # what a converter that was reset waited for
         self.stopped_by: dict[str, Any] | None = None  # the operator who stopped the run
+
+    def _open(self, log: Path) -> None:
+        self._path, self._room = log, log.with_suffix(".room")
+        try:
+            self._log = log.open("ab", buffering=0)
+            with self._room.open("wb") as room:
+                os.posix_fallocate(room.fileno(), 0, _ROOM)
+        except OSError as problem:
+            raise UserError(f"{log}: {problem.strerror}") from None
 
     @property
     def running(self) -> bool:
@@ -275,13 +277,19 @@ class TimelineInMemory(Timeline):
     """The events of a run in process, whose log stays in ``lines``."""
 
     def __init__(self, bench: Bench) -> None:
-        super().__init__(bench, Path(os.devnull), ROLES)
+        super().__init__(bench, Path(), ROLES)
         self.lines: list[dict[str, Any]] = []
+
+    def _open(self, log: Path) -> None:
+        pass
 
     def write(self, tick: int, kind: str, **more: Any) -> None:
         """Add a line to ``lines``."""
         t = round(tick * self._bench.scenario.T_s, 9)
         self.lines.append({"tick": tick, "t": t, "event": kind, **more})
+
+    def close(self) -> None:
+        """There is no file."""
 
 
 def safe_reason(ctl: Any) -> str:
