@@ -26,7 +26,7 @@ from gfm_plant.records import MAX_DELAY, N_TRIPS
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.error_maps import LINEAR
 from gfm_runtime.inner import faded, limited
-from gfm_runtime.signals import NU, NY, REF_NAMES
+from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import RUNNING
 
 T = TypeVar("T")
@@ -45,8 +45,7 @@ _NEAR = 1e-8  # of a mode, to the speed of a source
 _1_2, _1_3, _1_4, _1_5 = 1 / 2, 1 / 3, 1 / 4, 1 / 5
 #: what a lane records of the plant in each tick; a number that stays in calm ticks is none of them
 MOVING = ("true_p", "true_omega_u", "true_V", "true_i", "true_delta")
-_REFS = tuple(f"ref_{name}" for name in REF_NAMES)
-_RECORDED = {*MOVING, "true_omega_g", "true_V_g", "law", *_REFS}
+_RECORDED = {*MOVING, "true_omega_g", "true_V_g", "law"}
 
 
 def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
@@ -437,7 +436,6 @@ class Lanes:
         bench.y[:], bench.u[:] = ctl["y"][:NY], self._moving[0]["u_law"][:, j]
         ctl["u"] = bench.u
         stayed = {"true_omega_g": now["omega_g"], "true_V_g": now["V_g"], "law": ctl["active"]}
-        stayed |= zip(_REFS, ctl["ref"], strict=True)
         for name, column in _columns(stretch).items():
             if name in stayed:
                 column[stretch.start : k] = stayed[name]

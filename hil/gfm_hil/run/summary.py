@@ -34,7 +34,7 @@ END_METRICS = ("p_final", "settling_s", "overshoot_pct")
 READ = frozenset(
     {
         *("true_p", "true_omega_u", "true_V", "true_i", "true_delta", "true_omega_g", "true_V_g"),
-        *("law", "ref_P_ref"),
+        "law",
     }
 )
 _STEPS = ("reference", "grid-frequency", "grid-voltage")  # events that may move p to a new value
@@ -98,7 +98,7 @@ def summarise(
     log = [e for e in log if e["event"] != NOTE]
     met = [e for e in log if e["event"] == "handshake"]
     controller: str | None = met[0]["controller"] if met else OUR_CONTROLLER
-    plant, ours = "true_p" in signals, "ref_P_ref" in signals
+    plant, ours = "true_p" in signals, "law" in signals or "ref_P_ref" in signals
     ripple = None
     if plant and outcome.status == "completed":
         ripple = remaining_ripple(scenario, signals, log, done)
