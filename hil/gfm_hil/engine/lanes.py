@@ -388,8 +388,10 @@ class Lanes:
     """Runs side by side, each in a lane; a lane may be empty."""
 
     def __init__(self) -> None:
-        stays = fixed_dtype.itemsize // 8
-        words = np.zeros(stays + moving_dtype.itemsize // 8, np.int64)
+        stays, size = fixed_dtype.itemsize // 8, (fixed_dtype.itemsize + moving_dtype.itemsize) // 8
+        room = np.zeros(size + LANES, np.int64)
+        # where a line of the processor's cache begins: else the loop takes a fifth longer
+        words = room[-room.ctypes.data % (8 * LANES) // 8 :][:size]
         self._fixed = words[:stays].view(fixed_dtype)
         self._moving = words[stays:].view(moving_dtype)
         self._words = words.reshape(-1, LANES)  # of all lanes
