@@ -72,9 +72,9 @@ class MpcCase(CaseTables):
 
     def __init__(self, path: Path) -> None:
         self.path, self.fields = path, _fields(path)
-        version = self.fields.get("version", [("", ["1"])])[0][1]
-        if version not in (["2"], ["'2'"]):
-            raise UserError(f"{path}: mpc.version = {' '.join(version)}: must be '2'")
+        version = " ".join(self.fields.get("version", [("", ["1"])])[0][1]).strip("'")
+        if version != "2":
+            raise UserError(f"{path}: mpc.version = {version!r}: must be '2'")
         for name in ("baseMVA", *_COLUMNS):
             if not self.fields.get(name):
                 raise UserError(f"{path}: has no mpc.{name}")
