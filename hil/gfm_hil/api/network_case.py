@@ -153,15 +153,15 @@ def network_from(
     ]
     if not laws:
         raise UserError(
-            f"{flow.title}: name a bus for a converter; {', '.join(feeding)} have generators"
+            f"{flow.name}: name a bus for a converter; {', '.join(feeding)} have generators"
         )
     for name in laws:
         if name not in feeding:
             what = "has no generator" if name in names else "is no bus of the case"
-            raise UserError(f"{flow.title}: {named(name)}: {what}; {', '.join(feeding)} have one")
+            raise UserError(f"{flow.name}: {named(name)}: {what}; {', '.join(feeding)} have one")
         if not 0.0 < laws[name][1] <= 1.0:
             raise UserError(
-                f"{flow.title}: {named(name)}: share = {laws[name][1]:g}: must lie in (0, 1]"
+                f"{flow.name}: {named(name)}: share = {laws[name][1]:g}: must lie in (0, 1]"
             )
     if slack not in ("machine", "grid"):
         raise UserError(f"slack = {slack!r}: must be machine or grid")
@@ -175,7 +175,7 @@ def _with_following(flow: PowerFlow, machines: Machines) -> PowerFlow:
     own = [*dict.fromkeys(bus for table in machines.tables.values() for bus in table)]
     absent = [name for name in own if name not in names]
     if absent == own != []:
-        raise UserError(f"{machines.file}: {named(own[0])}: is no bus of {flow.title}")
+        raise UserError(f"{machines.file}: {named(own[0])}: is no bus of {flow.name}")
     ignored += [f"{named(name)} of the dynamic data is none of the case." for name in absent]
     for name in machines.tables.get("grid_following", ()):
         if name in absent:
@@ -232,7 +232,7 @@ class _Build:
         if bus.rating is None:
             grid = ", or stand a grid there: slack = grid" if k == self.flow.slack else ""
             raise UserError(
-                f"{self.flow.title}: {named(bus.name)}: its generator has no rating: give sn_mva or"
+                f"{self.flow.name}: {named(bus.name)}: its generator has no rating: give sn_mva or"
                 f" max_p_mw{grid}"
             )
         return bus.rating * self.flow.S_b
@@ -297,7 +297,7 @@ class _Build:
             R, X = (part / self.scale for part in (branch.Z.real, branch.Z.imag))
             if R < 0 or X < _LEAST:
                 raise UserError(
-                    f"{self.flow.title}: {kind} {a} to {b}: R = {branch.Z.real:g}, X ="
+                    f"{self.flow.name}: {kind} {a} to {b}: R = {branch.Z.real:g}, X ="
                     f" {branch.Z.imag:g} p.u.: R must be >= 0, X > 0"
                 )
             ends = {"start": self._node(branch.start), "end": self._node(branch.end)}
@@ -327,7 +327,7 @@ class _Build:
             return  # the grid holds its voltage
         if drawn.real < 0:
             raise UserError(
-                f"{self.flow.title}: {named(bus.name)}: its loads draw {bus.load.real:g} p.u.; make"
+                f"{self.flow.name}: {named(bus.name)}: its loads draw {bus.load.real:g} p.u.; make"
                 " them static generators"
             )
         if drawn.real or drawn.imag > 0:
@@ -452,7 +452,7 @@ class _Build:
         try:
             references = _references(self.par, law, abs(bus.V), power)
         except (NoEquilibrium, LawError) as problem:
-            raise UserError(f"{self.flow.title}: {named(bus.name)}: {problem}") from None
+            raise UserError(f"{self.flow.name}: {named(bus.name)}: {problem}") from None
         self._put(
             "converters",
             name,

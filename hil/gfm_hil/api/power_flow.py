@@ -56,6 +56,7 @@ class FlowBranch(NamedTuple):
 class PowerFlow:
     """A solved case in p.u. of ``S_b``."""
 
+    name: str  #: its file, or its title
     title: str
     S_b: float  #: VA
     f: float  #: Hz
@@ -72,25 +73,26 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     from pandapower.converter.pypower import to_ppc
 
     ignored: list[str] = []
-    if isinstance(case, str | Path):
-        title = title or Path(case).stem
+    is_named = isinstance(case, str | Path)
+    of = str(case) if is_named else title or str(case.name or "case")
+    title = title or (Path(of).stem if is_named else of)
+    if is_named:
         if (reader := _READERS.get(Path(case).suffix.lower())) is not None:
             tables = reader(Path(case))
             case, ignored = tables.net(), tables.ignored
         else:
             case = _load_pandapower(str(case))
-    title = title or str(case.name or "case")
     if len(case.bus) > _MOST_BUSES:
-        raise UserError(f"{title}: {len(case.bus)} buses: at most {_MOST_BUSES}")
+        raise UserError(f"{of}: {len(case.bus)} buses: at most {_MOST_BUSES}")
     if not case.ext_grid.in_service.any() and not case.gen.query("slack and in_service").size:
-        raise UserError(f"{title}: has no slack: an ext_grid, or a gen with slack")
+        raise UserError(f"{of}: has no slack: an ext_grid, or a gen with slack")
     try:
         pandapower.runpp(
             case, init="dc", tolerance_mva=1e-9, numba=False, enforce_q_lims=False,
             calculate_voltage_angles=False, trafo_model="pi",
         )  # fmt: skip
     except Exception as problem:  # of many kinds, from inside
-        raise UserError(f"{title}: its power flow does not converge: {problem}") from None
+        raise UserError(f"{of}: its power flow does not converge: {problem}") from None
     ppc = to_ppc(case, calculate_voltage_angles=False, trafo_model="pi", init="results", mode="pf")
     S_b = ppc["baseMVA"]
     names: dict[int, str] = {}
@@ -98,7 +100,7 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     unique = case.bus.name.notna().all() and case.bus.name.astype(str).is_unique
     called = {index: str(case.bus.name[index] if unique else index) for index in case.bus.index}
     if len(dead := case.bus.index[case.bus.in_service & case.res_bus.vm_pu.isna()]):
-        raise UserError(f"{title}: {named(called[dead[0]])} has no path to the slack")
+        raise UserError(f"{of}: {named(called[dead[0]])} has no path to the slack")
     for index, name in called.items():
         names.setdefault(int(where[index]), name)
     bus, branch = ppc["bus"], ppc["branch"]
@@ -132,11 +134,11 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     for k, one in enumerate(buses):
         if k not in ratings and abs(comes[k]) > _NEAR:
             raise UserError(
-                f"{title}: {named(one.name)}: {comes[k]:.3g} p.u. come from parts that this does"
+                f"{of}: {named(one.name)}: {comes[k]:.3g} p.u. come from parts that this does"
                 " not read (iron losses of transformers, for one)"
             )
     slack = int(np.flatnonzero(bus[:, 1] == 3)[0])
-    return PowerFlow(title, S_b * 1e6, float(case.f_hz), buses, branches, slack, ignored)
+    return PowerFlow(of, title, S_b * 1e6, float(case.f_hz), buses, branches, slack, ignored)
 
 
 def _ratings(
