@@ -38,6 +38,7 @@ _ROOM = 1.05  # of a governor above the power that the case asks for
 _STORED_S = 0.03  # energy of its DC capacitor by its rating, as of the paper's converter
 _V_N, _V_DC = 690.0, 1500.0  # V
 _FILTER = 0.05  # p.u. of a static generator's rating; the capacitor of its filter
+_OF_BUS = re.compile(r"(.*?\b)bus (\S*[^\s:,.])(.*)", re.DOTALL)
 # of the machines in Kundur's two areas, whose other values are those of a machine here
 _MACHINE = {"H": 6.5, "avr": {}}
 
@@ -262,9 +263,10 @@ class _Build:
                 f"GENCLS at bus {buses}: X' = {X:g} p.u., our assumption: the case has no sn_mva"
                 " and xdss_pu, which is ZSOURCE, of its generators there."
             )
+        ignored = _joined(self.ignored)
         content = {
             "title": self.flow.title,
-            "description": "Made from a power-flow case. " + " ".join(self.ignored),
+            "description": "Made from a power-flow case. " + " ".join(ignored),
             "duration": 5.0,
             "link": {"type": "inproc"},
         }
@@ -283,7 +285,7 @@ class _Build:
                 f"the machine at {self._node(k)}",
             )
         }
-        return NetworkCase(content, self.files, self.ignored, volts, sources)
+        return NetworkCase(content, self.files, ignored, volts, sources)
 
     def _branches(self) -> None:
         feeding = {k for k, bus in enumerate(self.flow.buses) if bus.machine}
@@ -459,6 +461,21 @@ class _Build:
             {"node": self._node(k), "law": law, "references": references,
              "plant": {"converter": file}},
         )  # fmt: skip
+
+
+def _joined(notes: Sequence[str]) -> list[str]:
+    """Notes that say the same of several buses as one of all of them."""
+    places: dict[tuple[str, str], dict[str, None]] = {}
+    for note in notes:
+        match = _OF_BUS.fullmatch(note)
+        before, name, after = match.groups() if match else (note, "", "")
+        places.setdefault((before, after), {})[name] = None
+    return [
+        f"{before}{'buses' if len(names) > 1 else 'bus'} {', '.join(names)}{after}"
+        if names.keys() != {""}
+        else before
+        for (before, after), names in places.items()
+    ]
 
 
 def _default(table: str, name: str) -> Any:

@@ -7,6 +7,7 @@ import pytest
 
 import gfmhil
 from gfm_hil.api.dyr_machines import read_machines
+from gfm_hil.api.network_case import _joined
 from gfm_hil.cli import main
 from gfm_hil.core.errors import UserError
 from gfm_plant.components import SynchronousMachine
@@ -119,6 +120,13 @@ def test_the_distribution_grid_of_cigre_with_a_converter_in_place_of_its_wind_tu
         *(f"F{k}" for k in (3, 4, 5, 6, 8, 9, 10, 11))
     ]
     assert run.status == "completed" and np.ptp(run["C7"].signals["p"]) < 1e-9
+
+
+def test_notes_that_say_the_same_of_several_buses_are_one():
+    made = _joined(
+        ["SEXS at bus 3: a", "SEXS at bus 14: a", "SEXS at bus 3: b", "60 Hz.", "Bus 7: c"]
+    )
+    assert made == ["SEXS at buses 3, 14: a", "SEXS at bus 3: b", "60 Hz.", "Bus 7: c"]
 
 
 def without_slack(net):
