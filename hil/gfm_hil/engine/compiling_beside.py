@@ -30,6 +30,7 @@ class Beside:
     ) -> None:
         self._task, self._notice = (scenario, tuple(roles)), notice
         self._process: subprocess.Popen[bytes] | None = None
+        self._is_over = False  # its share is next here
 
     def __enter__(self) -> "Beside":
         return self
@@ -41,9 +42,9 @@ class Beside:
 
     def begin(self, text: str) -> None:
         """Pass on that a set of functions is being compiled; before the first one, start the
-        process, unless this machine has one processor."""
+        process, unless this machine has one processor or nothing but its share is left."""
         self._notice(text)
-        if self._process is None and len(os.sched_getaffinity(0)) > 1:
+        if self._process is None and not self._is_over and len(os.sched_getaffinity(0)) > 1:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", __name__], stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -54,6 +55,7 @@ class Beside:
 
     def wait(self) -> None:
         """Wait until it has done its work."""
+        self._is_over = True
         if self._process is not None and self._process.poll() is None:
             self._notice("compiling the rest, in a second process (once a machine) …")
             self._process.wait()

@@ -138,6 +138,13 @@ def test_a_second_process_that_dies_holds_nothing_up(make, monkeypatch):
     assert said[0] == "a set" and said[-1] == "another"
 
 
+def test_no_second_process_begins_when_nothing_but_its_share_is_left(make, monkeypatch):
+    monkeypatch.setattr(compiling_beside.subprocess, "Popen", lambda *_, **more: pytest.fail())
+    with compiling_beside.Beside(make(), ROLES, lambda text: None) as beside:
+        beside.wait()
+        beside.begin("a set")
+
+
 def cached(folder: Path) -> dict[Path, int]:
     """The files of numba's cache and their times; not those of a kernel in user mode beside."""
     files = (file for file in folder.rglob("*.nb[ic]") if ".pytest_cache" not in file.parts)
