@@ -96,11 +96,12 @@ def run_tasks(
 ) -> None:
     """Work on all tasks until ``watch.stopped``, which is asked after each or a few times a second;
     those under way then are still finished. ``keep`` gets every result. What a worker had in hand
-    that died (killed, out of memory), another one takes up. Raises WorkerLost: workers died of the
-    same task again and again, or the function raised an error; the results of all other finished
-    tasks are kept."""
+    that died (killed, out of memory), another one takes up, one task after the other, so that it
+    shows of which one they die. Raises WorkerLost: workers died of the same task again and again,
+    or the function raised an error; the results of all other finished tasks are kept."""
     waiting = ((task, 0) for task in tasks)
-    again = deque[tuple[Task, int]]()  # tasks whose worker died, and how often
+    again = deque[tuple[Task, int]]()  # tasks that a worker's death ended, and how often theirs
+    alone = False  # whether they are worked on one after the other
     pending: dict[Future[Result], tuple[Task, int]] = {}
     try:
         while True:
@@ -108,7 +109,8 @@ def run_tasks(
                 again.clear()
                 pending = {f: task for f, task in pending.items() if not f.cancel()}
             else:
-                while len(pending) < pool.in_hand:
+                alone = bool(again) or (alone and bool(pending))
+                while len(pending) < (1 if alone else pool.in_hand):
                     if (one := again.popleft() if again else next(waiting, None)) is None:
                         break
                     pending[pool.submit(function, one[0])] = one
@@ -124,8 +126,8 @@ def run_tasks(
                 problem = future.exception()
                 if problem is None:
                     keep(future.result())
-                elif isinstance(problem, BrokenProcessPool) and deaths + 1 < _DEATHS:
-                    again.append((task, deaths + 1))
+                elif isinstance(problem, BrokenProcessPool) and deaths + alone < _DEATHS:
+                    again.append((task, deaths + alone))
                 else:
                     failed = problem
             if isinstance(failed, BrokenProcessPool):

@@ -39,11 +39,11 @@ def work(pool: Pool, function: Callable[[int], int]) -> tuple[list[int], list[st
 @pytest.mark.full
 def test_what_a_dead_worker_had_in_hand_is_worked_on_anew(tmp_path):
     with processes(2) as pool:
-        results, notices = work(pool, partial(double, {3: 1, 6: 2}, tmp_path))
+        results, notices = work(pool, partial(double, {3: 2, 4: 2, 6: 2}, tmp_path))
         assert results == [2 * task for task in range(8)]
         assert {*notices} == {"a worker process died (killed, or out of memory?); going on …"}
         results, notices = work(pool, partial(double, {5: 9}, tmp_path))
-        assert set(results) >= {0, 2, 4} and 10 not in results
+        assert {*results} >= {0, 2, 4, 6, 8} and 10 not in results  # none but the fifth is blamed
         assert notices[-1] == "3 worker processes died of the same work (out of memory?)"
 
 
