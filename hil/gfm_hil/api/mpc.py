@@ -72,7 +72,8 @@ class MpcCase(CaseTables):
 
     def __init__(self, path: Path) -> None:
         self.path, self.fields = path, _fields(path)
-        version = " ".join(self.fields.get("version", [("", ["1"])])[0][1]).strip("'")
+        (_, texts), *_ = self.fields.get("version") or [("", ["1"])]
+        version = " ".join(texts).strip("'")
         if version != "2":
             raise UserError(f"{path}: mpc.version = {version!r}: must be '2'")
         for name in ("baseMVA", *_COLUMNS):
