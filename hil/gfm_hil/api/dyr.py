@@ -153,5 +153,5 @@ def number(where: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) <= 1e6:
-        raise UserError(f"{where}: {text!r} is no number from -1e6 to 1e6")
+        raise UserError(f"{where}: {text[:40]!r} is no number from -1e6 to 1e6")
     return value

@@ -39,7 +39,7 @@ def _fields(path: Path) -> dict[str, list[tuple[str, list[str]]]]:
         line = _COMMENT.fullmatch(whole)[1]  # type: ignore[index]
         match = _ASSIGNMENT.fullmatch(line)
         if closing and match:
-            raise UserError(f"{path}, line {k}: mpc.{name} does not end with {closing}")
+            raise UserError(f"{path}, line {k}: mpc.{name[:40]} does not end with {closing}")
         if not closing:
             if match is None:
                 if not _AROUND.fullmatch(line):
@@ -55,10 +55,10 @@ def _fields(path: Path) -> dict[str, list[tuple[str, list[str]]]]:
             if numbers := row.replace(",", " ").split():
                 fields[name].append((f"{path}, line {k}, mpc.{name}", numbers))
         closing = "" if end else closing
-        if rest := rest.strip("; "):
+        if rest := rest.strip("; ")[:40]:
             raise UserError(f"{path}, line {k}: {rest!r}: only one mpc.NAME = ... a line is read")
     if closing:
-        raise UserError(f"{path}: mpc.{name} does not end with {closing}")
+        raise UserError(f"{path}: mpc.{name[:40]} does not end with {closing}")
     return fields
 
 
@@ -75,7 +75,7 @@ class MpcCase(CaseTables):
         (_, texts), *_ = self.fields.get("version") or [("", ["1"])]
         version = " ".join(texts).strip("'")
         if version != "2":
-            raise UserError(f"{path}: mpc.version = {version!r}: must be '2'")
+            raise UserError(f"{path}: mpc.version = {version[:40]!r}: must be '2'")
         for name in ("baseMVA", *_COLUMNS):
             if not self.fields.get(name):
                 raise UserError(f"{path}: has no mpc.{name}")
@@ -95,7 +95,7 @@ class MpcCase(CaseTables):
         for where, texts in self.fields[name]:
             for text in texts:
                 if not _NUMBER.fullmatch(text):
-                    raise UserError(f"{where}: {text!r} is no number")
+                    raise UserError(f"{where}: {text[:40]!r} is no number")
             if len(texts) != width:
                 raise UserError(f"{where}: must have {width} numbers, not {len(texts)}")
             if name == "gen" and texts[columns["PMAX"]].lower() == "inf":
