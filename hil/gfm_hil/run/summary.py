@@ -98,7 +98,7 @@ def summarise(
     log = [e for e in log if e["event"] != NOTE]
     met = [e for e in log if e["event"] == "handshake"]
     controller: str | None = met[0]["controller"] if met else OUR_CONTROLLER
-    plant, ours = "true_p" in signals, "law" in signals or "ref_P_ref" in signals
+    plant, ours = "true_p" in signals, "law" in signals
     ripple = None
     if plant and outcome.status == "completed":
         ripple = remaining_ripple(scenario, signals, log, done)
