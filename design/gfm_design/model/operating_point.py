@@ -373,7 +373,7 @@ class _ConverterEquilibrium:
 
     def __init__(self, par: Record, law: DiscreteLaw, ref: Vector, drop: Drop = no_drop) -> None:
         self.par, self.law, self.ref, self.drop = par, law, ref, drop
-        self.controlled = par[0]["i_u_gain"] != 0.0
+        self.controlled, self.across = par[0]["i_u_gain"] != 0.0, par[0]["array"] == ACROSS
         check_dc_side(par, law)
         # row 1's states are left out of a plant whose DC source ignores it
         self.kept = np.array(
@@ -385,14 +385,14 @@ class _ConverterEquilibrium:
         self._gain, self._offset = (
             par[0][name][: len(SENSED)].copy() for name in ("gain", "offset")
         )
-        nothing = np.zeros((law.order, NY))
+        n = law.order
         #: u - u_0 and the next state by the state, the references, and what the errors are of
-        self._gains = np.block(
-            [[law.C, law.D_u0, law.D_r, law.D_y], [law.A, nothing, law.B_r, law.B_y]]
-        )
-        impedance = np.zeros(2)
-        impedance[: len(law.law.error_parameters)] = law.law.error_parameters
-        self._impedance = impedance
+        self._gains = np.zeros((NU + n, n + 3 * NY))
+        self._gains[:NU] = np.hstack([law.C, law.D_u0, law.D_r, law.D_y])
+        self._gains[NU:, :n], self._gains[NU:, n + NY :] = law.A, np.hstack([law.B_r, law.B_y])
+        self._inner, self._map = law.law.inner, ERROR_MAPS[law.law.error_map]
+        self._impedance = np.zeros(2)
+        self._impedance[: len(law.law.error_parameters)] = law.law.error_parameters
 
     def first(self, V_g: float, omega_g: float) -> Vector:
         """Where to begin: at the references, with the law's states at zero.
@@ -401,28 +401,27 @@ class _ConverterEquilibrium:
             NoEquilibrium: the line cannot carry P_ref.
         """
         x, u = plant_equilibrium(self.par, self.ref[1], self.ref[4], V_g, omega_g)
-        r = self.par[0]
-        if r["array"] == ACROSS:  # on the side of the curve where v_dc falls as more power is drawn
+        if self.across:  # on the side of the curve where v_dc falls as more power is drawn
+            r = self.par[0]
             x[V_DC] = max(1.0, open_circuit_voltage(r, r["irradiance"]))
         return np.concatenate([x, [u[0], u[2]], np.zeros(len(self.kept))])
 
     def residual(self, z: Vector, V_g: float, omega_g: float, theta: float = 0.0) -> Vector:
         """What must vanish, at a voltage V_g of the line's far end that is ahead by theta, rad."""
-        law, ref = self.law, self.ref
-        if law.law.inner is not None and law.law.inner.f_pll > 0.0:
+        law, inner, ref = self.law, self._inner, self.ref
+        if inner is not None and inner.f_pll > 0.0:
             ref = np.array([*ref[:2], omega_g, *ref[3:]])  # the law sees what its PLL measures
         x, u, y, x_law = self._unpack(z, omega_g)
         x[DELTA] -= theta
         u_law, x_next = self._law(x_law, ref, y)
         dx = compiled_f(x, u, np.array([omega_g, V_g]), self.par)
-        r = self.par[0]
-        if r["array"] == ACROSS:
+        if self.across:
+            r = self.par[0]
             dc = array_current.py_func(r, r["irradiance"], x[V_DC]) - u[0]
         else:
             dc = u_law[0] - u[0] if self.controlled else x[V_DC] - 1.0
-        ac = dx[self._steady]
         e = self._command(x, u)
-        if isinstance(inner := law.law.inner, GridFollowingStage):
+        if isinstance(inner, GridFollowingStage):
             i, v = complex(x[0], x[1]), complex(x[2], x[3])
             lack = inner.wanted(ref, y[0], abs(v), omega_g)
             lack -= inner.reference(i, v, e, omega_g) * abs(v) / v
@@ -431,7 +430,7 @@ class _ConverterEquilibrium:
             E = _internal(law, x, u, e, limited=False)
             rest = [u_law[1] - omega_g, u_law[2] - abs(E)]
         change = (x_next - x_law)[self.kept] / law.T_s
-        return np.concatenate([ac, [dc, *rest], change])
+        return np.concatenate([dx[self._steady], [dc, *rest], change])
 
     def found(self, z: Vector, omega_g: float) -> OperatingPoint:
         """The operating point at the unknowns z. Raises NoEquilibrium: the DC source would need
@@ -469,14 +468,14 @@ class _ConverterEquilibrium:
     def _law(self, x: Vector, ref: Vector, y: Vector) -> tuple[Vector, Vector]:
         """The law's u (3,) and next state at held inputs; column 3 sees the plant's omega_u."""
         law, r, measured = self.law, ref.copy(), y.copy()
-        map_errors(ERROR_MAPS[law.law.error_map], self._impedance, r, measured)
+        map_errors(self._map, self._impedance, r, measured)
         made = self._gains @ np.concatenate([x, ref, r, measured])
         return law.u_0 + made[:NU], made[NU:]
 
     def no_steady_state(self, grid: str) -> str:
         """The words for: there is no operating point on that grid."""
         cause, r = "", self.par[0]
-        if r["array"] == ACROSS:
+        if self.across:
             P, v = most_power.py_func(r, r["irradiance"])
             cause = f"; the PV array gives at most {P:.4g} p.u., at v_dc = {v:.4g} p.u."
         if self.controlled and not (self.law.C[0].any() or self.law.D_y[0].any()):
@@ -510,22 +509,21 @@ def _newton(
             none: each acts on all.
         known: the other slopes at z, by row and unknown.
     """
-    everything = {*range(len(z))}
-    reach = reach or [(everything, everything)] * len(z)
-    groups, before, largest = _apart(reach), 0.0, math.inf
+    rows, columns, of = _measured(reach, len(z))
+    nudges = np.zeros((1 + of.max(initial=0), len(z)))
+    nudges[of, columns] = _NUDGE
+    before, largest = 0.0, math.inf
     step_of: Callable[[Vector], Vector] = np.negative  # none yet: the first round makes it
     for _ in range(_ROUNDS):
         now = residual(z)
         if np.abs(now).max() < _ROUNDING:  # near a dead network steps do not get shorter
             return z
         if not largest < 0.1 * before:
-            jacobian = [*known(z)]
-            for group in groups:
-                nudge = np.zeros(len(z))
-                nudge[group] = _NUDGE
-                slopes = ((residual(z + nudge) - now) / _NUDGE).tolist()
-                jacobian += [(j, column, slopes[j]) for column in group for j in reach[column][0]]
-            step_of = _steps(jacobian, (len(now), len(z)))
+            slopes = (np.array([residual(z + nudge) for nudge in nudges]) - now) / _NUDGE
+            more = np.array([*known(z)]).reshape(-1, 3).T
+            there = np.concatenate([(rows, columns), more[:2].astype(int)], axis=1)
+            values = np.concatenate([slopes[of, rows], more[2]])
+            step_of = _steps(*there, values, (len(now), len(z)))
         step = step_of(now)
         before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)
@@ -536,8 +534,14 @@ def _newton(
     return None
 
 
-def _apart(reach: Sequence[tuple[set[int], set[int]]]) -> list[list[int]]:
-    """The unknowns in groups, none of which acts on a row that is measured for another one."""
+def _measured(
+    reach: Sequence[tuple[set[int], set[int]]], unknowns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Of each slope that is measured its row and its unknown, and the group of that; no unknown of
+    a group acts on a row that is measured for another one of it."""
+    if not reach:
+        rows, columns = np.indices((unknowns, unknowns)).reshape(2, -1)
+        return rows, columns, columns
     groups: list[tuple[list[int], set[int], set[int]]] = []
     for column, (measured, moved) in enumerate(reach):
         for group, all_measured, all_moved in groups:
@@ -548,15 +552,16 @@ def _apart(reach: Sequence[tuple[set[int], set[int]]]) -> list[list[int]]:
                 break
         else:
             groups.append(([column], set(measured), set(moved)))
-    return [group for group, _, _ in groups]
+    places = [(j, c, k) for k, (group, *_) in enumerate(groups) for c in group for j in reach[c][0]]
+    rows, columns, of = np.array(places, int).reshape(-1, 3).T
+    return rows, columns, of
 
 
 def _steps(
-    slopes: Sequence[tuple[int, int, float]], shape: tuple[int, int]
+    rows: NDArray[np.int64], columns: NDArray[np.int64], values: Vector, shape: tuple[int, int]
 ) -> Callable[[Vector], Vector]:
     """The step of Newton's method by what must vanish, for slopes by row and unknown: of least
     squares, but for a large network whose rows are independent."""
-    rows, columns, values = map(np.array, zip(*slopes, strict=True))
     if shape[0] == shape[1] > _MOST_BY_SQUARES:
         try:
             sparse = scipy.sparse.csc_matrix((values, (rows, columns)), shape)

@@ -143,29 +143,33 @@ def follow_trips(plant: Network) -> list[int]:
     return started
 
 
-def make_bench(scenario: Scenario, real: str = "float64") -> Bench:
+def make_bench(scenario: Scenario, real: str = "float64", plant: Network | None = None) -> Bench:
     """Build both sides of a scenario of one converter at its operating point.
 
     Args:
         scenario: checked.
         real: float64 or float32, for the laws' arithmetic.
+        plant: what ``plant_of`` makes of the scenario, if someone has made it already; the bench
+            starts it.
 
     Raises:
         UserError: the law has no steady state on this grid, or the scenario has a network.
     """
     if scenario.parts:
         raise UserError(ONE_CONVERTER)
-    (bench,) = make_benches(scenario, real)
+    (bench,) = make_benches(scenario, real, plant)
     return bench
 
 
-def make_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
+def make_benches(
+    scenario: Scenario, real: str = "float64", plant: Network | None = None
+) -> list[Bench]:
     """Build both sides of a scenario at its operating point: a bench for each converter, with a
     controller of its own and one plant in common; as the controller of one of them sees it, the
     bench of that one. Arguments and errors as of ``make_bench``.
     """
-    benches = unstarted_benches(scenario, real)
-    plant = benches[0].plant
+    plant = plant or plant_of(scenario)
+    benches = unstarted_benches(scenario, real, plant)
     laws = [bench.controller.active_law for bench in benches]
     refs = [np.asarray(bench.scenario.references.vector()) for bench in benches]
     try:
@@ -223,10 +227,12 @@ def _plants(
     return [found[k] for k in range(len(x))]
 
 
-def unstarted_benches(scenario: Scenario, real: str = "float64") -> list[Bench]:
+def unstarted_benches(
+    scenario: Scenario, real: str = "float64", plant: Network | None = None
+) -> list[Bench]:
     """The benches of all converters before anyone knows the operating point: none can run, but the
     loops can be compiled for their records. Arguments as of ``make_bench``."""
-    plant, nowhere, benches = plant_of(scenario), cast(OperatingPoint, None), list[Bench]()
+    plant, nowhere, benches = plant or plant_of(scenario), cast(OperatingPoint, None), list[Bench]()
     vectors: tuple[Vector, Vector] = "y", "u"
     for k, one in enumerate([*scenario.each.values()] or [scenario]):
         controller = _controller(one, plant, real)

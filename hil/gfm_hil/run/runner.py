@@ -301,20 +301,11 @@ def run_in_memory(
         notice: is called with what is compiled meanwhile; None: each function is compiled when it
             is first called, without a word.
     """
-    with np.errstate(all="ignore"):  # a diverging run is a result
-        return drive(memory_steps(scenario, kept, notice))
-
-
-def memory_steps(
-    scenario: Scenario,
-    kept: tuple[MemoryPart, MemoryPart] | None = None,
-    notice: Notice | None = None,
-) -> Steps[Run]:
-    """``run_in_memory`` step by step."""
     if scenario.parts:
         raise UserError(ONE_CONVERTER)
     benches = _benches(scenario, notice)
-    (run,) = yield from _in_memory(benches, [kept] if kept else make_room(benches))
+    with np.errstate(all="ignore"):  # a diverging run is a result
+        (run,) = drive(memory_steps(benches, [kept] if kept else make_room(benches)))
     return run
 
 
@@ -323,7 +314,7 @@ def run_network_in_memory(scenario: Scenario, notice: Notice | None = None) -> N
     ``run_in_memory``. Raises UserError: the scenario has no operating point."""
     benches = _benches(scenario, notice)
     with np.errstate(all="ignore"):
-        runs = drive(_in_memory(benches, make_room(benches)))
+        runs = drive(memory_steps(benches, make_room(benches)))
     return NetworkRun(scenario, dict(zip(scenario.converters, runs, strict=True)))
 
 
@@ -340,10 +331,11 @@ def make_room(benches: Sequence[Bench]) -> list[tuple[MemoryPart, MemoryPart]]:
     ]
 
 
-def _in_memory(
+def memory_steps(
     benches: Sequence[Bench], kept: Sequence[tuple[MemoryPart, MemoryPart]]
 ) -> Steps[list[Run]]:
-    """Run benches; the runs' columns are those kept. Raises UserError: a snapshot has no place."""
+    """Run the benches of a scenario step by step; the runs' columns are those kept. Raises
+    UserError: a snapshot has no place."""
     if benches[0].scenario.snapshot is not None:
         raise UserError("snapshot: is kept in a run folder, and a run in memory has none")
     plants, controllers = zip(*kept, strict=True)

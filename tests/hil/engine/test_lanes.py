@@ -8,6 +8,7 @@ import pytest
 
 from gfm_hil.engine import lanes
 from gfm_hil.engine.lanes import LANES, Lanes, run_together
+from gfm_hil.engine.setup import make_bench
 from gfm_hil.run.runner import memory_steps, run_in_memory
 from gfm_hil.run.summary import READ
 from gfm_hil.scenario import load_scenario
@@ -34,7 +35,7 @@ def _scenario(k, fraction, events, **more):
 
 
 def _steps(scenario):
-    run = yield from memory_steps(scenario, kept(scenario))
+    (run,) = yield from memory_steps([make_bench(scenario)], [kept(scenario)])
     return {name: np.array(run.columns[name][:]) for name in READ}, _told(run)
 
 

@@ -136,5 +136,5 @@ def _check_run(path: Path, campaign: Campaign, run: int) -> None:
         scenario, _ = campaign.scenario(run, law)
         plant_of(scenario)
     except ValueError:
-        check_scenario(campaign.content(run, law)[0], f"{path}: run {run}")
+        check_scenario(campaign.under(campaign.drawn(run)[0], law), f"{path}: run {run}")
         raise

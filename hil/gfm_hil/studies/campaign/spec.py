@@ -232,11 +232,11 @@ class Campaign:
         text = json.dumps([decides, limit, scenarios, version("gfmhil")], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-    def content(self, run: int, law: str) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Scenario of a run as plain data, and the values drawn for it by their paths."""
+    def drawn(self, run: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Scenario of a run as plain data, under no law of the campaign yet, and the values drawn
+        for it by their paths."""
         seed, values = draw(self.file.seed, run, self.file.draw)
-        content = pickle.loads(self._packed)
-        content = self.under(content, law) | {"seed": seed}
+        content = pickle.loads(self._packed) | {"seed": seed}
         for d, value in zip(self.file.draw, values, strict=True):
             for path in d.paths():
                 put(content, path, value)
@@ -244,5 +244,5 @@ class Campaign:
 
     def scenario(self, run: int, law: str) -> tuple[Scenario, dict[str, Any]]:
         """The scenario of a run, and the values drawn for it by their paths."""
-        content, drawn = self.content(run, law)
-        return Scenario.model_validate(content), drawn
+        content, drawn = self.drawn(run)
+        return Scenario.model_validate(self.under(content, law)), drawn

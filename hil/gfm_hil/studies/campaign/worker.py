@@ -1,7 +1,10 @@
 """What a worker does: a chunk of runs in process, each turned into a small record."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -11,14 +14,16 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.compiling import SIDE_BY_SIDE, compile_sets, compiled_benches
 from gfm_hil.engine.inproc import Steps
 from gfm_hil.engine.lanes import is_plain, run_together
+from gfm_hil.engine.setup import make_bench
 from gfm_hil.recording.parts import MemoryPart
 from gfm_hil.results.report import finite
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import memory_steps, run_network_in_memory
 from gfm_hil.run.summary import READ
-from gfm_hil.scenario import Scenario
+from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.studies.campaign.spec import Campaign
 from gfm_hil.studies.workers import RunFailed
+from gfm_plant import Network
 
 Job = tuple[int, str]  # run number, law
 Record = dict[str, Any]
@@ -39,29 +44,57 @@ def compile_once(campaign: Campaign, notice: Callable[[str], None]) -> None:
 
 def run_chunk(campaign: Campaign, jobs: Sequence[Job]) -> list[Record]:
     """The records of some runs. Raises RunFailed: an error that is not the run's own."""
-    room: dict[int, list[tuple[MemoryPart, MemoryPart]]] = {}
     with np.errstate(all="ignore"):  # a diverging run is a result
-        return run_together(_record_steps(campaign, *job, room) for job in jobs)
+        return run_together(_each_in_steps(campaign, jobs))
+
+
+class _Draw:
+    """What the runs of a draw under several laws have in common, made when the first needs it."""
+
+    def __init__(self, campaign: Campaign, run: int) -> None:
+        self.campaign, self.run = campaign, run
+
+    @cached_property
+    def content(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As ``Campaign.drawn``."""
+        return self.campaign.drawn(self.run)
+
+    @cached_property
+    def plant(self) -> Network:
+        """Not started."""
+        return plant_of(self.scenario(self.campaign.file.laws[0]))
+
+    def scenario(self, law: str) -> Scenario:
+        """Of the run under a law."""
+        return Scenario.model_validate(self.campaign.under(self.content[0], law))
+
+
+def _each_in_steps(campaign: Campaign, jobs: Sequence[Job]) -> Iterator[Steps[Record]]:
+    room: dict[int, list[tuple[MemoryPart, MemoryPart]]] = {}
+    for run, those in groupby(jobs, key=itemgetter(0)):
+        draw = _Draw(campaign, run)
+        yield from (_record_steps(draw, law, room) for _, law in those)
 
 
 def _record_steps(
-    campaign: Campaign, run: int, law: str, room: dict[int, list[tuple[MemoryPart, MemoryPart]]]
+    draw: _Draw, law: str, room: dict[int, list[tuple[MemoryPart, MemoryPart]]]
 ) -> Steps[Record]:
     """The record of a run step by step; ``room``: what no run uses, by what it records."""
+    campaign, run = draw.campaign, draw.run
     try:
-        scenario, drawn = campaign.scenario(run, law)
+        scenario = draw.scenario(law)
         if scenario.parts:
             summary, lasted = simulate_network(scenario, campaign.file.converter)
         else:
             free = room.setdefault(scenario.signal_set, [])
             mine = free.pop() if free else kept(scenario)
-            summary, columns = yield from simulate(scenario, mine)
+            summary, columns = yield from simulate(scenario, mine, draw.plant.copy())
             lasted = len(columns["true_p"])
             free.append(mine)
     except Exception as problem:
         words = f"run {run}, {law}: {type(problem).__name__}: {problem}"
         raise RunFailed(words) from problem
-    return record(run, law, scenario, drawn, summary, lasted)
+    return record(run, law, scenario, draw.content[1], summary, lasted)
 
 
 def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
@@ -74,12 +107,12 @@ def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
 
 
 def simulate(
-    scenario: Scenario, room: tuple[MemoryPart, MemoryPart]
+    scenario: Scenario, room: tuple[MemoryPart, MemoryPart], plant: Network | None = None
 ) -> Steps[tuple[dict[str, Any], Mapping[str, NDArray[np.float64]]]]:
     """The summary of a run, as ``run_scenario`` would write it, and the columns that it reads,
-    which are good until the next run in the same room."""
+    which are good until the next run in the same room; ``plant`` as for ``make_bench``."""
     try:
-        run = yield from memory_steps(scenario, room)
+        (run,) = yield from memory_steps([make_bench(scenario, plant=plant)], [room])
     except UserError as problem:
         return no_steady_state(problem), dict.fromkeys(READ, np.empty(0))
     return run.summary, {name: np.asarray(run.columns[name]) for name in READ}
