@@ -523,7 +523,7 @@ def _newton(
             more = np.array([*known(z)]).reshape(-1, 3).T
             there = np.concatenate([(rows, columns), more[:2].astype(int)], axis=1)
             values = np.concatenate([slopes[of, rows], more[2]])
-            step_of = _steps(*there, values, (len(now), len(z)))
+            step_of = _steps(there[0], there[1], values, (len(now), len(z)))
         step = step_of(now)
         before, largest = largest, float(np.abs(step).max())
         z = z - step * min(1.0, 0.5 / largest if largest > 0 else 1.0)

@@ -17,22 +17,34 @@ from numpy.typing import NDArray
 
 from gfm_hil.engine.inproc import Steps, Stretch
 from gfm_hil.engine.setup import Bench
+from gfm_hil.engine.vectors import WIDTH as LANES
+from gfm_hil.engine.vectors import (
+    bits,
+    everywhere,
+    floor,
+    limited,
+    magnitude,
+    plus,
+    put,
+    sqrt,
+    times,
+    vector,
+    where,
+)
 from gfm_hil.realtime.atomics import row_at
 from gfm_hil.recording.parts import MemoryPart
-from gfm_plant.model import DELTA, V_DC, terminal
+from gfm_plant.model import DELTA, V_DC
 from gfm_plant.noise import normal_pair, random_bits
-from gfm_plant.quantise import quantise
 from gfm_plant.records import MAX_DELAY, N_TRIPS
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.error_maps import LINEAR
-from gfm_runtime.inner import faded, limited
+from gfm_runtime.inner.stage import NEGLIGIBLE
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import RUNNING
 
 T = TypeVar("T")
 _Places = tuple[NDArray[np.int64], NDArray[np.int64], int]
 
-LANES = 8
 BLOCK = 50  # ticks after which one that was not calm is noticed
 _MODES = 3  # of the filter and the line, whose states are as many
 _PARTS = 2  # of a period, at most: one before and one behind a fraction of a sample of delay
@@ -74,7 +86,7 @@ fixed_dtype = _record(
 )  # fmt: skip
 #: what changes from tick to tick
 moving_dtype = _record(
-    ("upset", "i8"), ("tick", "i8"), ("x", "f8", 8), ("i_reg", "f8"), ("sensed", "f8", 4),
+    ("tick", "i8"), ("x", "f8", 8), ("i_reg", "f8"), ("sensed", "f8", 4),
     ("u", "f8", _AGES, NU), ("E_q", "f8"), ("u_now", "f8", NU), ("E", "f8", 2), ("E_most", "f8"),
     ("drawn", "f8", 3), ("seen", "f8", 3, 3),
     ("noise", "f8", 4), ("z", "f8", 2, _MODES), ("forced", "f8", 2, 2, _MODES),
@@ -86,274 +98,299 @@ moving_dtype = _record(
 
 
 @inlined
+def _z(numbers, k):
+    """Return complex number k of all lanes."""
+    return vector(numbers[0, k]), vector(numbers[1, k])
+
+
+@inlined
+def _put_z(numbers, k, z):
+    put(numbers[0, k], z[0])
+    put(numbers[1, k], z[1])
+
+
+@inlined
+def _quantised(x, low, high, lsb):
+    """As `gfm_plant.quantise.quantise`."""
+    x = limited(x, low, high)
+    return where(lsb > 0.0, low + lsb * floor((x - low) / lsb + 0.5), x)
+
+
+@inlined
+def _faded(x):
+    """As `gfm_runtime.inner.faded`."""
+    return where(magnitude(x) < NEGLIGIBLE, 0.0, x)
+
+
+@inlined
+def _terminal(v, i_o):
+    """As `gfm_plant.model.terminal`."""
+    p, q = v[0] * i_o[0] + v[1] * i_o[1], v[1] * i_o[0] - v[0] * i_o[1]
+    return p, q, sqrt(v[0] * v[0] + v[1] * v[1])
+
+
+@inlined
 def _sample(n, c, s):
-    """As `gfm_plant.sensors.read_sensors`."""
+    """As `gfm_plant.sensors.read_sensors`; returns which lanes are calm."""
     for pair in range(2):
         for j in range(n):
-            bits = random_bits(c.seed[j], s.tick[j], pair)
-            s.noise[2 * pair, j], s.noise[2 * pair + 1, j] = normal_pair(bits)
+            random = random_bits(c.seed[j], s.tick[j], pair)
+            s.noise[2 * pair, j], s.noise[2 * pair + 1, j] = normal_pair(random)
     for k in range(4):
-        y = k if k < 2 else k + 1
-        for j in range(n):
-            value = (
-                c.gain[k, j] * s.sensed[k, j] + c.offset[k, j] + c.noise_std[k, j] * s.noise[k, j]
-            )
-            s.y[y, j] = quantise(value, c.adc_lo[k, j], c.adc_hi[k, j], c.adc_lsb[k, j])
-    for j in range(n):
-        s.y[2, j] = s.u_now[1, j]
+        value = vector(c.gain[k]) * vector(s.sensed[k]) + vector(c.offset[k])
+        value = value + vector(c.noise_std[k]) * vector(s.noise[k])
+        low, high, lsb = vector(c.adc_lo[k]), vector(c.adc_hi[k]), vector(c.adc_lsb[k])
+        put(s.y[k if k < 2 else k + 1], _quantised(value, low, high, lsb))
+    put(s.y[2], vector(s.u_now[1]))
+    calm = everywhere(True)
     for k in range(NY):
-        for j in range(n):
-            s.upset[j] |= 0 if c.y_low[k, j] <= s.y[k, j] <= c.y_high[k, j] else 1
-            s.seen_y[k, j] = s.y[k, j]
+        y = vector(s.y[k])
+        calm = calm & (vector(c.y_low[k]) <= y) & (y <= vector(c.y_high[k]))
+        put(s.seen_y[k], y)
+    return calm
 
 
 @inlined
-def _control(n, c, s, order):
-    """As `look` and `advance` of `gfm_runtime.kernel`. A loop over lanes holds those of fixed
-    length that it can, so that sums stay in registers."""
-    for i in range(NU):
-        for j in range(n):
-            raw = c.u_0[i, j] + s.off[i, j]
-            for k in range(_ORDER):
-                raw += c.C[i, k, j] * s.x_law[k, j]
-            for k in range(NY):
-                raw += c.from_ref[i, k, j]
-            for k in range(NY):
-                if k != 2:
-                    raw += c.D_y[i, k, j] * s.seen_y[k, j]
-            s.raw[i, j] = raw
-    for j in range(n):
-        s.raw[1, j] *= c.loop[j]
-        s.now[1, j] = s.seen_y[2, j] = limited(s.raw[1, j], c.low[1, j], c.high[1, j])
-    for i in (0, 2):
-        for j in range(n):
-            s.raw[i, j] += c.D_y[i, 2, j] * s.seen_y[2, j]
-            s.now[i, j] = limited(s.raw[i, j], c.low[i, j], c.high[i, j])
+def _row(c, s, i, order):
+    """As of `gfm_runtime.kernel`."""
+    raw = vector(c.u_0[i]) + vector(s.off[i])
     for k in range(order):
-        for j in range(n):
-            x = s.x_law[k, j]
-            for i in range(NU):
-                excess = s.now[i, j] - s.raw[i, j]
-                x = x + c.W[k, i, j] * excess if excess != 0 else x
-            s.x_law[k, j] = x
-    for i in range(NU):
-        for j in range(n):
-            s.upset[j] |= 0 if abs(s.now[i, j]) < math.inf else 1
-            s.off[i, j] = faded(s.off[i, j] * c.decay[j])
-            change = s.now[i, j] - s.u_law[i, j] - s.trend[i, j]
-            s.trend[i, j] = faded(s.trend[i, j] + c.follow[j] * change)
-            s.u_law[i, j] = s.now[i, j]
-    for i in range(order):
-        for j in range(n):
-            x = c.x_ref[i, j]
-            for k in range(NY):
-                x += c.B_y[i, k, j] * s.seen_y[k, j]
-            for k in range(_ORDER):
-                x += c.A[i, k, j] * s.x_law[k, j]
-            s.x_next[i, j] = x
-    for i in range(order):
-        for j in range(n):
-            s.x_law[i, j] = faded(s.x_next[i, j])
+        raw = raw + vector(c.C[i, k]) * vector(s.x_law[k])
+    for k in range(NY):
+        raw = raw + vector(c.from_ref[i, k])
+    for k in range(NY):
+        if k != 2:
+            raw = raw + vector(c.D_y[i, k]) * vector(s.seen_y[k])
+    return raw
 
 
 @inlined
-def _command(n, c, s):
+def _control(c, s, order):
+    """As `look` and `advance` of `gfm_runtime.kernel`; returns which lanes are calm."""
+    omega_u = _row(c, s, 1, order) * vector(c.loop)
+    put(s.raw[1], omega_u)
+    omega_u = limited(omega_u, vector(c.low[1]), vector(c.high[1]))
+    put(s.now[1], omega_u)
+    put(s.seen_y[2], omega_u)
+    for i in (0, 2):
+        raw = _row(c, s, i, order) + vector(c.D_y[i, 2]) * omega_u
+        put(s.raw[i], raw)
+        put(s.now[i], limited(raw, vector(c.low[i]), vector(c.high[i])))
+    for k in range(order):
+        x = vector(s.x_law[k])
+        for i in range(NU):
+            excess = vector(s.now[i]) - vector(s.raw[i])
+            x = where(excess != 0.0, x + vector(c.W[k, i]) * excess, x)
+        put(s.x_law[k], x)
+    calm, decay, follow = everywhere(True), vector(c.decay), vector(c.follow)
+    for i in range(NU):
+        now, trend = vector(s.now[i]), vector(s.trend[i])
+        calm = calm & (magnitude(now) < math.inf)
+        put(s.off[i], _faded(vector(s.off[i]) * decay))
+        change = now - vector(s.u_law[i]) - trend
+        put(s.trend[i], _faded(trend + follow * change))
+        put(s.u_law[i], now)
+    for i in range(order):
+        x = vector(c.x_ref[i])
+        for k in range(NY):
+            x = x + vector(c.B_y[i, k]) * vector(s.seen_y[k])
+        for k in range(order):
+            x = x + vector(c.A[i, k]) * vector(s.x_law[k])
+        put(s.x_next[i], x)
+    for i in range(order):
+        put(s.x_law[i], _faded(vector(s.x_next[i])))
+    return calm
+
+
+@inlined
+def _command(c, s):
     """As `gfm_plant.emulator.plant_command`."""
     for i in range(NU):
         for age in range(_AGES - 1, 0, -1):
-            for j in range(n):
-                s.u[age, i, j] = s.u[age - 1, i, j]
-        for j in range(n):
-            s.u[0, i, j] = quantise(s.now[i, j], c.dac_lo[i, j], c.dac_hi[i, j], c.dac_lsb[i, j])
+            put(s.u[age, i], vector(s.u[age - 1, i]))
+        low, high, lsb = vector(c.dac_lo[i]), vector(c.dac_hi[i]), vector(c.dac_lsb[i])
+        put(s.u[0, i], _quantised(vector(s.now[i]), low, high, lsb))
 
 
 @inlined
-def _z(numbers, k, j):
-    """Return complex number k of lane j; the compiler takes all lanes at a time of real numbers
-    only."""
-    return complex(numbers[0, k, j], numbers[1, k, j])
+def _look(c, s, E, unit):
+    """As of `gfm_plant.period`: what the bridge draws; p, q and V."""
+    i, v, i_o, scale = _z(s.w, 0), _z(s.w, 1), _z(s.w, 2), vector(c.current)
+    turned = times((unit[0], -unit[1]), (i[0] * scale, i[1] * scale))
+    return E[0] * turned[0] + E[1] * turned[1], _terminal(v, (i_o[0] * scale, i_o[1] * scale))
 
 
 @inlined
-def _set(numbers, k, j, z):
-    numbers[0, k, j], numbers[1, k, j] = z.real, z.imag
+def _turn_on(s, k, turn):
+    """As of `gfm_plant.solution`; returns the phasor in the middle of a piece, and at its end."""
+    middle = times(_z(s.unit, k), turn)
+    u = times(middle, turn)
+    length = 1.5 - 0.5 * (u[0] * u[0] + u[1] * u[1])
+    end = u[0] * length, u[1] * length
+    _put_z(s.unit, k, end)
+    return middle, end
 
 
 @inlined
-def _look(n, c, s, which):
-    """As of `gfm_plant.period`."""
-    for j in range(n):
-        unit = _z(s.halfway, 0, j) if which == 1 else _z(s.unit, 0, j)
-        i, v, i_o, scale = _z(s.w, 0, j), _z(s.w, 1, j), _z(s.w, 2, j), c.current[j]
-        turned = unit.conjugate() * complex(i.real * scale, i.imag * scale)
-        s.drawn[which, j] = s.E[0, j] * turned.real + s.E[1, j] * turned.imag
-        s.seen[which, 0, j], s.seen[which, 1, j], s.seen[which, 2, j] = terminal(
-            v.real, v.imag, i_o.real * scale, i_o.imag * scale
-        )
-
-
-@inlined
-def _turn_on(s, k, j, turn):
-    """As of `gfm_plant.solution`; returns the phasor in the middle of a piece."""
-    middle = _z(s.unit, k, j) * turn
-    u = middle * turn
-    length = 1.5 - 0.5 * (u.real * u.real + u.imag * u.imag)
-    _set(s.unit, k, j, complex(u.real * length, u.imag * length))
-    return middle
-
-
-@inlined
-def _drive(n, c, s, part):
-    """As of `gfm_plant.solution`, of the bridge and the grid."""
-    for j in range(n):
-        x = c.omega_b[j] * (s.u_now[1, j] - 1.0) * c.half_h[part, j]
-        s.upset[j] |= 0 if abs(x) < _SERIES else 1
-        x2 = x * x
-        s.turn[0, 0, j] = 1 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320))))
-        s.turn[1, 0, j] = x * (
-            1 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))
-        )
+def _drive(c, s, part, E, h):
+    """As of `gfm_plant.solution`, of the bridge and the grid; returns the bridge's phasors as
+    ``_turn_on``, and which lanes are calm."""
+    away, turns = vector(c.omega_b) * (vector(s.u_now[1]) - 1.0), _z(c.grid_turn, part)
+    x = away * h
+    x2 = x * x
+    turn = (
+        1.0 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320)))),
+        x * (1.0 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))),
+    )
+    calm = magnitude(x) < _SERIES
+    driven, held = times(E, _z(s.unit, 0)), times(_z(c.E_grid, 0), _z(s.unit, 1))
     for m in range(_MODES):
-        for j in range(n):
-            h, rate, turn = c.half_h[part, j], _z(c.rate, m, j), _z(s.turn, 0, j)
-            d = complex(-rate.real, c.omega_b[j] * (s.u_now[1, j] - 1.0) - rate.imag)
-            size = d.real * d.real + d.imag * d.imag
-            s.upset[j] |= 0 if size * h * h > _NEAR else 1
-            per_size = 1.0 / size
-            g = (turn - _z(c.decay_z[part], m, j)) * d.conjugate()
-            gain = complex(g.real * per_size, g.imag * per_size) * _z(c.drive, m, j)
-            f = gain * (complex(s.E[0, j], s.E[1, j]) * _z(s.unit, 0, j))
-            f_grid = _z(c.grid_gain[part], m, j) * (_z(c.E_grid, 0, j) * _z(s.unit, 1, j))
-            _set(s.forced[0], m, j, 0j + f + f_grid)
-            _set(s.forced[1], m, j, 0j + f * turn + f_grid * _z(c.grid_turn, part, j))
-    for j in range(n):
-        _set(s.halfway, 0, j, _turn_on(s, 0, j, _z(s.turn, 0, j)))
-        _turn_on(s, 1, j, _z(c.grid_turn, part, j))
+        rate, decay = _z(c.rate, m), _z(c.decay_z[part], m)
+        d = -rate[0], away - rate[1]
+        size = d[0] * d[0] + d[1] * d[1]
+        calm = calm & (size * h * h > _NEAR)
+        per_size = 1.0 / size
+        g = times((turn[0] - decay[0], turn[1] - decay[1]), (d[0], -d[1]))
+        gain = times((g[0] * per_size, g[1] * per_size), _z(c.drive, m))
+        f, f_grid = times(gain, driven), times(_z(c.grid_gain[part], m), held)
+        _put_z(s.forced[0], m, plus(plus((0.0, 0.0), f), f_grid))
+        later = plus(plus((0.0, 0.0), times(f, turn)), times(f_grid, turns))
+        _put_z(s.forced[1], m, later)
+    _turn_on(s, 1, turns)
+    return _turn_on(s, 0, turn), calm
 
 
 @inlined
-def _half_step(n, c, s, part, which):
+def _half_step(c, s, part, which):
     for m in range(_MODES):
-        for j in range(n):
-            z = _z(c.decay_z[part], m, j) * _z(s.z, m, j) + _z(s.forced[which], m, j)
-            _set(s.z, m, j, z)
+        z = times(_z(c.decay_z[part], m), _z(s.z, m))
+        _put_z(s.z, m, plus(z, _z(s.forced[which], m)))
     for i in range(_MODES):
-        for j in range(n):
-            w = 0j + _z(c.states[i], 0, j) * _z(s.z, 0, j)
-            w += _z(c.states[i], 1, j) * _z(s.z, 1, j)
-            _set(s.w, i, j, w + _z(c.states[i], 2, j) * _z(s.z, 2, j))
+        w = plus((0.0, 0.0), times(_z(c.states[i], 0), _z(s.z, 0)))
+        w = plus(w, times(_z(c.states[i], 1), _z(s.z, 1)))
+        _put_z(s.w, i, plus(w, times(_z(c.states[i], 2), _z(s.z, 2))))
 
 
 @inlined
-def _asks(c, j, v, i, i_u):
-    """Whether the DC source's control is at a limit."""
-    asked = i_u + c.k_p[j] * (1.0 - v) + i
-    return asked > c.i_most[0, j] or asked < c.i_most[1, j]
+def _asks(c, v, i, i_u):
+    """Whether the DC source's control asks for what is between its limits."""
+    asked = i_u + vector(c.k_p) * (1.0 - v) + i
+    return ~((asked > vector(c.i_most[0])) | (asked < vector(c.i_most[1])))
 
 
 @inlined
-def _low_pass(c, part, j, sensed, f_0, f_1, f_2):
-    weights = c.lag_weights
-    return (
-        weights[part, 0, j] * sensed + weights[part, 1, j] * f_0
-        + weights[part, 2, j] * f_1 + weights[part, 3, j] * f_2
-    )  # fmt: skip
+def _low_pass(c, s, part, k, f_0, f_1, f_2):
+    weights = c.lag_weights[part]
+    sensed = vector(weights[0]) * vector(s.sensed[k]) + vector(weights[1]) * f_0
+    put(s.sensed[k], sensed + vector(weights[2]) * f_1 + vector(weights[3]) * f_2)
 
 
 @inlined
-def _dc_link(n, c, s, part):
-    """As `gfm_plant.dc_link.advance_dc_link` in one step, and the sensors."""
-    for j in range(n):
-        h, v, i, k_p = 2.0 * c.half_h[part, j], s.x[V_DC, j], s.i_reg[j], c.k_p[j]
-        i_u, H, K = c.i_u_gain[j] * s.u_now[0, j], h * c.omega_b[j] / c.C_dc[j], h * c.k_i[j]
-        d_0, d_1, d_2, v_0 = s.drawn[0, j], s.drawn[1, j], s.drawn[2, j], v
-        b, a = 4.0 * d_1 - 3.0 * d_0 - d_2, 2.0 * (d_0 + d_2) - 4.0 * d_1
-        upset, t_0, per_v = _asks(c, j, v, i, i_u), i_u + k_p * (1.0 - v) + i, 1.0 / v
-        c_0 = d_0 * per_v
-        v_1, i_1 = H * (t_0 - c_0), K * (1.0 - v)
-        t_1 = i_1 - k_p * v_1
-        c_1 = (b - v_1 * c_0) * per_v
-        v_2, i_2 = _1_2 * H * (t_1 - c_1), -_1_2 * K * v_1
-        t_2 = i_2 - k_p * v_2
-        c_2 = (a - v_1 * c_1 - v_2 * c_0) * per_v
-        v_3, i_3 = _1_3 * H * (t_2 - c_2), -_1_3 * K * v_2
-        t_3 = i_3 - k_p * v_3
-        c_3 = -(v_1 * c_2 + v_2 * c_1 + v_3 * c_0) * per_v
-        v_4, i_4 = _1_4 * H * (t_3 - c_3), -_1_4 * K * v_3
-        t_4 = i_4 - k_p * v_4
-        c_4 = -(v_1 * c_3 + v_2 * c_2 + v_3 * c_1 + v_4 * c_0) * per_v
-        v_5, i_5 = _1_5 * H * (t_4 - c_4), -_1_5 * K * v_4
-        v_middle = v + (v_1 + (v_2 + (v_3 + (v_4 + v_5 / 2) / 2) / 2) / 2) / 2
-        v += v_1 + (v_2 + (v_3 + (v_4 + v_5)))
-        i += i_1 + (i_2 + (i_3 + (i_4 + i_5)))
-        calm = abs(v_5) <= _ROUGH and not (upset or _asks(c, j, v, i, i_u))
-        s.upset[j] |= 0 if calm else 1
-        s.x[V_DC, j], s.i_reg[j] = v, i
-        s.sensed[0, j] = _low_pass(c, part, j, s.sensed[0, j], v_0, v_middle, v)
-    for k in range(3):
-        for j in range(n):
-            s.sensed[1 + k, j] = _low_pass(
-                c, part, j, s.sensed[1 + k, j], s.seen[0, k, j], s.seen[1, k, j], s.seen[2, k, j]
-            )
+def _dc_link(c, s, part, half, drawn):
+    """As `gfm_plant.dc_link.advance_dc_link` in one step, and the sensor of v_dc; returns which
+    lanes are calm."""
+    h, v, i, k_p = 2.0 * half, vector(s.x[V_DC]), vector(s.i_reg), vector(c.k_p)
+    i_u = vector(c.i_u_gain) * vector(s.u_now[0])
+    H, K = h * vector(c.omega_b) / vector(c.C_dc), h * vector(c.k_i)
+    d_0, d_1, d_2 = drawn
+    v_0 = v
+    b, a = 4.0 * d_1 - 3.0 * d_0 - d_2, 2.0 * (d_0 + d_2) - 4.0 * d_1
+    calm, t_0, per_v = _asks(c, v, i, i_u), i_u + k_p * (1.0 - v) + i, 1.0 / v
+    c_0 = d_0 * per_v
+    v_1, i_1 = H * (t_0 - c_0), K * (1.0 - v)
+    t_1 = i_1 - k_p * v_1
+    c_1 = (b - v_1 * c_0) * per_v
+    v_2, i_2 = _1_2 * H * (t_1 - c_1), -_1_2 * K * v_1
+    t_2 = i_2 - k_p * v_2
+    c_2 = (a - v_1 * c_1 - v_2 * c_0) * per_v
+    v_3, i_3 = _1_3 * H * (t_2 - c_2), -_1_3 * K * v_2
+    t_3 = i_3 - k_p * v_3
+    c_3 = -(v_1 * c_2 + v_2 * c_1 + v_3 * c_0) * per_v
+    v_4, i_4 = _1_4 * H * (t_3 - c_3), -_1_4 * K * v_3
+    t_4 = i_4 - k_p * v_4
+    c_4 = -(v_1 * c_3 + v_2 * c_2 + v_3 * c_1 + v_4 * c_0) * per_v
+    v_5, i_5 = _1_5 * H * (t_4 - c_4), -_1_5 * K * v_4
+    v_middle = v + (v_1 + (v_2 + (v_3 + (v_4 + v_5 / 2.0) / 2.0) / 2.0) / 2.0) / 2.0
+    v = v + (v_1 + (v_2 + (v_3 + (v_4 + v_5))))
+    i = i + (i_1 + (i_2 + (i_3 + (i_4 + i_5))))
+    put(s.x[V_DC], v)
+    put(s.i_reg, i)
+    _low_pass(c, s, part, 0, v_0, v_middle, v)
+    return calm & (magnitude(v_5) <= _ROUGH) & _asks(c, v, i, i_u)
 
 
 @inlined
-def _advance(n, c, s, parts):
-    """As `gfm_plant.emulator.plant_step`."""
+def _advance(c, s, parts, ages):
+    """As `gfm_plant.emulator.plant_step`; returns which lanes are calm."""
+    calm = everywhere(True)
     for part in range(parts):
+        age, h = vector(c.age[part]), vector(c.half_h[part])
         for i in range(NU):
-            for j in range(n):
-                s.u_now[i, j] = s.u[c.age[part, j], i, j]
-        for j in range(n):
-            s.E[0, j], s.E[1, j] = s.u_now[2, j], s.E_q[j]
-            s.E_most[j] = most = c.m_max[j] * s.x[V_DC, j]
-            size = s.E[0, j] * s.E[0, j] + s.E[1, j] * s.E[1, j]
-            s.upset[j] |= 1 if size > most * most else 0
-        _look(n, c, s, 0)
-        _drive(n, c, s, part)
-        _half_step(n, c, s, part, 0)
-        _look(n, c, s, 1)
-        _half_step(n, c, s, part, 1)
-        _look(n, c, s, 2)
-        _dc_link(n, c, s, part)
-        for j in range(n):
-            away = s.u_now[1, j] - c.omega_grid[j]
-            s.x[DELTA, j] += 2.0 * c.half_h[part, j] * c.omega_b[j] * away
+            u = vector(s.u[0, i])
+            for k in range(1, ages):
+                u = where(age == k, vector(s.u[k, i]), u)
+            put(s.u_now[i], u)
+        E, most = (vector(s.u_now[2]), vector(s.E_q)), vector(c.m_max) * vector(s.x[V_DC])
+        put(s.E[0], E[0])
+        put(s.E[1], E[1])
+        put(s.E_most, most)
+        calm = calm & ~(E[0] * E[0] + E[1] * E[1] > most * most)
+        drawn_0, seen_0 = _look(c, s, E, _z(s.unit, 0))
+        (middle, end), near = _drive(c, s, part, E, h)
+        _half_step(c, s, part, 0)
+        drawn_1, seen_1 = _look(c, s, E, middle)
+        _half_step(c, s, part, 1)
+        drawn_2, seen_2 = _look(c, s, E, end)
+        calm = calm & near & _dc_link(c, s, part, h, (drawn_0, drawn_1, drawn_2))
+        for k in range(3):
+            _low_pass(c, s, part, 1 + k, seen_0[k], seen_1[k], seen_2[k])
+        away = vector(s.u_now[1]) - vector(c.omega_grid)
+        put(s.x[DELTA], vector(s.x[DELTA]) + 2.0 * h * vector(c.omega_b) * away)
+    unit = _z(s.unit, 0)
     for i in range(_MODES):
-        for j in range(n):
-            w, scale = _z(s.w, i, j), 1.0 if i == 1 else c.current[j]
-            turned = complex(w.real * scale, w.imag * scale) * _z(s.unit, 0, j).conjugate()
-            s.x[2 * i, j], s.x[2 * i + 1, j] = turned.real, turned.imag
-            s.upset[j] |= 0 if abs(w.real) + abs(w.imag) < _FAR else 1
-    for j in range(n):
-        near = 0.0 < s.x[V_DC, j] < _FAR and abs(s.x[DELTA, j]) < _FAR * _FAR
-        s.upset[j] |= 0 if near and abs(s.i_reg[j]) < _FAR else 1
-        s.tick[j] += 1
+        w = _z(s.w, i)
+        scaled = w
+        if i != 1:
+            scaled = w[0] * vector(c.current), w[1] * vector(c.current)
+        turned = times(scaled, (unit[0], -unit[1]))
+        put(s.x[2 * i], turned[0])
+        put(s.x[2 * i + 1], turned[1])
+        calm = calm & (magnitude(w[0]) + magnitude(w[1]) < _FAR)
+    v_dc, delta, i_reg = vector(s.x[V_DC]), vector(s.x[DELTA]), vector(s.i_reg)
+    calm = calm & (v_dc > 0.0) & (v_dc < _FAR) & (magnitude(delta) < _FAR * _FAR)
+    return calm & (magnitude(i_reg) < _FAR)
 
 
 @inlined
-def _protect(n, c, s):
-    """As of `gfm_plant.protection`: whether any quantity is beyond its threshold."""
-    for j in range(n):
-        i = math.sqrt(s.x[0, j] ** 2 + s.x[1, j] ** 2)
-        v = math.sqrt(s.x[2, j] ** 2 + s.x[3, j] ** 2)
-        v_dc, omega, limit, on = s.x[V_DC, j], s.u_now[1, j], c.trip_limit, c.trips
-        s.upset[j] |= on[0, j] if i - limit[0, j] > 0.0 else 0
-        s.upset[j] |= on[1, j] if v - limit[1, j] > 0.0 else 0
-        s.upset[j] |= on[2, j] if limit[2, j] - v > 0.0 else 0
-        s.upset[j] |= on[3, j] if v_dc - limit[3, j] > 0.0 else 0
-        s.upset[j] |= on[4, j] if limit[4, j] - v_dc > 0.0 else 0
-        s.upset[j] |= on[5, j] if omega - limit[5, j] > 0.0 else 0
-        s.upset[j] |= on[6, j] if limit[6, j] - omega > 0.0 else 0
+def _is_within(c, trip, quantity, sign):
+    """Whether a quantity does not pass a threshold upwards, or with -1 downwards, or may."""
+    beyond = sign * (quantity - vector(c.trip_limit[trip]))
+    return ~(beyond > 0.0) | (vector(c.trips[trip]) == 0)
+
+
+@inlined
+def _protect(c, s):
+    """As of `gfm_plant.protection`: which lanes have no quantity beyond its threshold."""
+    i_d, i_q, v_d, v_q = vector(s.x[0]), vector(s.x[1]), vector(s.x[2]), vector(s.x[3])
+    i, v = sqrt(i_d * i_d + i_q * i_q), sqrt(v_d * v_d + v_q * v_q)
+    v_dc, omega = vector(s.x[V_DC]), vector(s.u_now[1])
+    return (
+        _is_within(c, 0, i, 1.0) & _is_within(c, 1, v, 1.0) & _is_within(c, 2, v, -1.0)
+        & _is_within(c, 3, v_dc, 1.0) & _is_within(c, 4, v_dc, -1.0)
+        & _is_within(c, 5, omega, 1.0) & _is_within(c, 6, omega, -1.0)
+    )  # fmt: skip
 
 
 @inlined
 def _keep(n, s, used, columns, k):
     """Record what moves of the used lanes, as `gfm_plant.emulator.plant_truth`."""
-    for j in range(n):
-        s.kept[0, j], _, s.kept[2, j] = terminal(s.x[2, j], s.x[3, j], s.x[4, j], s.x[5, j])
-        s.kept[1, j], s.kept[4, j] = s.u_now[1, j], s.x[DELTA, j]
-        s.kept[3, j] = math.sqrt(s.x[0, j] ** 2 + s.x[1, j] ** 2)
+    i_d, i_q, v_d, v_q = vector(s.x[0]), vector(s.x[1]), vector(s.x[2]), vector(s.x[3])
+    p, _, V = _terminal((v_d, v_q), (vector(s.x[4]), vector(s.x[5])))
+    put(s.kept[0], p)
+    put(s.kept[1], vector(s.u_now[1]))
+    put(s.kept[2], V)
+    put(s.kept[3], sqrt(i_d * i_d + i_q * i_q))
+    put(s.kept[4], vector(s.x[DELTA]))
     for j in range(n):
         for i in range(len(columns) if used[j] else 0):
             row_at(columns[i, j], 1, k)[0] = s.kept[i, j]
@@ -362,26 +399,29 @@ def _keep(n, s, used, columns, k):
 @compiled
 def _run_lanes(n, fixed, moving, before, used, columns, order, parts, ticks):
     """Run ticks, of all lanes, in whole blocks; returns after how many some ``used`` lane is upset,
-    which then is in the next block, at whose beginning all are."""
-    c, s = fixed[0], moving[0]
+    which then is in the next block, at whose beginning all are, and which lanes are, as bits."""
+    c, s, mine, ages = fixed[0], moving[0], 0, 1
+    for j in range(n):
+        mine |= used[j] << j
+        for part in range(parts):
+            ages = max(ages, 1 + c.age[part, j])
     for first in range(0, ticks, BLOCK):
         before[0] = moving[0]
+        calm = everywhere(True)
         for k in range(first, min(first + BLOCK, ticks)):
             _keep(n, s, used, columns, k)
-            _sample(n, c, s)
-            _control(n, c, s, order)
-            _advance(n, c, s, parts)
-            _protect(n, c, s)
-            _command(n, c, s)
-        upset = 0
-        for j in range(n):
-            upset |= s.upset[j] & used[j]
-        if upset:
+            calm = calm & _sample(n, c, s)
+            calm = calm & _control(c, s, order)
+            calm = calm & _advance(c, s, parts, ages)
             for j in range(n):
-                before[0].upset[j] = s.upset[j]
+                s.tick[j] += 1
+            calm = calm & _protect(c, s)
+            _command(c, s)
+        upset = mine & bits(~calm)
+        if upset:
             moving[0] = before[0]
-            return first
-    return ticks
+            return first, upset
+    return ticks, 0
 
 
 class Lanes:
@@ -423,7 +463,6 @@ class Lanes:
         x_ref[:] = by_ref[:, 0]
         for column in by_ref.T[1:]:
             x_ref += column
-        self._moving["upset"][0, j] = 0
         return True
 
     def leave(self, j: int, stretch: Stretch, k: int) -> None:
@@ -445,16 +484,12 @@ class Lanes:
     def run(self, ticks: int) -> tuple[int, list[int]]:
         """Run all lanes for up to ``ticks``; returns the ticks done, and the lanes that have to go
         on by themselves."""
-        done = int(
-            _run_lanes(
-                LANES, self._fixed, self._moving, self._before, self._used, self._columns,
-                *self._kind, ticks,
-            )
+        done, upset = _run_lanes(
+            LANES, self._fixed, self._moving, self._before, self._used, self._columns,
+            *self._kind, ticks,
         )  # fmt: skip
         self._columns += 8 * done
-        upset = self._moving[0]["upset"] & self._used
-        self._moving["upset"] = 0
-        return done, np.flatnonzero(upset).tolist()
+        return done, [j for j in range(LANES) if upset >> j & 1]
 
 
 def _columns(stretch: Stretch) -> dict[str, NDArray[np.float64]]:
