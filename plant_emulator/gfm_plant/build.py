@@ -39,9 +39,11 @@ from gfm_runtime.signals import CHANNELS, COUNT_BITS, SPACE_VECTOR
 
 CONVERTER, FAR, LOAD = "converter", "far", "load"
 """Names in a plant of one converter: itself, the far end of its line, and the load there."""
-MOST_BY_MODES = 60
+MOST_BY_MODES = 32
 """States of a circuit up to which it is solved by its modes, and beyond which by its series, unless
-a bridge is switched."""
+a bridge is switched: about where both take as long."""
+_MOST_OF_A_PORT = 60
+"""States of a circuit up to which one switched bridge beside averaged ones goes on by a `port`."""
 CONNECTION, LINE = "connection", "line"
 """With a second inductor: the point of connection behind it, and the line from there."""
 
@@ -173,7 +175,7 @@ def _make(
     large = not carriers and len(wiring.order) > MOST_BY_MODES
     entries = entries_of(wiring) if large else 0
     switched = np.flatnonzero(par["levels"])
-    port = len(switched) == 1 < len(par) and len(wiring.order) <= MOST_BY_MODES
+    port = len(switched) == 1 < len(par) and len(wiring.order) <= _MOST_OF_A_PORT
     port = port and not par["filtered"][par["levels"] == 0].any()
     network = _network(par, st, wiring, T_s, dynamic, measured, carriers * updates, entries, port)
     network.net["updates"], network.net["switched"] = updates, switched[0] if port else -1

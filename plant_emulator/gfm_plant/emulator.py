@@ -113,7 +113,7 @@ def plant_step(plant: PlantRecords) -> None:
     call_at(plant.net[0].step, plant.net[0].records, 0.0, 0.0)
 
 
-@compiled
+@inlined
 def whole_period(plant: PlantRecords) -> None:
     """``plant_step`` itself."""
     n, now = plant.net[0], plant.now[0]
@@ -165,7 +165,7 @@ def _advance_converting(plant: PlantRecords) -> None:
         end = n.T_s * (m + 1) / n.conversions
         advance(plant, n.T_s * m / n.conversions, end if m + 1 < n.conversions else math.inf)
         for k in range(n.n_converters):
-            convert(plant, k, m, end)
+            convert(n, plant.now[0], plant.par[k], plant.st[k], k, m, end)
 
 
 @compiled

@@ -22,10 +22,9 @@ _SEED = np.uint64(1 << 62)  # tells the noise of the phases from that of `sensor
 
 
 @compiled
-def stands(plant: PlantRecords, at: float) -> complex:
-    """Return e^(j omega_b t) at an instant of the period, s after its beginning."""
-    n = plant.net[0]
-    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
+def stands(n: Any, tick: int, at: float) -> complex:
+    """Return e^(j omega_b t) at an instant of a tick's period, s after its beginning."""
+    angle = n.omega_b * (n.T_s * tick + at)
     return complex(math.cos(angle), math.sin(angle))
 
 
@@ -45,25 +44,25 @@ def read_phases(plant: PlantRecords, k: int) -> None:
     s = plant.st[k]
     if math.isnan(s.phase_sums[0]):
         for m in range(plant.par[k].phase_samples):
-            convert(plant, k, m, 0.0)
+            convert(plant.net[0], plant.now[0], plant.par[k], s, k, m, 0.0)
 
 
 @compiled
-def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
+def convert(n: Any, now: Any, r: Any, s: Any, k: int, m: int, at: float) -> None:
     """Add conversion m of this period, at an instant s after its beginning, to the counts of
-    converter k.
+    converter k. It takes elements of ``net``, ``now``, ``par`` and ``st``: a caller would put all
+    words of a plant on the stack whether it calls or not.
 
     A sensor's low-pass sees a straight line from conversion to conversion. A channel with skew
     samples earlier, on the same line; with one conversion a period the current of L_f on the slope
     that it has before the tick, where its bridge has a zero vector if it is switched.
     """
-    r, s, w = plant.par[k], plant.st[k], field(plant.now[0], "w")
-    turn = stands(plant, at)
+    w, turn = field(now, "w"), stands(n, s.tick, at)
     i, v, i_o = w[own(k) + I_F] * turn, w[own(k) + V] * turn, w[own(k) + I_O] * turn
     i, i_o = i * r.current, i_o * r.current
     slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
     if r.levels == 0:
-        E = complex(s.E[0], s.E[1]) * field(plant.now[0], "unit")[k] * turn
+        E = complex(s.E[0], s.E[1]) * field(now, "unit")[k] * turn
         slope += E * (r.omega_b / r.L_f)
     for j in range(N_PHASES):
         x = (j - 1) % 3
@@ -77,7 +76,7 @@ def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
             + r.phase_weights[2] * value
         )
         s.phase_seen[0, j], s.phase_seen[1, j] = value, low
-        back = change * r.phase_samples / plant.net[0].T_s
+        back = change * r.phase_samples / n.T_s
         if 0 < j < 4 and r.phase_samples == 1:
             back = along(x, slope)
         seen = low - r.phase_skew[j] * back

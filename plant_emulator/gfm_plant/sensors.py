@@ -12,7 +12,7 @@ from gfm_plant.phases import read_phases
 from gfm_plant.quantise import quantise
 from gfm_plant.records import PlantRecords
 from gfm_runtime.by_address import call_at
-from gfm_runtime.compiled import compiled, inlined
+from gfm_runtime.compiled import inlined
 from gfm_runtime.signals import N_SET, NY, NY_INNER
 
 
@@ -43,7 +43,7 @@ def plant_sample(plant: PlantRecords, k: int, y: NDArray[np.float64]) -> None:
         y[j] = s.phase_sums[j - NY_INNER]
 
 
-@compiled
+@inlined
 def read_sensors(plant: PlantRecords, k: int, size: int) -> None:
     """``plant_sample`` for a y of (size,), into ``reads`` and ``phase_sums``."""
     r, s = plant.par[k], plant.st[k]

@@ -24,7 +24,7 @@ from gfm_plant.components.synchronous_machine import SynchronousMachine
 from gfm_plant.components.transformer import Transformer
 from gfm_plant.parameters import Options
 from gfm_runtime.by_address import call_at
-from gfm_runtime.compiled import compiled, inlined, inlined_as
+from gfm_runtime.compiled import inlined, inlined_as
 
 
 class NetworkParts(Options):
@@ -148,7 +148,7 @@ KEEP, GO_BACK, TICK = range(3)
 """What all components do around a sampling period, see ``Dynamic.hooks``."""
 
 
-@compiled
+@inlined
 def components_act(plant: Any, act: int, c: int) -> None:
     """Have all components keep their states, go back to them, or end a period, in circuit c."""
     if act == KEEP:
