@@ -27,8 +27,7 @@ def address_of(kinds: tuple[Any, ...], way: Callable[..., None]) -> int:
         way: (each of these, two numbers).
     """
     signature = types.void(*kinds, types.float64, types.float64)
-    # as part of what C calls, without the calls between, which pass all words of all arrays
-    address: Any = callback(way, signature, **{**FREE, "forceinline": True}).address
+    address: Any = callback(way, signature, **FREE).address
     return address
 
 

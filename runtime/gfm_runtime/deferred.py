@@ -37,6 +37,7 @@ class _Library(JITCodeLibrary):
     """The code of a function, linked with its callees when someone asks for an address."""
 
     _alone: Any = None
+    exported: frozenset[str] = frozenset()  # callees that have an address
 
     @classmethod
     def of(cls, name: str) -> _Library:
@@ -106,7 +107,17 @@ class _Library(JITCodeLibrary):
         """Optimise the function with its callees, and make machine code of it."""
         for library in self._callees():
             self._reload_init.update(library._reload_init)
+        own = {f.name for f in self._final_module.functions if not f.is_declaration}
+        for_c = {name for name in own if name.startswith("cfunc.")}
+        whose = hashlib.sha256(repr(sorted(own)).encode()).hexdigest()[:16]
         self._link(self._final_module)
+        for function in self._final_module.functions:
+            # nobody else calls a callee: LLVM leaves out the arguments that it does not use, which
+            # are most of the words of a plant
+            has_address = function.name in (for_c or own | self.exported)
+            if not (has_address or function.is_declaration):
+                function.linkage = llvm.Linkage.internal
+                function.name += f".{whose}"  # the linker of a process takes the first of a name
         self._linking_libraries = []
         super().finalize()
 
@@ -151,6 +162,7 @@ class UnlinkedCode:
         context = cpu_target.target_context.subtarget(enable_nrt=self.nrt)
         library = _Library.of(self.library.name)  # a caller without this compiler may have its own
         library.add_linking_library(self.library)
+        library.exported = frozenset({self.fndesc.llvm_func_name})
         context.create_cpython_wrapper(library, self.fndesc, self.env, None, release_gil=True)
         self.function = context.get_executable(library, self.fndesc, self.env)
         self.library = library
