@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu, rankdata
 
 from gfm_hil.bench.options import KINDS
-from gfm_hil.bench.result import check_result, write_result
+from gfm_hil.bench.result import check_result, rows_of, write_result
 from gfm_hil.bench.rounds import ShowProgress, in_turn
 from gfm_hil.bench.tables import lockstep_name
 from gfm_hil.core.errors import UserError
@@ -97,17 +97,16 @@ def _samples(
             yield (name, "× limit"), r["rounds_ratio"]
         elif r["rounds_p50_us"]:
             yield (name, "µs"), r["rounds_p50_us"]
-    for r in content.get("jitter", ()):
+    for r in rows_of(content, "jitter") or ():
         yield (f"jitter: {r['wait']}, {r['load']}, {r['policy']}", "µs"), r["rounds_p50_us"]
-    loop = content.get("loop", {})
-    for r in loop.get("lockstep", ()):
+    for r in rows_of(content, "lockstep") or ():
         yield (f"lockstep: {lockstep_name(r)}", "ticks/s"), r["ticks_per_s"]["turns"]
-    for r in loop.get("laws", ()):
+    for r in rows_of(content, "laws") or ():
         yield (f"loop in process: {r['law']}", "ns"), r["whole_ns"]["turns"]
-    for r in loop.get("realtime", ()):
+    for r in rows_of(content, "realtime") or ():
         if r["rounds_p50_us"]:
             yield (f"real time: {r['link']}, {r['load']}", "µs"), r["rounds_p50_us"]
-    for r in content.get("kernel", ()):
+    for r in rows_of(content, "kernel") or ():
         name = f"kernel: {r['law']}, {r['real']}"
         if by_limit and r["ratio"]:
             yield (name, "× C"), r["ratio"]["turns"]

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 
 from gfm_hil.bench import plots, tables
+from gfm_hil.bench.result import rows_of
 from gfm_hil.results import page
 from gfm_hil.results.table import Table
 
@@ -20,38 +21,42 @@ _BADGE = {
     "python": "Python", "numba": "numba", "numpy": "numpy", "pyzmq": "pyzmq", "libzmq": "libzmq",
     "gfmhil": "gfmhil",
 }  # fmt: skip
-#: tables and figure of each section of the page, of which there may be nothing in a result
+#: of each section of the page the figure, of the first rows, and the tables by the name of theirs
 _SECTIONS = {
-    "latency": (tables.latency_tables, plots.latency),
-    "night": (tables.night_tables, plots.night),
-    "misses": (tables.realtime_tables, plots.misses),
-    "jitter": (tables.jitter_tables, plots.jitter),
-    "lockstep": (tables.lockstep_tables, plots.lockstep),
-    "kernel": (tables.kernel_tables, plots.kernel),
-    "sweep": (tables.sweep_tables, plots.sweep),
+    "latency": (plots.latency, {"results": tables.latency_tables}),
+    "night": (plots.night, {"results": tables.night_tables}),
+    "misses": (plots.misses, {"realtime": tables.realtime_tables}),
+    "jitter": (plots.jitter, {"jitter": tables.jitter_tables}),
+    "lockstep": (plots.lockstep, {"lockstep": tables.lockstep_tables, "laws": tables.law_tables}),
+    "kernel": (plots.kernel, {"kernel": tables.kernel_tables}),
+    "sweep": (plots.sweep, {"sweep": tables.sweep_tables, "highest": tables.rate_tables}),
 }
 
 
 def all_tables(content: dict[str, Any]) -> Iterator[tuple[str, Table]]:
     """All tables of a result, each with the name of its section."""
-    return ((name, table) for name, (make, _) in _SECTIONS.items() for table in make(content))
+    for section, (_, makers) in _SECTIONS.items():
+        for name, make in makers.items():
+            rows = rows_of(content, name)
+            yield from ((section, table) for table in (() if rows is None else make(rows)))
 
 
 def figures(content: dict[str, Any]) -> dict[str, bytes]:
     """Every figure that a result has data for, by its section, as SVG."""
     drawn = {}
-    for name, (_, draw) in _SECTIONS.items():
-        if (figure := draw(content)) is not None:
+    for section, (draw, makers) in _SECTIONS.items():
+        rows = rows_of(content, next(iter(makers)))
+        if rows and (figure := draw(rows)) is not None:
             out = io.BytesIO()
             with mpl.rc_context({"svg.hashsalt": "gfmhil"}):  # equal results give equal bytes
                 figure.savefig(out, format="svg", metadata={"Date": None})
-            drawn[name] = out.getvalue()
+            drawn[section] = out.getvalue()
     return drawn
 
 
 def write_page(content: dict[str, Any], path: Path) -> None:
     """Write the page of a result, and its figures as files in the same folder."""
-    images = figures(content)
+    images, made = figures(content), [*all_tables(content)]
     for name, svg in images.items():
         path.with_name(f"{name}.svg").write_bytes(svg)
     page.write_page(
@@ -62,8 +67,12 @@ def write_page(content: dict[str, Any], path: Path) -> None:
         badge=badge(content["environment"]),
         cards=_cards(content),
         sections=[
-            (name, name in images and page.inline(images[name], "svg+xml"), [*make(content)])
-            for name, (make, _) in _SECTIONS.items()
+            (
+                name,
+                name in images and page.inline(images[name], "svg+xml"),
+                [table for section, table in made if section == name],
+            )
+            for name in _SECTIONS
         ],
         points=[*content["caveats"], *content["remarks"]],
     )
@@ -90,7 +99,7 @@ def badge(environment: dict[str, Any]) -> Iterator[tuple[str, str, bool]]:
 
 def _cards(content: dict[str, Any]) -> Iterator[list[tuple[str, str]]]:
     """The most important figures as (value, text), one line per kind."""
-    loop, trips = content.get("loop", {}), []
+    trips = []
     for r in content["results"]:
         if (r["peer"], r["code"], r["mode"], r["load"]) == ("ours", "compiled", "lockstep", "idle"):
             ratio = r["ratio_to_baseline_p50"]
@@ -102,12 +111,12 @@ def _cards(content: dict[str, Any]) -> Iterator[list[tuple[str, str]]]:
             tables.percent(r["missed_pct"]),
             f"{r['link']}, {r['load']}: ticks missed, host alone {tables.percent(r['host_pct'])}",
         )
-        for r in loop.get("realtime", ())
+        for r in rows_of(content, "realtime") or ()
     ]
     yield [
         (
             f"{r['times_real_time']['median']:.3g} ×",
             f"{tables.lockstep_name(r)}: times real time, lockstep",
         )
-        for r in loop.get("lockstep", ())
+        for r in rows_of(content, "lockstep") or ()
     ]

@@ -70,10 +70,10 @@ def _panels(rows: list[Row], keys: list[str], label: str, draw: Callable[..., No
     return figure
 
 
-def latency(content: Row) -> Figure | None:
+def latency(rows: list[Row]) -> Figure | None:
     """Percentiles of the round trips: a link's contenders in shades of one colour, limits dashed
     in the colour of the first contender that is compared with them."""
-    rows = [r for r in content["results"] if r["n"]]
+    rows = [r for r in rows if r["n"]]
     contenders = list({r["name"]: r for r in rows if r["peer"] != "C"}.values())
     colours = _colours([r["link"] for r in contenders])
     look = dict[str, tuple[str, float]]()
@@ -93,9 +93,9 @@ def latency(content: Row) -> Figure | None:
     return _panels(rows, ["mode", "load"], "round trip [µs]", draw) if rows else None
 
 
-def night(content: Row) -> Figure | None:
+def night(rows: list[Row]) -> Figure | None:
     """How often each time was measured in the course of a night, a panel for each cell."""
-    rows = [row for row in content["results"] if "night" in row and row["n"]]
+    rows = [row for row in rows if "night" in row and row["n"]]
     if not rows:
         return None
     figure = Figure(figsize=(9.2, 0.5 + 1.9 * len(rows)), layout="constrained")
@@ -125,11 +125,8 @@ def night(content: Row) -> Figure | None:
     return figure
 
 
-def jitter(content: Row) -> Figure | None:
+def jitter(rows: list[Row]) -> Figure:
     """Percentiles of the lateness, and the period."""
-    rows = content.get("jitter")
-    if not rows:
-        return None
     colours = dict(zip(dict.fromkeys(r["wait"] for r in rows), COLOURS, strict=False))
 
     def draw(axes: Axes, row: Row) -> None:
@@ -139,11 +136,8 @@ def jitter(content: Row) -> Figure | None:
     return _panels(rows, ["policy", "load"], "later than its deadline [µs]", draw)
 
 
-def misses(content: Row) -> Figure | None:
+def misses(rows: list[Row]) -> Figure:
     """Missed ticks by cause, with those of the host alone, and their bursts."""
-    rows = content.get("loop", {}).get("realtime")
-    if not rows:
-        return None
     figure = Figure(figsize=(11.8, 1.6 + 0.42 * len(rows)), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     labels = [f"{r['link']}, {r['load']}" for r in rows]
@@ -177,11 +171,8 @@ def misses(content: Row) -> Figure | None:
     return figure
 
 
-def lockstep(content: Row) -> Figure | None:
+def lockstep(rows: list[Row]) -> Figure:
     """Times real time over each link."""
-    rows = content.get("loop", {}).get("lockstep")
-    if not rows:
-        return None
     figure = Figure(figsize=(8.2, 0.9 + 0.42 * len(rows)), layout="constrained")
     axes = figure.subplots()
     dress(axes, "closed loop in lockstep, times real time at 10 kHz")
@@ -204,11 +195,8 @@ def lockstep(content: Row) -> Figure | None:
     return figure
 
 
-def kernel(content: Row) -> Figure | None:
+def kernel(rows: list[Row]) -> Figure:
     """ns per step of every law, in the first real type."""
-    rows = content.get("kernel")
-    if not rows:
-        return None
     real = rows[0]["real"]
     rows = sorted((r for r in rows if r["real"] == real), key=lambda r: r["numba_ns"]["median"])
     figure = Figure(figsize=(8.2, 1.0 + 0.19 * len(rows)), layout="constrained")
@@ -228,12 +216,9 @@ def kernel(content: Row) -> Figure | None:
 _LOW_PCT, _HIGH_PCT = 0.01, 100.0  # limits of the colours of a heat map
 
 
-def sweep(content: Row) -> Figure | None:
+def sweep(rows: list[Row]) -> Figure:
     """Share of missed messages by payload and rate: one heat map per contender and condition, with
     p99 in each field."""
-    rows = content.get("sweep")
-    if not rows:
-        return None
     keys = ("name", "load", "policy", "wait")
     maps = [*dict.fromkeys(tuple(r[key] for key in keys) for r in rows)]
     payloads, rates = (sorted({r[key] for r in rows}) for key in ("payload", "khz"))

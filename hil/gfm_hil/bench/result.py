@@ -47,6 +47,11 @@ def read_result(path: Path) -> dict[str, Any]:
     return check_result(content, str(file))
 
 
+def rows_of(content: dict[str, Any], name: str) -> list[dict[str, Any]] | None:
+    """The rows of a result that have this name in its file; None if they were not measured."""
+    return (content | content.get("loop", {})).get(name)
+
+
 def check_result(content: Any, source: str) -> dict[str, Any]:
     """The content, if it is a result. Raises UserError: it is not a result, or one of another
     version."""

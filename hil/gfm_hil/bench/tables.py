@@ -65,9 +65,8 @@ _CELL: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
 _PERCENTILES = {name.replace("_", "."): _of(micro, f"{name}_us") for name in SHARES}
 
 
-def latency_tables(content: Row) -> Iterator[Table]:
+def latency_tables(rows: list[Row]) -> Iterator[Table]:
     """Round trips, one table per mode and load, and both ways to who answers elsewhere."""
-    rows = content["results"]
     columns: dict[str, Column] = {
         "": "name",
         "code": "code",
@@ -129,9 +128,9 @@ def latency_verdicts(content: Row) -> Iterator[str]:
         yield text
 
 
-def night_tables(content: Row) -> Iterator[Table]:
+def night_tables(rows: list[Row]) -> Iterator[Table]:
     """Of a night: how sure its percentiles are, what lies beyond them, bursts, and the worst."""
-    rows = [row for row in content["results"] if "night" in row]
+    rows = [row for row in rows if "night" in row]
     if not rows:
         return
     sure = {
@@ -172,21 +171,14 @@ def _clock_time(at: float) -> str:
     return time.strftime("%m-%d %H:%M:%S", time.gmtime(at)) + f"{at % 1:.4f}"[1:]
 
 
-def jitter_tables(content: Row) -> Iterator[Table]:
+def jitter_tables(rows: list[Row]) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
-    if "jitter" in content:
-        columns: dict[str, Column] = {
-            "": "policy",
-            "load": "load",
-            "wait": "wait",
-            **_PERCENTILES,
-            "ticks lost": _of(percent, "lost_pct"),
-            "p50, p99 : nanosleep": _agrees,
-        }
-        heading = "A loop that only paces, every 100 µs: late by [µs]"
-        yield _table(heading, content["jitter"], columns)
-        heading = "Who had the processor in ticks that were late by more than 100 µs"
-        yield from _named_tables(heading, content["jitter"], ("policy", "load", "wait"))
+    named: dict[str, Column] = {"": "policy", "load": "load", "wait": "wait"}
+    figures = {"ticks lost": _of(percent, "lost_pct"), "p50, p99 : nanosleep": _agrees}
+    heading = "A loop that only paces, every 100 µs: late by [µs]"
+    yield _table(heading, rows, named | _PERCENTILES | figures)
+    heading = "Who had the processor in ticks that were late by more than 100 µs"
+    yield from _named_tables(heading, rows, ("policy", "load", "wait"))
 
 
 _NEARLY = 0.1  # relative difference to another program's p50 and p99 that is agreement
@@ -210,11 +202,8 @@ def _agrees(row: Row) -> str:
     return f"{each}: {verdict}"
 
 
-def realtime_tables(content: Row) -> Iterator[Table]:
+def realtime_tables(rows: list[Row]) -> Iterator[Table]:
     """Misses in real time, and why ticks were missed."""
-    rows = content.get("loop", {}).get("realtime")
-    if rows is None:
-        return
     named: dict[str, Column] = {"": "link", "load": "load"}
     shares = {
         "ticks": _of("{:,}".format, "ticks"),
@@ -254,18 +243,19 @@ def lockstep_name(row: Row) -> str:
     return f"{row['link']}, a sample late" if row["delay_samples"] else str(row["link"])
 
 
-def lockstep_tables(content: Row) -> Iterator[Table]:
-    """The closed loop as fast as possible, over links and, by law, in one process."""
-    loop = content.get("loop", {})
-    if "lockstep" not in loop:
-        return
+def lockstep_tables(rows: list[Row]) -> Iterator[Table]:
+    """The closed loop as fast as possible over links."""
     rates: dict[str, Column] = {
         "": lockstep_name,
         "ticks a second": _median("ticks_per_s", ",.0f"),
         "× real time": _median("times_real_time", ".1f"),
         "of what the plant alone allows": _median("share_of_plant_alone", ".0%"),
     }
-    yield _table("The product in lockstep", loop["lockstep"], rates)
+    yield _table("The product in lockstep", rows, rates)
+
+
+def law_tables(rows: list[Row]) -> Iterator[Table]:
+    """The closed loop in one process, by law."""
     parts = ("whole", "plant", "controller", "recording")
     by_law: dict[str, Column] = {
         "": "law",
@@ -273,14 +263,14 @@ def lockstep_tables(content: Row) -> Iterator[Table]:
         "× real time": _median("times_real_time", ".0f"),
         "allocations": _of("{:g}".format, "allocations_per_tick"),
     }
-    yield _table("The loop in one process: ns a tick", loop["laws"], by_law)
+    yield _table("The loop in one process: ns a tick", rows, by_law)
 
 
-def kernel_tables(content: Row) -> Iterator[Table]:
+def kernel_tables(rows: list[Row]) -> Iterator[Table]:
     """ns per step of every law."""
     by_law: dict[str, Row] = {}
     columns: dict[str, Column] = {"": "law", "states": "states"}
-    for r in content.get("kernel", ()):
+    for r in rows:
         law = by_law.setdefault(r["law"], {"law": r["law"], "states": r["states"]})
         real = r["real"]
         law |= {f"{key} {real}": r[key] for key in ("numba_ns", "c_ns", "ratio")}
@@ -289,16 +279,17 @@ def kernel_tables(content: Row) -> Iterator[Table]:
             f"C, {real}": _median(f"c_ns {real}", ".1f"),
             f"ratio, {real}": _median(f"ratio {real}", ".2f", " ×"),
         }
-    if by_law:
-        yield _table("One step of the kernel [ns]", [*by_law.values()], columns)
+    yield _table("One step of the kernel [ns]", [*by_law.values()], columns)
 
 
-def sweep_tables(content: Row) -> Iterator[Table]:
-    """Round trips of a sweep with their cost, and the highest rates."""
-    if "sweep" not in content:
-        return
-    named: dict[str, Column] = {"": "name", "load": "load", "policy": "policy", "wait": "wait"}
-    named |= {"B": _of("{:,}".format, "payload")}
+_SWEPT: dict[str, Column] = {
+    "": "name", "load": "load", "policy": "policy", "wait": "wait",
+    "B": _of("{:,}".format, "payload"),
+}  # fmt: skip
+
+
+def sweep_tables(rows: list[Row]) -> Iterator[Table]:
+    """Round trips of a sweep with their cost."""
     figures = {
         "kHz": _of("{:g}".format, "khz"),
         "p50": _PERCENTILES["p50"],
@@ -308,7 +299,11 @@ def sweep_tables(content: Row) -> Iterator[Table]:
         "opened, kB": _of("{:,}".format, "opened_kb"),
     }
     heading = "Round trips from the deadline, by payload and rate [µs]"
-    yield _table(heading, content["sweep"], named | figures)
-    most = percent(content["highest"][0]["most_missed_pct"]) if content["highest"] else ""
+    yield _table(heading, rows, _SWEPT | figures)
+
+
+def rate_tables(rows: list[Row]) -> Iterator[Table]:
+    """The highest rates of a sweep."""
+    most = percent(rows[0]["most_missed_pct"]) if rows else ""
     rate = {"kHz": lambda row: f"{row['highest_khz']:g}" if row["highest_khz"] else "none"}
-    yield _table(f"Highest rate at which at most {most} miss", content["highest"], named | rate)
+    yield _table(f"Highest rate at which at most {most} miss", rows, _SWEPT | rate)
