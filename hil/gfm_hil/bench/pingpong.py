@@ -54,7 +54,7 @@ class PingPong:
     # sends requests: (stop, period_ns, duration_ns, took); see the module
     ping: Callable[[Numbers, int, int, Numbers], int]
     pong: Callable[[Numbers], object]  # answers until stopped: (stop)
-    close: Callable[[], None]  # frees all resources
+    close: Callable[[], object]  # frees all resources
     compiled: bool  # whether its loops are compiled
     # of the last round: ``gfm_hil.bench.one_way.delays``, empty if its exchanges carry no clock
     sides: Callable[[], dict[str, Any]] = dict

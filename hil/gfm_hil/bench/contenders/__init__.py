@@ -118,16 +118,22 @@ def _open_link(c: Contender, role: Role, own: Messages) -> Link:
 
 
 class PackageEnd:
-    """Base of one end of another package's transport; Python drives it like a link. ``WAYS``: of a
-    role, the names of what it sends and of what it receives."""
+    """Base of one end of another package's transport; Python drives it like a link, with ``send``
+    and ``close``. ``WAYS``: of a role, the names of what it sends and of what it receives."""
 
     port = None
-    _answer: bytes | None = None  # of one whose ``send`` returns with the answer
     WAYS: ClassVar = {"controller": ("u", "y"), "plant": ("y", "u")}
 
+    def __init__(self) -> None:
+        self.arrived: list[bytes] = []  # of one whose package hands messages over by itself
+
     def receive(self) -> bytes | None:
-        answer, self._answer = self._answer, None
-        return answer
+        return self.arrived.pop(0) if self.arrived else None
+
+
+def server_end(close: Callable[[], object]) -> PingPong:
+    """The controller's end of a package whose server answers in a thread of its own."""
+    return PingPong(lambda *_: -1, lambda stop: None, close, False)
 
 
 def fresh_endpoint(link: str, folder: Path) -> str:

@@ -48,9 +48,8 @@ class Dds(PackageEnd):
         self._message = message
         self._keep = [settings, participant]
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes) -> None:
         self._writer.write(self._message(content=message))
-        return True
 
     def receive(self) -> bytes | None:
         samples = self._reader.take(1)

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from gfm_hil.bench.contenders import Contender, PackageEnd
+from gfm_hil.bench.contenders import Contender, PackageEnd, server_end
 from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.bench.pingpong import Messages, PingPong
 from gfm_hil.core.roles import Role
@@ -30,16 +30,15 @@ class _Stub(PackageEnd):
     def __init__(self, endpoint: str) -> None:
         import grpc
 
+        super().__init__()
         self._channel = grpc.insecure_channel(endpoint)
         grpc.channel_ready_future(self._channel).result(_START_S)
         self._call = self._channel.unary_unary(f"/{_SERVICE}/{_METHOD}")
 
-    def send(self, message: bytes) -> bool:
-        self._answer = self._call(message)
-        return True
+        self.close = self._channel.close
 
-    def close(self) -> None:
-        self._channel.close()
+    def send(self, message: bytes) -> None:
+        self.arrived.append(self._call(message))
 
 
 def _server(endpoint: str, own: Messages) -> PingPong:
@@ -57,4 +56,4 @@ def _server(endpoint: str, own: Messages) -> PingPong:
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(_SERVICE, handlers),))
     server.add_insecure_port(endpoint)
     server.start()
-    return PingPong(lambda *_: -1, lambda stop: None, lambda: server.stop(None).wait(), False)
+    return server_end(lambda: server.stop(None).wait())

@@ -41,10 +41,10 @@ class Iceoryx2(PackageEnd):
         self._subscriber = into.subscriber_builder().create()
         self._keep: list[Any] = [node, out, into]
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes) -> None:
         sample = self._publisher.loan_slice_uninit(len(message))
         ctypes.memmove(sample.payload().as_ptr(), message, len(message))
-        return bool(sample.assume_init().send())
+        sample.assume_init().send()
 
     def receive(self) -> bytes | None:
         if (sample := self._subscriber.receive()) is None:

@@ -23,21 +23,20 @@ class Lcm(PackageEnd):
     def __init__(self, c: Contender, role: Role, own: Messages) -> None:
         from lcm import LCM
 
+        super().__init__()
         try:
             self._lcm = LCM(c.endpoint)
         except RuntimeError:
             raise UserError("LCM has no multicast here: ip link set lo multicast on") from None
         self._out, into = self.WAYS[role]
-        self._came: list[bytes] = []
-        self._lcm.subscribe(into, lambda _, message: self._came.append(message))
+        self._lcm.subscribe(into, lambda _, message: self.arrived.append(message))
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes) -> None:
         self._lcm.publish(self._out, message)
-        return True
 
     def receive(self) -> bytes | None:
         self._lcm.handle_timeout(0)
-        return self._came.pop(0) if self._came else None
+        return super().receive()
 
     def close(self) -> None:
         del self._lcm

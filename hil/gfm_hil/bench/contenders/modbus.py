@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench.contenders import Contender, PackageEnd, free_port
+from gfm_hil.bench.contenders import Contender, PackageEnd, free_port, server_end
 from gfm_hil.bench.contenders.ours import UDP
 from gfm_hil.bench.pingpong import Messages, PingPong
 from gfm_hil.core.errors import UserError
@@ -37,19 +37,19 @@ class _Client(PackageEnd):
     def __init__(self, port: int) -> None:
         from pymodbus.client import ModbusTcpClient
 
+        super().__init__()
         self._client = ModbusTcpClient("127.0.0.1", port=port, timeout=1.0, retries=0)
         if not self._client.connect():
             raise UserError(f"no Modbus server at port {port}")
         self.close = self._client.close
 
-    def send(self, message: bytes) -> bool:
+    def send(self, message: bytes) -> None:
         values = np.frombuffer(message[: len(message) // 2 * 2], ">u2").tolist()
         answer = self._client.readwrite_registers(
             read_address=0, read_count=len(values), write_address=_MOST, values=values
         )
-        good = not answer.isError()
-        self._answer = struct.pack(f">{len(values)}H", *answer.registers) if good else None
-        return good
+        if not answer.isError():
+            self.arrived.append(struct.pack(f">{len(values)}H", *answer.registers))
 
 
 def _server(port: int) -> PingPong:
@@ -74,4 +74,4 @@ def _server(port: int) -> PingPong:
         loop.call_soon_threadsafe(loop.stop)
         thread.join(5.0)
 
-    return PingPong(lambda *_: -1, lambda stop: None, close, False)
+    return server_end(close)

@@ -29,15 +29,10 @@ class Nng(PackageEnd):
         else:
             self._socket.dial(c.endpoint, block=True)
 
-    def send(self, message: bytes) -> bool:
-        self._socket.send(message)
-        return True
+        self.send, self.close = self._socket.send, self._socket.close
 
     def receive(self) -> bytes | None:
         try:
             return bytes(self._socket.recv(block=False))
         except self._no_message:
             return None
-
-    def close(self) -> None:
-        self._socket.close()

@@ -44,13 +44,8 @@ class Zenoh(PackageEnd):
         ring: Any = zenoh.handlers.RingChannel(_ROOM)
         self._subscriber = self._session.declare_subscriber(f"gfmhil/{into}", ring)
 
-    def send(self, message: bytes) -> bool:
-        self._publisher.put(message)
-        return True
+        self.send, self.close = self._publisher.put, self._session.close
 
     def receive(self) -> bytes | None:
         sample = self._subscriber.try_recv()
         return None if sample is None else bytes(sample.payload)
-
-    def close(self) -> None:
-        self._session.close()
