@@ -10,29 +10,26 @@ from gfm_hil.bench.exchange import frames, send_all
 from gfm_hil.bench.one_way import RECEIVED, SENT
 from gfm_hil.bench.pingpong import frames as messages
 from gfm_hil.bench.pingpong import over_link
-from gfm_hil.links.crc import crc32
-from gfm_hil.links.frame import FrameWriter
+from gfm_hil.links.frame import FrameWriter, is_sealed, seal
 from gfm_hil.links.port import Port, port_function
 from gfm_runtime.signals import NU, NY
 
 _TIMES, _ROUND_NS = 2000, 100_000_000
-# words of the handle: whether a message is under way, and frames are; bytes of the answer; a CRC
-_HERE, _FRAMES, _SIZE, _CRC_OF_Y = range(4)
+# words of the handle: whether a message is under way, and frames are; bytes of the answer; whether
+# the CRC of y is right
+_HERE, _FRAMES, _SIZE, _GOOD = range(4)
 _ANSWER = 8  # word at which the answer begins
-_TICK, _CRC = slice(12, 20), 4  # bytes of a frame, and those at its end
+_TICK = slice(12, 20)  # bytes of a frame
 
 
 @port_function
 def _send(handle, message):
     handle[_HERE] = 1
     if handle[_FRAMES] != 0:
-        answer = handle[_ANSWER:].view(np.uint8)
-        last = handle[_SIZE] - _CRC
+        answer = handle[_ANSWER:].view(np.uint8)[: handle[_SIZE]]
         answer[_TICK] = message[_TICK]
-        handle[_CRC_OF_Y] = crc32(message, len(message) - _CRC)
-        crc = np.int64(crc32(answer, last))
-        for k in range(_CRC):
-            answer[last + k] = (crc >> (8 * k)) & 0xFF
+        handle[_GOOD] = is_sealed(message)
+        seal(answer)
     return 1
 
 
