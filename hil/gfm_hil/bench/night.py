@@ -8,7 +8,7 @@ was being measured: a line that is cut off counts for nothing, and goes when the
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,11 +49,9 @@ class Block:
 
     def add(self, times_ns: NDArray[np.int64], at: float, cause: str) -> None:
         """Take the times of a round in, when it began, and what cost its worst."""
-        self.counts += histogram(times_ns)
         late = np.flatnonzero(times_ns > self.limit_ns) if self.limit_ns else times_ns[:0]
         events = times_ns
         if len(late):
-            self.bursts.update(dict(bursts([late])))
             # a burst is one event, as bad as its worst
             starts = np.flatnonzero(np.diff(late, prepend=-2) != 1)
             events = times_ns.copy()
@@ -62,7 +60,14 @@ class Block:
         top = np.argpartition(events, -min(WORST, len(events)))[-WORST:]
         since = self.limit_ns * top if self.limit_ns else np.cumsum(times_ns)[top]
         each = zip((at + 1e-9 * since).tolist(), (events[top] / 1e3).tolist(), strict=True)
-        self.worst = _worst([*self.worst, *((place, us, cause) for place, us in each)])
+        worst = [(place, us, cause) for place, us in each]
+        self.merge(histogram(times_ns), worst, dict(bursts([late])))
+
+    def merge(self, counts: Counts, worst: Sequence[Any], lengths: dict[int, int]) -> None:
+        """Take other times in: their histogram, the worst ones, and the bursts by their length."""
+        self.counts += counts
+        self.worst = sorted([*self.worst, *worst], key=lambda event: -event[1])[:WORST]
+        self.bursts.update(lengths)
 
     def line(self, cell: Cell) -> str:
         """For the file."""
@@ -72,10 +77,6 @@ class Block:
             "worst": [(round(at, 4), round(us, 3), cause) for at, us, cause in self.worst],
         }  # fmt: skip
         return json.dumps(content, separators=(",", ":")) + "\n"
-
-
-def _worst(events: list[Any]) -> list[Any]:
-    return sorted(events, key=lambda event: -event[1])[:WORST]
 
 
 class Blocks:
@@ -144,24 +145,19 @@ class CellNight:
     """One cell's night, however long, in bounded memory."""
 
     def __init__(self) -> None:
-        self.counts = np.zeros(BUCKETS, np.int64)
+        self.whole = Block(0.0)
         self.each: list[list[float]] = []  # ``of_round`` of each block
-        self.worst: list[list[Any]] = []
-        self.bursts: Counter[int] = Counter()
-        self.measured_s = 0.0
         self._heat: list[tuple[float, NDArray[np.int64]]] = []
         self._together = 1  # blocks of a column
 
     def add(self, block: dict[str, Any]) -> None:
         """Take a block in, as ``lines_of`` gives it."""
-        self.measured_s += block["s"]
+        self.whole.seconds += block["s"]
         if not block["histogram"]:  # nobody answered
             return
         counts = dense(block["histogram"])
-        self.counts += counts
         self.each.append(of_round(counts))
-        self.worst = _worst([*self.worst, *block["worst"]])
-        self.bursts.update({int(k): int(n) for k, n in block["bursts"]})
+        self.whole.merge(counts, block["worst"], {int(k): int(n) for k, n in block["bursts"]})
         column = counts.reshape(ROWS, PER_ROW).sum(axis=1)
         if (len(self.each) - 1) % self._together:
             self._heat[-1][1][:] += column
@@ -175,12 +171,13 @@ class CellNight:
     def row(self, cell: Cell) -> dict[str, Any]:
         """The row of a result, with ``night``: what a short measurement has not."""
         name, mode, load = cell
+        whole = self.whole
         return {
             "name": name, "mode": mode, "load": load,
-            **summarised(self.counts, self.each), **confidence(self.counts),
+            **summarised(whole.counts, self.each), **confidence(whole.counts),
             "night": {
-                "worst": self.worst, "bursts": sorted(self.bursts.items()),
-                "beyond": beyond(self.counts), "measured_s": round(self.measured_s, 1),
+                "worst": whole.worst, "bursts": sorted(whole.bursts.items()),
+                "beyond": beyond(whole.counts), "measured_s": round(whole.seconds, 1),
                 "heat": {
                     "at": [at for at, _ in self._heat],
                     "counts": [sparse(column) for _, column in self._heat],
@@ -208,5 +205,5 @@ def night_of(folder: Path) -> dict[str, Any]:
     return {
         "format": FORMAT, "bench": "latency", "results": rows, "remarks": [],
         "environment": settings["environment"], "caveats": settings["caveats"],
-        "seconds": round(sum(one.measured_s for one in cells.values()), 1),
+        "seconds": round(sum(one.whole.seconds for one in cells.values()), 1),
     }  # fmt: skip
