@@ -30,6 +30,7 @@ from gfm_hil.core.roles import Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.drive import end_exchange, send_last
 from gfm_hil.engine.handshake import shake_hands
+from gfm_hil.engine.processes import fill_in
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.links import Link, link_kind, link_names
 from gfm_hil.links.base import LinkKind, LinkOptions
@@ -120,10 +121,7 @@ def _controller(model: str, ports: Path | None, folder: Path) -> dict[str, Any]:
     words = controller_program(scenario, model, ports, lambda text: None)
     write_scenario(folder, scenario)
     endpoint = link_kind("shm").fresh(folder)
-    for mark, value in (
-        ("{scenario}", folder / "scenario.toml"), ("{endpoint}", endpoint), ("{folder}", folder),
-    ):  # fmt: skip
-        words = [word.replace(mark, str(value)) for word in words]
+    words = fill_in(words, endpoint, folder)
     return {"program": words, "inner": inner, "endpoint": endpoint, "log": folder / "log"}
 
 

@@ -68,6 +68,17 @@ class _Process:
         return f"the {self.name} failed, see {self.log}" if code not in (0, 2) else ""
 
 
+def fill_in(command: Sequence[str], endpoint: str, folder: Path) -> list[str]:
+    """The command of a controller for this endpoint and this run folder."""
+    own = str(folder.absolute())
+    return [
+        word.replace("{endpoint}", endpoint)
+        .replace("{scenario}", f"{own}/scenario.toml")
+        .replace("{folder}", own)
+        for word in command
+    ]
+
+
 @dataclass
 class Processes:
     """One run's processes: the plant, and a controller for each converter.
@@ -186,15 +197,9 @@ class Processes:
         return command
 
     def _controller_command(self, name: str, folder: Path, endpoint: str) -> list[str]:
-        own = str(folder.absolute())
         if not (command := self.controller_commands.get(name)):
             return [*self._ours("controller", folder), "--endpoint", endpoint]
-        return [
-            word.replace("{endpoint}", endpoint)
-            .replace("{scenario}", f"{own}/scenario.toml")
-            .replace("{folder}", own)
-            for word in command
-        ]
+        return fill_in(command, endpoint, folder)
 
     def _watch(self) -> float:
         """Wait until all have ended; stop and then kill a process that takes too long.
