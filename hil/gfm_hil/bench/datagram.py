@@ -8,32 +8,27 @@ import select
 import socket
 import struct
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
-from numba import types
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links.base import LONGEST, LinkKind, LinkOptions
 from gfm_hil.links.port import Port, free_port_function
+from gfm_hil.links.system import DONTWAIT, recv, send
 
-_DONTWAIT = int(socket.MSG_DONTWAIT)
-_transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
-_send: Any = types.ExternalFunction("send", _transfer)
-_recv: Any = types.ExternalFunction("recv", _transfer)
 _SPINS = 1000
 _PATIENCE = struct.pack("ll", 0, 1000)  # struct timeval: s, µs
 
 
 @free_port_function
 def _port_send(handle, message):
-    return 1 if _send(handle[0], message.ctypes.data, len(message), _DONTWAIT) > 0 else 0
+    return 1 if send(handle[0], message.ctypes.data, len(message), DONTWAIT) > 0 else 0
 
 
 @free_port_function
 def _port_receive(handle, message):
-    return max(0, _recv(handle[0], message.ctypes.data, len(message), handle[1]))
+    return max(0, recv(handle[0], message.ctypes.data, len(message), handle[1]))
 
 
 class UdpLink:
@@ -52,18 +47,18 @@ class UdpLink:
             self.close()
             raise UserError(f"{endpoint}: cannot be used: {problem.strerror}") from None
         # on one processor a side that polls keeps all others waiting, the kernel's too
-        how = _DONTWAIT if (os.cpu_count() or 1) > 1 else 0
+        how = DONTWAIT if (os.cpu_count() or 1) > 1 else 0
         handle = np.array([self._socket.fileno(), how])
         self.port = Port(handle, _port_send, _port_receive, _SPINS)
 
     def send(self, message: bytes) -> bool:
         with suppress(OSError):  # the other side has not opened its port yet
-            return self._socket.send(message, _DONTWAIT) > 0
+            return self._socket.send(message, DONTWAIT) > 0
         return False
 
     def receive(self) -> bytes | None:
         try:
-            message, sender = self._socket.recvfrom(LONGEST + 1, _DONTWAIT)
+            message, sender = self._socket.recvfrom(LONGEST + 1, DONTWAIT)
         except OSError:
             return None
         if self._serves:

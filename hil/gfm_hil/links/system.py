@@ -2,6 +2,7 @@
 
 import errno
 import select
+import socket
 from typing import Any
 
 from numba import int64, types
@@ -15,6 +16,12 @@ _errno_place: Any = types.ExternalFunction("__errno_location", types.int64())
 
 #: poll(2): address of the structures ``pollfd``, how many, and ms
 poll: Any = types.ExternalFunction("poll", types.int32(types.int64, types.int64, types.int32))
+
+#: send(2) and recv(2); addresses are int64
+DONTWAIT = int(socket.MSG_DONTWAIT)
+_transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
+send: Any = types.ExternalFunction("send", _transfer)
+recv: Any = types.ExternalFunction("recv", _transfer)
 
 
 def pollfd(fd: int) -> int:

@@ -5,16 +5,13 @@ SocketCAN, and a ``Bridge`` in its place, transfer whole structures; on the loop
 """
 
 import errno
-import socket
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numba import types
 
 from gfm_hil.links.can import LOOPBACK_PLACES
 from gfm_hil.links.can.wire import FD, HEAD, MTU, MTU_FD
-from gfm_hil.links.system import NONE_NOW, errno_now, pollfd
+from gfm_hil.links.system import DONTWAIT, NONE_NOW, errno_now, pollfd, recv, send
 from gfm_hil.realtime.clock import now_ns
 from gfm_runtime.compiled import compiled
 
@@ -33,13 +30,7 @@ socket_dtype = np.dtype(
 )
 POLL_AT = socket_dtype.itemsize - 8
 
-_DONTWAIT = int(socket.MSG_DONTWAIT)
 FULL = (errno.ENOBUFS, errno.EAGAIN)
-
-# send(2) and recv(2) of libc; addresses are int64
-_transfer = types.int64(types.int32, types.int64, types.int64, types.int32)
-_send: Any = types.ExternalFunction("send", _transfer)
-_recv: Any = types.ExternalFunction("recv", _transfer)
 
 
 def set_socket(record: np.ndarray, kind: int, fd: int, others: Sequence[int] = ()) -> None:
@@ -54,7 +45,7 @@ def write_frame(sockets, frame):
     s, address = sockets[0], frame.ctypes.data
     if s.kind == SOCKETCAN:
         size = MTU_FD if frame[0].flags & FD else MTU
-        return 0 if _send(s.fd, address, size, _DONTWAIT) == size else errno_now()
+        return 0 if send(s.fd, address, size, DONTWAIT) == size else errno_now()
     problem = now = 0
     size = HEAD + frame[0].length
     for k in range(_OTHERS):
@@ -63,7 +54,7 @@ def write_frame(sockets, frame):
             if now < s.empty_until[k]:
                 continue
         s.empty_until[k] = 0
-        if _send(s.others[k], address, size, _DONTWAIT) != size:
+        if send(s.others[k], address, size, DONTWAIT) != size:
             why = errno_now()
             if why == errno.ECONNREFUSED:  # reports the previous datagram, not this one
                 s.empty_until[k] = now_ns() + _RECHECK_NS
@@ -76,7 +67,7 @@ def write_frame(sockets, frame):
 def read_frame(sockets, frame):
     """Receive into the frame in an array of ``wire.frame_dtype``; returns 1, 0 if none is there,
     or the negative errno."""
-    got = _recv(sockets[0].fd, frame.ctypes.data, MTU_FD, _DONTWAIT)
+    got = recv(sockets[0].fd, frame.ctypes.data, MTU_FD, DONTWAIT)
     if got < 0:
         why = errno_now()
         return 0 if why in NONE_NOW else -why
