@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gfm_hil.bench.contenders import Contender, contenders_of, memory_folder
+from gfm_hil.bench.contenders import ELSEWHERE, Contender, contenders_of, memory_folder
 from gfm_hil.bench.cpu_load import Load, cpu_load
 from gfm_hil.bench.histogram import summary
 from gfm_hil.bench.night import Block, Blocks, lines_of, night_of
@@ -62,12 +62,13 @@ def measure(options: BenchOptions, content: dict[str, Any], show: ShowProgress) 
             try:
                 compiled = two.open(c, options.payload)
             except UserError as problem:
-                if c in elsewhere:
+                if c.peer == ELSEWHERE:
                     raise
                 remarks.append(f"{c.name}: not measured: {problem}")
                 continue
             code = "C" if c.source else ("compiled" if compiled else "Python")
-            share = None if c.source else two.here("plant", own_share_us, code, c in elsewhere)
+            far = c.peer == ELSEWHERE
+            share = None if c.source else two.here("plant", own_share_us, code, far)
             about = {"link": c.link, "peer": c.peer, "code": code, "bench_us": share}
             cells += [_RoundTrips(c, m, w, about) for w in options.loads for m in options.modes]
 

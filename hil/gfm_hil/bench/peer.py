@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.bench import datagram
-from gfm_hil.bench.contenders import Contender
+from gfm_hil.bench.contenders import ELSEWHERE, Contender
 from gfm_hil.bench.contenders.ours import SHM, UDP, ZMQ_IPC, ZMQ_TCP
 from gfm_hil.bench.exchange import GONE, LEFT, OTHER, SILENT, answer_all, frames, send_all
 from gfm_hil.bench.one_way import ANSWERED, DUE, HEARD, RECEIVED, SENT, delays
@@ -45,7 +45,6 @@ from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import STOPPED
 
 ANSWERER = "gfmhil bench answer"
-PEER = "to"  # of a contender, in place of ``ours``
 _LAW, _STAGE = "vsg-2", "virtual-stator"
 _TICKS = 600_000  # exchanges at most with a controller that the bench starts: it records each
 _MOST = 1 << 20  # exchanges of a round
@@ -103,13 +102,13 @@ def peer_of(bench: BenchOptions, place: Path) -> Contender:
         folder = place / "controller"
         folder.mkdir()
         more |= _controller(to, ports, folder)
-        return Contender(name or to, "shm", more["endpoint"], _open, PEER, more, SHM)
+        return Contender(name or to, "shm", more["endpoint"], _open, ELSEWHERE, more, SHM)
     kind, _ = _link_of(to, link, "--to")
     if ports is not None:
         raise UserError(f"--map {ports}: is for a controller {FORMS}; {to} is an endpoint")
     _check_route(to)
     limit = ZMQ_IPC if to.startswith("ipc:") else _LIMITS.get(kind.name, "")
-    return Contender(name or to, kind.name, to, _open, PEER, more, limit)
+    return Contender(name or to, kind.name, to, _open, ELSEWHERE, more, limit)
 
 
 def _controller(model: str, ports: Path | None, folder: Path) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from gfm_hil.bench.contenders import ELSEWHERE
 from gfm_hil.bench.histogram import SHARES
 from gfm_hil.results.table import Table, shown
 from gfm_hil.run.taken import METHODS
@@ -110,7 +111,7 @@ def latency_verdicts(content: Row) -> Iterator[str]:
     rows = content["results"]
     limits = {(r["name"], r["mode"], r["load"]): r for r in rows if r["peer"] == "C"}
     for row in rows:
-        if row["peer"] not in ("ours", "to") or row["p50_us"] is None:
+        if row["peer"] not in ("ours", ELSEWHERE) or row["p50_us"] is None:
             continue
         text = f"{row['name']}, {row['mode']}, {row['load']}: p50 {micro(row['p50_us'])} µs"
         ratio = row["ratio_to_baseline_p50"]

@@ -159,7 +159,8 @@ def test_wrong_peers_are_refused_in_a_line(line, said, tmp_path, capsys):
     assert not (tmp_path / "none").exists()
 
 
-def test_another_version_is_refused_by_both_sides(tmp_path, capsys):
+def test_another_version_is_refused_by_both_sides(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")  # also where there are no limits
     endpoint = f"tcp://127.0.0.1:{free_port()}"
     other = (
         "import sys, gfm_hil.engine.handshake as h\n"

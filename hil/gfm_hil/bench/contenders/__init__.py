@@ -29,6 +29,7 @@ from gfm_runtime.children import GRACE_S
 from gfm_runtime.signals import NY
 
 FRAME = wire_dtype(NY).itemsize  # bytes of the frame with y; the reply is the one with u
+ELSEWHERE = "to"  # in place of the ``peer`` of who answers elsewhere
 #: files of other packages' transports, in the order of the tables, and the packages that each needs
 PEERS = {
     "cyclonedds": ("cyclonedds",),
@@ -51,7 +52,7 @@ class Contender:
     # opens one end that sends these messages; a function or class of a module. What it returns is
     # called as a link is, if it is no ``PingPong``. The controller opens its end first
     end: Callable[[Contender, Role, Messages], Any]
-    peer: str = "ours"  # ``ours``, ``C`` or the name of another package
+    peer: str = "ours"  # ``ours``, ``C``, ``ELSEWHERE`` or the name of another package
     options: dict[str, Any] = field(default_factory=dict)  # of the link
     # name of the contender in C that it is compared with; its own name for one in C
     limit: str = ""
