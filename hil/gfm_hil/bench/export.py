@@ -3,7 +3,6 @@
 import io
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,6 @@ from gfm_hil.bench.histogram import SHARES, bars
 from gfm_hil.core.errors import UserError, need
 
 Row = dict[str, Any]
-#: by name what reads them
-FORMATS = {
-    "hdr": "HdrHistogram log",
-    "github": "JSON of github-action-benchmark",
-    "pytest": "JSON of pytest-benchmark",
-    "prometheus": "text format of Prometheus",
-}
 _MOST_NS, _DIGITS = 3_600_000_000_000, 3  # of an HdrHistogram
 
 
@@ -28,10 +20,8 @@ def export(content: Row, form: str, path: Path) -> None:
     rows = [row for row in content["results"] if row["n"]]
     if not rows:
         raise UserError("the result has no round trips to export")
-    write: dict[str, Callable[[Row, list[Row]], str]] = {
-        "hdr": _hdr, "github": _github, "pytest": _pytest, "prometheus": _prometheus,
-    }  # fmt: skip
-    path.write_text(write[form](content, rows), encoding="utf-8")
+    _, write = FORMATS[form]
+    path.write_text(write(content, rows), encoding="utf-8")
 
 
 def _name(row: Row) -> str:
@@ -117,3 +107,12 @@ def _prometheus(content: Row, rows: list[Row]) -> str:
         lines.append(f"{name}_sum{{{labels}}} {float(at @ counts) * 1e-9:.9g}")
         lines.append(f"{name}_count{{{labels}}} {row['n']}")
     return "\n".join(lines) + "\n"
+
+
+#: by name what reads them, and what writes them
+FORMATS = {
+    "hdr": ("HdrHistogram log", _hdr),
+    "github": ("JSON of github-action-benchmark", _github),
+    "pytest": ("JSON of pytest-benchmark", _pytest),
+    "prometheus": ("text format of Prometheus", _prometheus),
+}

@@ -148,7 +148,8 @@ def add(command: argparse.ArgumentParser) -> None:
 def _add_page(kinds: Any) -> None:
     page = kinds.add_parser("page", help="make the page of a result, or of a night so far")
     export = kinds.add_parser("export", help="write a result for other tools")
-    export.add_argument("format", choices=FORMATS, help="; ".join(map(": ".join, FORMATS.items())))
+    text = "; ".join(f"{name}: {what}" for name, (what, _) in FORMATS.items())
+    export.add_argument("format", choices=FORMATS, help=text)
     for command, call in ((page, page_call), (export, export_call)):
         command.add_argument("result", type=Path, help="folder of a result or of a night")
         command.set_defaults(call=call)
