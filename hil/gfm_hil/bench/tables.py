@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from gfm_hil.bench.contenders import ELSEWHERE
@@ -10,16 +11,31 @@ from gfm_hil.results.table import Table, shown
 from gfm_hil.run.taken import METHODS
 
 Row = dict[str, Any]
-#: a column of a table: the key of what it shows as it is, or a function that makes a cell of a row
+#: a column of a table: the key of what it shows, in a row or, after dots, in what a row has; or a
+#: function that makes a cell of a row
 Column = str | Callable[[Row], str]
 
 
 def _table(heading: str, rows: list[Row], columns: Mapping[str, Column]) -> Table:
     def cell(row: Row, column: Column) -> str:
-        return str(row[column]) if isinstance(column, str) else column(row)
+        return _cell(row, column) if isinstance(column, str) else column(row)
 
     cells = [[cell(row, column) for column in columns.values()] for row in rows]
     return Table([*columns], cells, heading)
+
+
+def _cell(row: Row, key: str) -> str:
+    """What a row has under a key, as its unit wants it; – for none."""
+    value: Any = row
+    for part in key.split("."):
+        value = (value or {}).get(part)
+    if key.endswith("_us"):
+        return micro(value)
+    if key.endswith("_pct"):
+        return percent(value)
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:g}" if isinstance(value, float) else shown(value)
 
 
 def micro(value: float | None) -> str:
@@ -41,41 +57,24 @@ def percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g} %"
 
 
-def _of(show: Callable[[Any], str], *keys: str) -> Column:
-    """What a row has under a key, or under one within another: None if it is not there."""
-
-    def cell(row: Row) -> str:
-        value: Any = row
-        for key in keys:
-            value = (value or {}).get(key)
-        return show(value)
-
-    return cell
-
-
 def _median(key: str, form: str, unit: str = "") -> Column:
     """Of a ``rounds.spread``; – for none."""
     return lambda row: format(row[key]["median"], form) + unit if row[key] else "–"
 
 
-def _longest(bursts: list[tuple[int, int]]) -> str:
+def _longest(row: Row) -> str:
+    bursts = row["night"]["bursts"] if "night" in row else row["bursts"]
     return str(max((length for length, _ in bursts), default=0))
 
 
 _CELL: dict[str, Column] = {"": "name", "mode": "mode", "load": "load"}
-_PERCENTILES = {name.replace("_", "."): _of(micro, f"{name}_us") for name in SHARES}
+_PERCENTILES: dict[str, Column] = {name.replace("_", "."): f"{name}_us" for name in SHARES}
 
 
 def latency_tables(rows: list[Row]) -> Iterator[Table]:
     """Round trips, one table per mode and load, and both ways to who answers elsewhere."""
-    columns: dict[str, Column] = {
-        "": "name",
-        "code": "code",
-        **_PERCENTILES,
-        "n": _of("{:,}".format, "n"),
-        "of it the bench": _of(micro, "bench_us"),
-        "p50 : limit": _limit,
-    }
+    columns: dict[str, Column] = {"": "name", "code": "code", **_PERCENTILES}
+    columns |= {"n": "n", "of it the bench": "bench_us", "p50 : limit": _limit}
     for mode, load in dict.fromkeys((r["mode"], r["load"]) for r in rows):
         some = [r for r in rows if (r["mode"], r["load"]) == (mode, load)]
         conditions = f"{some[0]['policy']}, {some[0]['payload']} B"
@@ -90,13 +89,14 @@ def _limit(row: Row) -> str:
 
 
 _WAYS: dict[str, Column] = {
-    f"{words} {name}": _of(micro, way, f"{name}_us")
-    for way, words in (("there", "there"), ("between", "its own"), ("back", "back"))
-    for name in ("p50", "p99")
-} | {
-    "± ": _of(micro, "within_us"),
+    **{
+        f"{words} {name}": f"{way}.{name}_us"
+        for way, words in (("there", "there"), ("between", "its own"), ("back", "back"))
+        for name in ("p50", "p99")
+    },
+    "± ": "within_us",
     "clock": lambda row: row.get("clock", "not read"),
-    "lost": _of(percent, "lost_pct"),
+    "lost": "lost_pct",
     "95 %": lambda row: "{:.3g}–{:.3g} %".format(*row["lost_pct_95"]),
 }
 
@@ -134,16 +134,15 @@ def night_tables(rows: list[Row]) -> Iterator[Table]:
     rows = [row for row in rows if "night" in row]
     if not rows:
         return
-    sure = {
-        name.replace("_", "."): _of(_interval, f"{name}_us_95") for name in SHARES if name != "max"
-    }
+    sure = {head: partial(_interval, f"{key}_95") for head, key in _PERCENTILES.items()}
+    del sure["max"]
     yield _table("Percentiles of all times, with 95 % between [µs]", rows, _CELL | sure)
-    beyond = {
-        "above": _of(micro, "night", "beyond", "threshold_us"),
-        "shape": _of(shown, "night", "beyond", "shape"),
-        "fitted to": _of(shown, "night", "beyond", "fitted"),
-        "one in …: longer than": _of(_estimates, "night", "beyond", "estimates"),
-        "longest burst": _of(_longest, "night", "bursts"),
+    beyond: dict[str, Column] = {
+        "above": "night.beyond.threshold_us",
+        "shape": "night.beyond.shape",
+        "fitted to": "night.beyond.fitted",
+        "one in …: longer than": _estimates,
+        "longest burst": _longest,
     }
     heading = "Beyond the data: estimates by a generalised Pareto distribution [µs]"
     yield _table(heading, rows, _CELL | beyond)
@@ -160,12 +159,13 @@ def night_tables(rows: list[Row]) -> Iterator[Table]:
 _WORST = 10
 
 
-def _interval(ends: list[float | None] | None) -> str:
-    return "–".join("?" if end is None else micro(end) for end in ends or ())
+def _interval(key: str, row: Row) -> str:
+    return "–".join("?" if end is None else micro(end) for end in row.get(key) or ())
 
 
-def _estimates(estimates: list[tuple[int, float]] | None) -> str:
-    return "; ".join(f"{times:,}: {micro(us)}" for times, us in estimates or ())
+def _estimates(row: Row) -> str:
+    beyond = row["night"]["beyond"] or {"estimates": ()}
+    return "; ".join(f"{times:,}: {micro(us)}" for times, us in beyond["estimates"])
 
 
 def _clock_time(at: float) -> str:
@@ -175,7 +175,7 @@ def _clock_time(at: float) -> str:
 def jitter_tables(rows: list[Row]) -> Iterator[Table]:
     """Lateness of a loop that only paces."""
     named: dict[str, Column] = {"": "policy", "load": "load", "wait": "wait"}
-    figures = {"ticks lost": _of(percent, "lost_pct"), "p50, p99 : nanosleep": _agrees}
+    figures: dict[str, Column] = {"ticks lost": "lost_pct", "p50, p99 : nanosleep": _agrees}
     heading = "A loop that only paces, every 100 µs: late by [µs]"
     yield _table(heading, rows, named | _PERCENTILES | figures)
     heading = "Who had the processor in ticks that were late by more than 100 µs"
@@ -206,19 +206,15 @@ def _agrees(row: Row) -> str:
 def realtime_tables(rows: list[Row]) -> Iterator[Table]:
     """Misses in real time, and why ticks were missed."""
     named: dict[str, Column] = {"": "link", "load": "load"}
-    shares = {
-        "ticks": _of("{:,}".format, "ticks"),
-        "missed": _of(percent, "missed_pct"),
-        "the host's own": _of(percent, "host_pct"),
-        "beyond it, median": _of(percent, "beyond_host_pct"),
-        "by work or link": _of(percent, "by_work_or_link_pct"),
-        "trip p50 [µs]": _PERCENTILES["p50"],
-        "p99 [µs]": _PERCENTILES["p99"],
-    }
+    shares: dict[str, Column] = {
+        "ticks": "ticks", "missed": "missed_pct", "the host's own": "host_pct",
+        "beyond it, median": "beyond_host_pct", "by work or link": "by_work_or_link_pct",
+        "trip p50 [µs]": "p50_us", "p99 [µs]": "p99_us",
+    }  # fmt: skip
     yield _table("The product in real time, 10 kHz", rows, named | shares)
-    causes = {cause: _of("{:,}".format, "causes", cause) for row in rows for cause in row["causes"]}
-    burst = {"longest burst": _of(_longest, "bursts")}
-    yield _table("Missed ticks by cause", rows, named | causes | burst)
+    causes: dict[str, Column] = {c: f"causes.{c}" for row in rows for c in row["causes"]}
+    columns = named | causes | {"longest burst": _longest}
+    yield _table("Missed ticks by cause", rows, columns)
     yield from _named_tables("Who had the processor in missed ticks", rows, ("link", "load"))
 
 
@@ -234,7 +230,7 @@ def _named_tables(heading: str, rows: list[Row], keys: tuple[str, ...]) -> Itera
     ]
     if named:
         columns: dict[str, Column] = {key: key for key in keys}
-        columns |= {"who": "name", "ticks": _of("{:,}".format, "count")}
+        columns |= {"who": "name", "ticks": "count"}
         by = dict.fromkeys(METHODS[row["method"]] for row in named)
         yield _table(f"{heading}, {' and '.join(by)}", named, columns)
 
@@ -262,7 +258,7 @@ def law_tables(rows: list[Row]) -> Iterator[Table]:
         "": "law",
         **{part: _median(f"{part}_ns", ".0f") for part in parts},
         "× real time": _median("times_real_time", ".0f"),
-        "allocations": _of("{:g}".format, "allocations_per_tick"),
+        "allocations": "allocations_per_tick",
     }
     yield _table("The loop in one process: ns a tick", rows, by_law)
 
@@ -284,21 +280,16 @@ def kernel_tables(rows: list[Row]) -> Iterator[Table]:
 
 
 _SWEPT: dict[str, Column] = {
-    "": "name", "load": "load", "policy": "policy", "wait": "wait",
-    "B": _of("{:,}".format, "payload"),
+    "": "name", "load": "load", "policy": "policy", "wait": "wait", "B": "payload",
 }  # fmt: skip
 
 
 def sweep_tables(rows: list[Row]) -> Iterator[Table]:
     """Round trips of a sweep with their cost."""
-    figures = {
-        "kHz": _of("{:g}".format, "khz"),
-        "p50": _PERCENTILES["p50"],
-        "p99": _PERCENTILES["p99"],
-        "missed": _of(percent, "missed_pct"),
-        "processors": _of(percent, "processor_pct"),
-        "opened, kB": _of("{:,}".format, "opened_kb"),
-    }
+    figures: dict[str, Column] = {
+        "kHz": "khz", "p50": "p50_us", "p99": "p99_us", "missed": "missed_pct",
+        "processors": "processor_pct", "opened, kB": "opened_kb",
+    }  # fmt: skip
     heading = "Round trips from the deadline, by payload and rate [µs]"
     yield _table(heading, rows, _SWEPT | figures)
 
