@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 from gfm_hil.bench.histogram import bars, lower_ends
@@ -164,6 +165,7 @@ def misses(rows: list[Row]) -> Figure:
     right.set_yscale("log")
     for axis in (right.xaxis, right.yaxis):
         axis.set_major_formatter(lambda x, _: f"{x:g}")
+        axis.set_minor_formatter(LogFormatter())  # as numbers, and only within a decade
     right.set_xlabel("ticks in a row that were missed", fontsize=9)
     dress(right, "bursts: how many of each length")
     if right.get_legend_handles_labels()[1]:
