@@ -89,7 +89,7 @@ def _next(plant: PlantRecords, steps: int, first: float, at: float, last: float)
 @compiled
 def _see(plant: PlantRecords, seen: NDArray[Any], row: int, at: float) -> None:
     r, s, w = plant.par[0], plant.st[0], field(plant.now[0], "w")
-    turn = stands(plant.net[0], plant.st[0].tick, at)
+    turn = stands(plant, at)
     i, v, i_o = w[own(0) + I_F] * turn, w[own(0) + V] * turn, w[own(0) + I_O] * turn
     seen[row, 0], seen[row, 1], seen[row, 2] = at, s.x[V_DC], s.mid
     for x in range(3):

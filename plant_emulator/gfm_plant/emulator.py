@@ -165,7 +165,7 @@ def _advance_converting(plant: PlantRecords) -> None:
         end = n.T_s * (m + 1) / n.conversions
         advance(plant, n.T_s * m / n.conversions, end if m + 1 < n.conversions else math.inf)
         for k in range(n.n_converters):
-            convert(n, plant.now[0], plant.par[k], plant.st[k], k, m, end)
+            convert(plant, k, m, end)
 
 
 @compiled

@@ -121,7 +121,7 @@ def take_command(plant: PlantRecords, k: int, part: int) -> None:
             begin = 0.0
             for before in range(part):
                 begin += field(n, "stretch")[before]
-            frame = field(now, "unit")[k] * stands(n, plant.st[0].tick, begin)
+            frame = field(now, "unit")[k] * stands(plant, begin)
             apply_counts(plant, k, frame, field(n, "stretch")[part])
     else:
         s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`

@@ -22,9 +22,10 @@ _SEED = np.uint64(1 << 62)  # tells the noise of the phases from that of `sensor
 
 
 @compiled
-def stands(n: Any, tick: int, at: float) -> complex:
-    """Return e^(j omega_b t) at an instant of a tick's period, s after its beginning."""
-    angle = n.omega_b * (n.T_s * tick + at)
+def stands(plant: PlantRecords, at: float) -> complex:
+    """Return e^(j omega_b t) at an instant of the period, s after its beginning."""
+    n = plant.net[0]
+    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
     return complex(math.cos(angle), math.sin(angle))
 
 
@@ -44,27 +45,31 @@ def read_phases(plant: PlantRecords, k: int) -> None:
     s = plant.st[k]
     if math.isnan(s.phase_sums[0]):
         for m in range(plant.par[k].phase_samples):
-            convert(plant.net[0], plant.now[0], plant.par[k], s, k, m, 0.0)
+            convert(plant, k, m, 0.0)
 
 
 @compiled
-def convert(n: Any, now: Any, r: Any, s: Any, k: int, m: int, at: float) -> None:
+def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
     """Add conversion m of this period, at an instant s after its beginning, to the counts of
-    converter k. It takes elements of ``net``, ``now``, ``par`` and ``st``: a caller would put all
-    words of a plant on the stack whether it calls or not.
+    converter k.
 
     A sensor's low-pass sees a straight line from conversion to conversion. A channel with skew
     samples earlier, on the same line; with one conversion a period the current of L_f on the slope
     that it has before the tick, where its bridge has a zero vector if it is switched.
     """
-    w, turn = field(now, "w"), stands(n, s.tick, at)
+    r, s, w = plant.par[k], plant.st[k], field(plant.now[0], "w")
+    turn = stands(plant, at)
     i, v, i_o = w[own(k) + I_F] * turn, w[own(k) + V] * turn, w[own(k) + I_O] * turn
     i, i_o = i * r.current, i_o * r.current
     slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
     if r.levels == 0:
-        E = complex(s.E[0], s.E[1]) * field(now, "unit")[k] * turn
+        E = complex(s.E[0], s.E[1]) * field(plant.now[0], "unit")[k] * turn
         slope += E * (r.omega_b / r.L_f)
+    tick, noise, other = s.tick * r.phase_samples + m, 0.0, 0.0
     for j in range(N_PHASES):
+        noise, other = other, noise
+        if j % 2 == 0:
+            noise, other = _noise(r, tick, j)
         x = (j - 1) % 3
         value = along(x, i if j < 4 else (v if j < 7 else i_o)) if j > 0 else s.x[V_DC]
         if math.isnan(s.phase_seen[0, j]):
@@ -76,12 +81,12 @@ def convert(n: Any, now: Any, r: Any, s: Any, k: int, m: int, at: float) -> None
             + r.phase_weights[2] * value
         )
         s.phase_seen[0, j], s.phase_seen[1, j] = value, low
-        back = change * r.phase_samples / n.T_s
+        back = change * r.phase_samples / plant.net[0].T_s
         if 0 < j < 4 and r.phase_samples == 1:
             back = along(x, slope)
         seen = low - r.phase_skew[j] * back
         before = 0.0 if m == 0 else s.phase_sums[j]
-        s.phase_sums[j] = before + _count(r, s.tick * r.phase_samples + m, j, seen)
+        s.phase_sums[j] = before + _count(r, j, seen, noise)
 
 
 @cached
@@ -93,17 +98,22 @@ def convert_nothing(plant: PlantRecords, k: int, rows: NDArray[np.float64]) -> N
         for j in range(N_PHASES):
             rows[i, j] = 0.0
             for m in range(r.phase_samples):
-                rows[i, j] += _count(r, m - (i + 1) * r.phase_samples, j, 0.0)
+                noise = _noise(r, m - (i + 1) * r.phase_samples, j - j % 2)[j % 2]
+                rows[i, j] += _count(r, j, 0.0, noise)
 
 
-@compiled
-def _count(r: Any, tick: int, j: int, value: float) -> float:
-    """Return what channel j reads of a value, counts."""
-    noise = 0.0
-    if r.phase_noise[j] > 0.0:
-        a, b = gaussians(r.seed + _SEED, tick, j // 2)
-        noise = r.phase_noise[j] * (a if j % 2 == 0 else b)
-    value = r.phase_gain[j] * value + r.phase_offset[j] + noise
+@inlined
+def _noise(r: Any, tick: int, j: int) -> tuple[float, float]:
+    """Return samples of N(0, 1) for an even channel and the next; 0 if neither has noise."""
+    if r.phase_noise[j] > 0.0 or r.phase_noise[j + 1] > 0.0:
+        return gaussians(r.seed + _SEED, tick, j // 2)
+    return 0.0, 0.0
+
+
+@inlined
+def _count(r: Any, j: int, value: float, noise: float) -> float:
+    """Return what channel j reads of a value, counts; ``noise`` is a sample of N(0, 1)."""
+    value = r.phase_gain[j] * value + r.phase_offset[j] + r.phase_noise[j] * noise
     count = math.floor((value - r.phase_lo[j]) / r.phase_lsb[j] + 0.5)
     return min(max(count, 0.0), r.phase_top)
 
