@@ -65,12 +65,18 @@ def _fields(path: Path) -> dict[str, list[tuple[str, list[str]]]]:
 class MpcCase(CaseTables):
     """A case of MATPOWER.
 
+    Args:
+        path: of the file.
+        frequency: nominal, Hz, which a file does not have; None: 60, and ``ignored`` says so.
+
     Raises:
         UserError: the file cannot be read, is of another version, computes, or a row is none; the
-            message has the file, the line and the column.
+            message has the file, the line and the column. The frequency is not above 0.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, frequency: float | None = None) -> None:
+        if frequency is not None and not 0.0 < frequency < math.inf:
+            raise UserError(f"frequency = {frequency:g}: must be above 0 Hz")
         self.path, self.fields = path, _fields(path)
         (_, texts), *_ = self.fields.get("version") or [("", ["1"])]
         version = " ".join(texts).strip("'")
@@ -83,8 +89,11 @@ class MpcCase(CaseTables):
         S_b = number(where, " ".join(texts))
         if S_b <= 0.0:
             raise UserError(f"{where}: {S_b:g}: must be above 0")
-        super().__init__(S_b, _F)
-        self.ignored.append(f"{_F:g} Hz is our assumption: a file of MATPOWER has no frequency.")
+        super().__init__(S_b, frequency or _F)
+        if frequency is None:
+            self.ignored.append(
+                f"{_F:g} Hz is our assumption: a file of MATPOWER has no frequency."
+            )
         self._fill()
 
     def _rows(self, name: str) -> list[tuple[str, dict[str, float]]]:

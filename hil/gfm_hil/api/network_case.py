@@ -112,6 +112,7 @@ def network_from(
     slack: str = "machine",
     title: str = "",
     dynamics: str | Path | None = None,
+    frequency: float | None = None,
 ) -> NetworkCase:
     """Make a network of a power-flow case.
 
@@ -133,13 +134,14 @@ def network_from(
         title: of the scenario.
         dynamics: dynamic data file of PSS/E (.dyr) with the machines and their controls, see
             ``read_machines``.
+        frequency: nominal, Hz, of a file of MATPOWER, which has none; 60 by default.
 
     Raises:
         UserError: an unknown case, bus or law; a case that has no slack or does not converge; a
             part that a network cannot have; a generator without a rating; a law that has no steady
             state there.
     """
-    flow = read_pandapower(case, title)
+    flow = read_pandapower(case, title, frequency)
     machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
     flow = _with_following(flow, machines)
     names = [bus.name for bus in flow.buses]

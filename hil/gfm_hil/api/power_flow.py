@@ -16,7 +16,6 @@ from gfm_runtime.errors import meant
 
 _MOST_BUSES = 500  # the matrices of a network are dense
 _NEAR = 1e-6  # p.u.; a smaller current comes from rounding
-_READERS: dict[str, type[RawCase | MpcCase]] = {".raw": RawCase, ".m": MpcCase}
 _IGNORED = {
     "controller": "they stand where the power flow leaves them",
     "motor": "impedances, as loads are",
@@ -66,7 +65,7 @@ class PowerFlow:
     ignored: Sequence[str]  #: what the case has and a network has not
 
 
-def read_pandapower(case: Any, title: str) -> PowerFlow:
+def read_pandapower(case: Any, title: str, frequency: float | None = None) -> PowerFlow:
     """Solve a net of pandapower, and read it as pandapower itself hands it to PYPOWER."""
     need("pandapower", "pandapower", "a power-flow case", "networks")
     import pandapower  # an optional package, and seconds of imports
@@ -76,12 +75,16 @@ def read_pandapower(case: Any, title: str) -> PowerFlow:
     is_named = isinstance(case, str | Path)
     of = str(case) if is_named else title or str(case.name or "case")
     title = title or (Path(of).stem if is_named else of)
-    if is_named:
-        if (reader := _READERS.get(Path(case).suffix.lower())) is not None:
-            tables = reader(Path(case))
-            case, ignored = tables.net(), tables.ignored
-        else:
-            case = _load_pandapower(str(case))
+    suffix = Path(case).suffix.lower() if is_named else ""
+    if frequency is not None and suffix != ".m":
+        raise UserError(
+            f"frequency = {frequency:g}: is for a file of MATPOWER, which has none; {of} has one"
+        )
+    if suffix in (".m", ".raw"):
+        tables = MpcCase(Path(case), frequency) if suffix == ".m" else RawCase(Path(case))
+        case, ignored = tables.net(), tables.ignored
+    elif is_named:
+        case = _load_pandapower(str(case))
     if len(case.bus) > _MOST_BUSES:
         raise UserError(f"{of}: {len(case.bus)} buses: at most {_MOST_BUSES}")
     if not case.ext_grid.in_service.any() and not case.gen.query("slack and in_service").size:

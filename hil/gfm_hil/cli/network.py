@@ -37,6 +37,10 @@ def add(command: argparse.ArgumentParser) -> None:
         "--dynamics", metavar="FILE",
         help=f"dynamic data of PSS/E (.dyr): {', '.join(MODELS)}",
     )  # fmt: skip
+    read.add_argument(
+        "--frequency", type=float, metavar="HZ",
+        help="nominal, of a file of MATPOWER, which has none (default: 60)",
+    )  # fmt: skip
     read.add_argument("-o", "--out", metavar="FOLDER", help="(default: the case's name)")
     read.set_defaults(call=call_import)
 
@@ -52,7 +56,9 @@ def call_import(options: argparse.Namespace) -> int:
             converters[bus] = (law, float(share)) if colon else law
         except ValueError:
             raise UserError(f"--converter {text}: {share!r} must be a number in (0, 1]") from None
-    case = network_from(options.case, converters, options.slack, dynamics=options.dynamics)
+    case = network_from(
+        options.case, converters, options.slack, "", options.dynamics, options.frequency
+    )
     file = case.save(options.out or Path(options.case).stem)
     network, console = case.content["network"], terminal()
     counts = [(len(parts), table.replace("_", " "))

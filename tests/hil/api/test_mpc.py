@@ -27,6 +27,10 @@ def test_a_published_case_has_its_published_voltages(tmp_path):
     assert nominal_frequency(load_scenario(network)) == pytest.approx(60.0)
     assert case.converters["converter2.toml"]["S_n"] == 300e6  # PMAX, which is above MBASE
     assert case.ignored == ["60 Hz is our assumption: a file of MATPOWER has no frequency."]
+    european = gfmhil.network_from(FILES / "case9.m", {"2": "droop-3"}, frequency=50.0)
+    assert not european.ignored
+    assert european.voltages == pytest.approx(case.voltages, rel=1e-12)
+    assert nominal_frequency(load_scenario(european.save(tmp_path / "eu"))) == pytest.approx(50.0)
 
 
 #: taps and a shift on either side of the higher voltage, charging behind a tap, two generators at
