@@ -1,6 +1,9 @@
 """Firmware from pin to pin: every bit of the whole interrupt, on this machine and in QEMU."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,9 +43,20 @@ COUNTED = {
 }  # fmt: skip
 
 
-def test_after_a_law_that_refuses_its_last_row_the_next_one_begins_anew(tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
+    """A folder with all laws in a precision and style; made once."""
+
+    @cache
+    def made(real: str, style: str) -> Path:
+        return exported(tmp_path_factory.mktemp(f"{style}-{real}"), real, style, of=COUNTED)
+
+    return made
+
+
+def test_after_a_law_that_refuses_its_last_row_the_next_one_begins_anew(folder):
     """A change of law would ask the refusing one for its output."""
-    found = check(exported(tmp_path, "float32", "unrolled", of=COUNTED), "host", ticks=300)
+    found = check(folder("float32", "unrolled"), "host", ticks=300)
     assert [(c.rows, c.differ) for c in found] == [(300, 0)] * len(COUNTED)
 
 
@@ -56,9 +70,9 @@ def test_after_a_law_that_refuses_its_last_row_the_next_one_begins_anew(tmp_path
         ("aarch64", "float64", "unrolled", "-O2"), ("i386", "float32", "unrolled", "-O2"),
     ],
 )  # fmt: skip
-def test_the_whole_interrupt_has_the_kernels_bits(tmp_path, target, real, style, flags):
+def test_the_whole_interrupt_has_the_kernels_bits(folder, target, real, style, flags):
     """With an A/D at its ends, too little v_dc, faults of sensors, resets and changes of law."""
-    found = check(exported(tmp_path, real, style, of=COUNTED), target, flags)
+    found = check(folder(real, style), target, flags)
     assert [(c.name, c.rows, c.differ) for c in found] == [(n, CHECKED, 0) for n in COUNTED]
     if (target, style) == ("m4f", "unrolled"):
         most = {c.name: c.instructions[1] for c in found if c.instructions}
@@ -82,10 +96,10 @@ def test_the_rows_reach_what_they_are_for():
 
 @pytest.mark.parametrize("style", ["unrolled", "records"])
 @pytest.mark.parametrize("real", ["float32", "float64"])
-def test_the_code_compiles_without_a_warning(tmp_path, real, style):
-    folder = exported(tmp_path, real, style, of=COUNTED)
-    done = cc(folder, *STRICT, "-Wdouble-promotion", "-ffp-contract=off", "-fsyntax-only",
-              *sorted(p.name for p in folder.glob("*.c")))  # fmt: skip
+def test_the_code_compiles_without_a_warning(folder, real, style):
+    at = folder(real, style)
+    done = cc(at, *STRICT, "-Wdouble-promotion", "-ffp-contract=off", "-fsyntax-only",
+              *sorted(p.name for p in at.glob("*.c")))  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
 
 

@@ -41,7 +41,7 @@ from gfm_runtime.states import OK
 from gfm_runtime.switchover import settle_into
 
 from ..support.firmware import SOME, STRICT, T_S, cc, exported
-from ..support.laws import LAWS, slow_but
+from ..support.laws import LAWS, drive, slow_but
 
 PAGES = Path(__file__).parents[2] / "docs"
 #: one of each error map, and the most states
@@ -145,13 +145,12 @@ def test_states_stay_in_their_ranges_and_sums_in_their_words(name):
     m = module(name)
     law = instance(m).law
     rng = np.random.default_rng(1)
-    record, state, u = np.array([m.record])[0], np.zeros(1, state_dtype()), np.zeros(NU)
+    record, state, u = np.array([m.record]), np.zeros(1, state_dtype()), np.zeros(NU)
     spans = np.array([one.span for one in law.numbers[X:]]).reshape(-1, 2)
     for _ in range(40):
         ref, y = (np.array([rng.choice(n.span) for n in many]) for many in (REFS, YS))
         ref, y = twin_inputs(m, *(to_integers(v, n).tolist() for v, n in ((ref, REFS), (y, YS))))
-        for _ in range(300):
-            step(record, state[0], ref, y, u)
+        drive(record, state, ref, y, u, 300)
         x = state["x"][0, : law.n]
         assert (spans[:, 0] <= x).all() and (x <= spans[:, 1]).all()
     ends = [(one.low, one.high) for one in law.numbers]
@@ -209,10 +208,10 @@ def test_the_half_angle_against_libm():
 def test_what_is_seen_is_within_what_is_proven(name):
     m = module(name)
     assert m.fixed is not None
-    rows = beside(m, CHECKED, settles=True)
+    rows = beside(m, 12 * SHIPPED, settles=True)
     proven = deviations(m.fixed, m.record, FIXED)
     kind = rows[:, 0] // SEGMENT % 7
-    assert len(rows) > 9_900 and rows[:, 1].max() > 100
+    assert len(rows) > 0.98 * 12 * SHIPPED and rows[:, 1].max() > 100
     for i, found in enumerate(proven):
         if name == "hybrid-angle" and i == 1:  # its map jumps: no bound for all inputs
             assert math.isinf(found.bound)
@@ -324,15 +323,15 @@ class TestCompiled:
     def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return exported(tmp_path_factory.mktemp("fixed"), FIXED, "unrolled")
 
-    @pytest.mark.parametrize(("target", "flags"), [("host", "-O0"), ("m4f", None)])
-    def test_every_law_has_the_references_bits(self, folder, target, flags):
-        found = check(folder, target, flags, SHIPPED)
+    def test_every_law_has_the_references_bits(self, folder):
+        """On a Cortex-M4F; the host has those of some in the self-test and in many rows."""
+        found = check(folder, "m4f", ticks=SHIPPED)
         assert [c.name for c in found] == list(LAWS) and {c.rows for c in found} == {SHIPPED}
         assert sum(c.differ for c in found) == 0
         table = (PAGES / "tables" / "firmware_fixed.md").read_text(encoding="utf-8")
-        compiler = TARGETS[target].prefix + TARGETS[target].compiler
+        compiler = TARGETS["m4f"].prefix + TARGETS["m4f"].compiler
         version = cc(PAGES, "--version", compiler=compiler).stdout.splitlines()[0]
-        if target == "m4f" and version in table:
+        if version in table:
             for c in found:
                 assert c.instructions is not None
                 row = f"| {c.name} | {c.instructions[0]}…{c.instructions[1]} | {c.code} |"
