@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-import gfmhil
 from benchmarks.certificates import largest_sigma, random_network, widest
 from gfm_design.margins.admittance import line_impedance
 from gfm_design.margins.certificate import GridClass, certify
@@ -78,15 +77,6 @@ def test_no_certified_network_is_unstable(law) -> None:
             certified += 1
             assert largest_sigma(scenario) < 0.0
     assert certified > 5
-
-
-@pytest.mark.full  # 30 points of a scan
-def test_a_measured_converter_is_certified_as_its_model() -> None:
-    scan = gfmhil.scan("mimo-gfm", inner="virtual-stator", stop_hz=4500.0, points=30)
-    (R, L), grids = scan.line, GridClass(1.5, 100.0, (5.0, 15.0))
-    assert scan.certificate(grids).holds
-    with pytest.raises(gfmhil.UserError, match="must be one of the class"):
-        scan.certificate(GridClass(1.5, 0.5 / math.hypot(R, L), (5.0, 15.0)))
 
 
 def test_the_command_names_a_grid_that_makes_a_law_unstable(capsys) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import gfmhil
 from gfm_design.margins.admittance import line_impedance
+from gfm_design.margins.certificate import GridClass
 from gfm_hil.cli.main import main
 from gfm_hil.studies.scan import _bands
 from gfm_plant import Plant, load_converter
@@ -62,15 +63,20 @@ def test_stage_delay_sensors_and_frequency(more):
 
 
 @pytest.mark.full
-def test_one_percent_from_1_hz_to_1_khz():
-    found = gfmhil.scan("mimo-gfm", inner="virtual-stator")
+def test_one_percent_from_1_hz_on_and_a_certificate_as_of_the_model():
+    found = gfmhil.scan("mimo-gfm", inner="virtual-stator", stop_hz=4500.0, settle_s=1.0)
     assert len(found.frequency) == 40
-    assert found.frequency[[0, -1]] == pytest.approx([1.0, 1000.0], rel=0.01)
+    assert found.frequency[[0, -1]] == pytest.approx([1.0, 4500.0], rel=0.01)
     assert found.deviation is not None and found.deviation.max() < 0.01
-    assert found.nfp == pytest.approx(found.nfp_model, rel=0.01)
+    low = found.frequency < 1000.0
+    assert found.nfp[low] == pytest.approx(found.nfp_model[low], rel=0.01)
+    (R, L), grids = found.line, GridClass(1.5, 100.0, (5.0, 15.0))
+    assert found.certificate(grids).holds
+    with pytest.raises(gfmhil.UserError, match="must be one of the class"):
+        found.certificate(GridClass(1.5, 0.5 / math.hypot(R, L), (5.0, 15.0)))
 
 
-def switched(law, bridge, settle_s=2.0, **how):
+def switched(law, bridge, settle_s=0.5, **how):
     """A scan with a bridge of 10 kHz and 10,000 counts, one sample of delay and real sensors."""
     plant = {**REAL["plant"], "delay": {"samples": 1}, "dc_source": {"mode": "regulated"}}
     plant |= {"bridge": {"kind": "two-level", **bridge}, "grid": {}}
@@ -92,7 +98,7 @@ def test_a_switched_bridge_has_the_admittance_of_its_average():
 @pytest.mark.full
 def test_dead_time_changes_the_admittance_as_its_describing_function_says():
     """From 60 Hz on it is off by more, but without it all is wrong. VSG-2 has an unstable swing."""
-    how = {"start_hz": 5, "stop_hz": 40, "points": 5, "settle_s": 1.0}
+    how = {"start_hz": 5, "stop_hz": 40, "points": 5}
     with_it = switched("mimo-gfm", {"dead_time_s": 2e-6}, **how)
     without = switched("mimo-gfm", {}, **how)
     assert with_it.deviation is not None and with_it.deviation.max() < 0.17
@@ -121,8 +127,9 @@ def test_judges_other_grids_as_their_poles_do():
     law = gfmhil.Law.load("droop-5").with_inner("cascaded").with_gains("steep", D_p=0.3)
     plant = {"grid": {"scr": 2.0, "x_over_r": 10.0}}
     found = gfmhil.scan(
-        law, gfmhil.load_scenario("pref_step", plant=plant), start_hz=0.5, stop_hz=4500, points=60
-    )
+        law, gfmhil.load_scenario("pref_step", plant=plant),
+        start_hz=1.5, stop_hz=4500, points=50, settle_s=0.5,
+    )  # fmt: skip
     for scr in (57.0, 15.0, 3.0, 1.5):
         grid = Plant.model_validate({"grid": {"scr": scr, "x_over_r": 10.0}})
         poles = law.closed_loop(grid).poles()
@@ -157,7 +164,7 @@ def test_measures_a_controller_that_is_a_program(tmp_path):
 
 @pytest.mark.full
 def test_the_command_writes_a_folder(tmp_path, capsys):
-    options = ["--from", "100", "--to", "800", "--points", "4", "--settle", "1", "--grid", "5:10"]
+    options = ["--from", "100", "--to", "800", "--points", "4", "--grid", "5:10"]
     folder = tmp_path / "out"
     assert main(["scan", "droop-2", *options, "-o", str(folder), "--quiet"]) == 0
     said = capsys.readouterr().out
