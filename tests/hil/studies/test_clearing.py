@@ -151,21 +151,19 @@ def test_what_has_no_clearing_time_is_refused_in_one_line(options, said, capsys)
 
 def test_a_place_without_an_operating_point_is_told_and_the_rest_of_the_map_is_there():
     """A line of SCR 0.3 cannot carry 0.7 p.u."""
-    made = gfmhil.clearing_map("vsg-2", over={"scr": (0.3, 2.0)}, longest=0.1, after=0.3)
+    over = {"scr": (0.3, 2.0)}
+    made = gfmhil.clearing_map("vsg-2", over=over, workers=1, longest=0.1, after=0.3)
     assert [one.loss for one in made.found] == [NO_EQUILIBRIUM, ""]
     assert made.values("seconds").tolist() == [0.0, 0.1]
-    made = gfmhil.attraction_map(
-        "vsg-2", "deep_sag", over={"scr": (0.3, 2.0)}, after=0.3, within=90.0
-    )
+    made = gfmhil.attraction_map("vsg-2", "deep_sag", over=over, after=0.3, within=90.0)
     assert (made.found[0].below, made.found[0].runs) == (NO_EQUILIBRIUM, 0) and made.found[1].runs
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_map_has_the_clearing_times_of_its_places(workers):
+def test_a_map_has_the_clearing_times_of_its_places():
     over = {"scr": (2.0, 6.0), "events.0.V_g": (0.0, 0.1), "inner.I_max": (1.1, 1.5)}
     how = {"longest": 1.0, "after": 1.0, "within": 5e-3}
-    made = gfmhil.clearing_map("vsg-2", over=over, workers=workers, **how)
+    made = gfmhil.clearing_map("vsg-2", over=over, workers=2, **how)
     seconds = made.values("seconds")
     assert seconds.shape == (2, 2, 2) and len(made.to_pandas()) == 8
     law = gfmhil.Law.load("vsg-2").with_inner("virtual-stator", I_max=1.1)

@@ -838,9 +838,8 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
     asked = ["firmware", "dll", "vsg-2", "--inner", "virtual-stator", "--real", "float64"]
     assert main([*asked, "-o", built]) == 0
     (library,) = Path(built).glob("*.so")
-    found = gfmhil.conform(
-        "vsg-2", lab, lab.parent / "out", inner="virtual-stator", controller=f"dll:{library}"
-    )
+    more = {"inner": "virtual-stator", "controller": f"dll:{library}"}
+    found = gfmhil.conform("vsg-2", lab, lab.parent / "out", figures=False, **more)
     name = f"dll:{library.name}"
     assert found.laws == ["vsg-2", name]
     assert found.matrix[name, "lab/jump"] == found.matrix["vsg-2", "lab/jump"] == PASS
@@ -851,7 +850,6 @@ def test_a_law_as_a_dll_gets_the_verdicts_of_the_law(lab, capsys):
             assert other.value == pytest.approx(one.value, abs=1e-3) and other.text == one.text
     # which has settled for a while before the test
     (lab.parent / "map.toml").write_text("settle_s = 0.3\n")
-    more = {"inner": "virtual-stator", "controller": f"dll:{library}"}
     later = gfmhil.conform(against=lab / "jump.toml", ports=lab.parent / "map.toml", **more)
     (at_rest,), (settled,) = found.of(name, "lab/jump"), later.of(name, "lab/jump")
     for one, other in zip(at_rest.verdicts, settled.verdicts, strict=True):
