@@ -140,8 +140,8 @@ def test_judges_other_grids_as_their_poles_do():
 @pytest.mark.processes
 def test_measures_a_controller_that_is_a_program(tmp_path):
     command = f"{sys.executable} {OWN} {{endpoint}} {{scenario}}"
-    options = ["--controller", command, "--from", "100", "--to", "400", "--points", "3"]
-    options += ["--settle", "0.3", "-o", str(tmp_path / "out"), "--grid", "2:6", "--quiet"]
+    options = ["--controller", command, "--from", "200", "--to", "400", "--points", "2"]
+    options += ["--settle", "0.2", "-o", str(tmp_path / "out"), "--grid", "2:6", "--quiet"]
     weak = tmp_path / "weak.toml"
     weak.write_text(
         'title = "weak"\nduration = 1.0\nlaw = "droop-5"\n'
