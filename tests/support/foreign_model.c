@@ -1,11 +1,10 @@
 /* A real-code model that is not ours: a droop in SI units with ports of several types and widths, which
  * leaves out all that a model may leave out. At tick `at` it does `what`: 1 fails, 2 gives a frequency
- * that is no number, 3 never answers, 4 reads where nothing is, 5 blocks. */
+ * that is no number, 3 blocks. */
 #include "IEEE_Cigre_DLLInterface.h"
 
 #include <math.h>
 #include <stddef.h>
-#include <unistd.h>
 
 typedef struct {
     real32_T dispatch[2]; /* W, var */
@@ -95,13 +94,7 @@ int32_T Model_Outputs(IEEE_Cigre_DLLInterface_Instance *instance)
         }
         if (set->what == 2)
             out->f = NAN;
-        while (set->what == 3)
-            sleep(1);
-        if (set->what == 4) {
-            const volatile real64_T *volatile nowhere = NULL;
-            out->f = *nowhere;
-        }
-        if (set->what == 5)
+        if (set->what == 3)
             out->block = 1;
     }
     return IEEE_Cigre_DLLInterface_Return_OK;

@@ -191,17 +191,15 @@ def test_phases_of_a_library_written_for_windows(exported, tmp_path, capsys):
     [
         (1, "dll droop of others: Model_Outputs failed: the sun is down"),
         (2, "an output is not finite: omega_u"),
-        (3, "dll droop of others: has not answered for 2 s"),
-        (4, "the controller was ended by SIGSEGV"),
-        (5, "dll droop of others: blocks the bridge: block = 1"),
+        (3, "dll droop of others: blocks the bridge: block = 1"),
     ],
 )
 def test_a_model_that_fails_is_named_and_the_run_is_kept(foreign, tmp_path, what, reason):
+    """What hangs or crashes is named as a library's in C is, by the process around both."""
     wrong = f"parameters.at = {FAILS_AT}\nparameters.what = {what}\n"
     (tmp_path / "map.toml").write_text(MAP + wrong)
-    link = {"type": "shm", "peer_timeout_s": 4.0 if what == 3 else 20.0 - 18.0 * (what == 4)}
     options = ["--map", str(tmp_path / "map.toml")]
-    found = run(tmp_path, f"dll:{foreign}", *options, plant=RIG, link=link)
+    found = run(tmp_path, f"dll:{foreign}", *options, plant=RIG, link={"type": "shm"})
     assert (found.summary["status"], found.summary["reason"]) == ("safe", reason)
     assert found.summary["ticks"] >= 2 * FAILS_AT
     assert np.isfinite(found.columns["y_p"][: 2 * FAILS_AT]).all()

@@ -71,7 +71,11 @@ NO_GREETINGS = {
 }
 
 
-@pytest.mark.parametrize(("said", "why"), NO_GREETINGS.items(), ids=range(len(NO_GREETINGS)))
+#: all over one link, which does not read them, and one over the other
+OVER = [("shm", *one) for one in NO_GREETINGS.items()] + [("zmq", "{}", NO_GREETINGS["{}"])]
+
+
+@pytest.mark.parametrize(("ends", "said", "why"), OVER, indirect=["ends"], ids=range(len(OVER)))
 @pytest.mark.attack(
     "5.1",
     "a greeting that is deep JSON, cut off, of wrong types, with escapes, or t0 = 1e999 or 10⁴⁰",

@@ -65,10 +65,6 @@ def paper(folder: Path) -> list[str]:
     return [*command, "--jobs", "2"]
 
 
-def conform(folder: Path) -> list[str]:
-    return [*GFMHIL, "conform", "--law", "all", "--against", "miso", "--workers", "2"]
-
-
 def conform_c(folder: Path) -> list[str]:
     command = [*GFMHIL, "conform", "--controller", library(folder), "--inner", "virtual-stator"]
     return [*command, "--workers", "2"]
@@ -104,8 +100,8 @@ def marked(mark: str) -> set[int]:
     [
         (campaign, 5),  # with fork server, resource tracker and two workers
         (paper, 6),  # and the manager
-        (conform, 5),
-        pytest.param(conform_c, 9, marks=pytest.mark.apt),  # and guard, controller, its fork
+        # workers as a campaign's, each with guard, controller and its fork
+        pytest.param(conform_c, 9, marks=pytest.mark.apt),
         pytest.param(pil, 7, marks=pytest.mark.compilers),  # three guards, plant, controller, QEMU
         pytest.param(run_c, 6, marks=pytest.mark.apt),  # two guards, plant, controller, its fork
     ],
