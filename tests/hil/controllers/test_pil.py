@@ -44,6 +44,7 @@ SHM, PAUSE_S = {"type": "shm"}, 2.0
 STEP = {"tick": 100, "type": "reference", "P_ref": 0.8, "ramp_s": 0.01}
 GAINS = {"tick": 150, "type": "gains", "values": {"D_p": 0.02}}
 CHANGE = {"tick": 300, "type": "law", "law": "mimo-gfm"}
+LATER = {**CHANGE, "tick": 400}
 BACK = {"tick": 400, "type": "law", "law": "vsg-2"}
 COUNTS = {
     "counts": "rig-dead-time",
@@ -93,7 +94,7 @@ def assert_same(found: Run, near: Run) -> None:
     ("target", "content"),
     [
         ("m4f", {"events": [STEP, GAINS, CHANGE, BACK]}),
-        ("m7", {"inner": "cascaded", "events": [*DIP, CHANGE], "after_trip": "wait"}),
+        ("m7", {"inner": "cascaded", "events": [*DIP, LATER], "after_trip": "wait"}),
         ("host", {"law": "mimo-gfm-scheduled", "events": [STEP]}),
         ("m4f", {**COUNTS, "events": [STEP, CHANGE, BACK]}),
         ("m7", {**COUNTS, "events": DIP, "after_trip": "wait"}),
@@ -105,6 +106,8 @@ def test_a_run_has_the_bits_of_the_kernel(target, content, tmp_path, monkeypatch
     assert found.summary["controller"] == f"gfmhil on {target}"
     near = in_process(found, TARGETS[target].real, monkeypatch)
     assert_same(found, near)
+    changes = [e for e in content.get("events", ()) if e["type"] in ("law", "gains")]
+    assert np.count_nonzero(np.diff(found.columns["law"][:])) == len(changes)
     assert np.ptp(near.columns["true_p"][:]) > 0.005
     counted = found.summary.get("instructions")
     if target == "host":
@@ -232,6 +235,7 @@ def test_a_firmware_that_brings_the_code_of_another_law_is_refused(
     command = ["run", "scenario.toml", "--controller", "pil:host:.", "--quiet", "--no-figures"]
     assert main([*command, "--out", "run"]) == ends
     said = capsys.readouterr().err.strip()
+    assert Path("run", "signals.npz").exists() == (not ends)
     if ends:
         assert re.fullmatch(
             r"gfmhil: controller pil: gfmhil on host: its code is of another law: "
