@@ -164,7 +164,7 @@ def test_a_model_of_others_goes_on_between_two_of_its_steps(foreign, tmp_path):
     """Its step is two ticks, and the snapshot lies within one; ``at`` counts its steps."""
     from .test_controllers import MAP
 
-    (tmp_path / "map.toml").write_text(MAP + "parameters.at = 300\nparameters.what = 5\n")
+    (tmp_path / "map.toml").write_text(MAP + "parameters.at = 300\nparameters.what = 3\n")
     given = {"title": "cut", "duration": 0.1, "law": "vsg-2", "plant": RIG,
              "link": {"type": "shm", "peer_timeout_s": 20.0}}  # fmt: skip
     how = {"controller": f"dll:{foreign}", "ports": tmp_path / "map.toml", "figures": False}
