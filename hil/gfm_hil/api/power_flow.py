@@ -80,8 +80,11 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
         raise UserError(
             f"frequency = {frequency:g}: is for a file of MATPOWER, which has none; {of} has one"
         )
-    if suffix in (".m", ".raw"):
-        tables = MpcCase(Path(case), frequency) if suffix == ".m" else RawCase(Path(case))
+    readers: dict[str, Callable[[Path], CaseTables]] = {
+        ".raw": RawCase, ".m": partial(MpcCase, frequency=frequency)
+    }  # fmt: skip
+    if (reader := readers.get(suffix)) is not None:
+        tables = reader(Path(case))
         case, ignored = tables.net(), tables.ignored
     elif is_named:
         case = _load_pandapower(str(case))

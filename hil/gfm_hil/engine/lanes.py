@@ -88,9 +88,8 @@ fixed_dtype = _record(
 moving_dtype = _record(
     ("tick", "i8"), ("x", "f8", 8), ("i_reg", "f8"), ("sensed", "f8", 4),
     ("u", "f8", _AGES, NU), ("E_q", "f8"), ("u_now", "f8", NU), ("E", "f8", 2), ("E_most", "f8"),
-    ("drawn", "f8", 3), ("seen", "f8", 3, 3),
     ("noise", "f8", 4), ("z", "f8", 2, _MODES), ("forced", "f8", 2, 2, _MODES),
-    ("w", "f8", 2, _MODES), ("unit", "f8", 2, 2), ("halfway", "f8", 2, 1), ("turn", "f8", 2, 1),
+    ("w", "f8", 2, _MODES), ("unit", "f8", 2, 2),
     ("y", "f8", NY), ("seen_y", "f8", NY), ("x_law", "f8", _ORDER), ("x_next", "f8", _ORDER),
     ("raw", "f8", NU), ("now", "f8", NU), ("off", "f8", NU), ("u_law", "f8", NU),
     ("trend", "f8", NU), ("kept", "f8", len(MOVING)),

@@ -168,8 +168,8 @@ def make_benches(
     controller of its own and one plant in common; as the controller of one of them sees it, the
     bench of that one. Arguments and errors as of ``make_bench``.
     """
-    plant = plant or plant_of(scenario)
     benches = unstarted_benches(scenario, real, plant)
+    plant = benches[0].plant
     laws = [bench.controller.active_law for bench in benches]
     refs = [np.asarray(bench.scenario.references.vector()) for bench in benches]
     try:
