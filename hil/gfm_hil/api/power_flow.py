@@ -1,14 +1,16 @@
 """Power-flow cases by pandapower: solved, and read as it hands them to PYPOWER."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gfm_hil.api.case_tables import CaseTables
 from gfm_hil.api.mpc import MpcCase
 from gfm_hil.api.raw import RawCase
 from gfm_hil.core.errors import UserError, need

@@ -18,27 +18,15 @@ from numpy.typing import NDArray
 from gfm_hil.engine.inproc import Steps, Stretch
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.vectors import WIDTH as LANES
-from gfm_hil.engine.vectors import (
-    bits,
-    everywhere,
-    floor,
-    limited,
-    magnitude,
-    plus,
-    put,
-    sqrt,
-    times,
-    vector,
-    where,
-)
+from gfm_hil.engine.vectors import bits, everywhere, plus, put, times, vector, where
 from gfm_hil.realtime.atomics import row_at
 from gfm_hil.recording.parts import MemoryPart
-from gfm_plant.model import DELTA, V_DC
+from gfm_plant.model import DELTA, V_DC, terminal
 from gfm_plant.noise import normal_pair, random_bits
 from gfm_plant.records import MAX_DELAY, N_TRIPS
 from gfm_runtime.compiled import compiled, inlined
 from gfm_runtime.error_maps import LINEAR
-from gfm_runtime.inner.stage import NEGLIGIBLE
+from gfm_runtime.inner.stage import NEGLIGIBLE, limited
 from gfm_runtime.signals import NU, NY
 from gfm_runtime.states import RUNNING
 
@@ -112,20 +100,13 @@ def _put_z(numbers, k, z):
 def _quantised(x, low, high, lsb):
     """As `gfm_plant.quantise.quantise`."""
     x = limited(x, low, high)
-    return where(lsb > 0.0, low + lsb * floor((x - low) / lsb + 0.5), x)
+    return where(lsb > 0.0, low + lsb * np.floor((x - low) / lsb + 0.5), x)
 
 
 @inlined
 def _faded(x):
     """As `gfm_runtime.inner.faded`."""
-    return where(magnitude(x) < NEGLIGIBLE, 0.0, x)
-
-
-@inlined
-def _terminal(v, i_o):
-    """As `gfm_plant.model.terminal`."""
-    p, q = v[0] * i_o[0] + v[1] * i_o[1], v[1] * i_o[0] - v[0] * i_o[1]
-    return p, q, sqrt(v[0] * v[0] + v[1] * v[1])
+    return where(abs(x) < NEGLIGIBLE, 0.0, x)
 
 
 @inlined
@@ -184,7 +165,7 @@ def _control(c, s, order):
     calm, decay, follow = everywhere(True), vector(c.decay), vector(c.follow)
     for i in range(NU):
         now, trend = vector(s.now[i]), vector(s.trend[i])
-        calm = calm & (magnitude(now) < math.inf)
+        calm = calm & (abs(now) < math.inf)
         put(s.off[i], _faded(vector(s.off[i]) * decay))
         change = now - vector(s.u_law[i]) - trend
         put(s.trend[i], _faded(trend + follow * change))
@@ -216,7 +197,7 @@ def _look(c, s, E, unit):
     """As of `gfm_plant.period`: what the bridge draws; p, q and V."""
     i, v, i_o, scale = _z(s.w, 0), _z(s.w, 1), _z(s.w, 2), vector(c.current)
     turned = times((unit[0], -unit[1]), (i[0] * scale, i[1] * scale))
-    return E[0] * turned[0] + E[1] * turned[1], _terminal(v, (i_o[0] * scale, i_o[1] * scale))
+    return E[0] * turned[0] + E[1] * turned[1], terminal(v[0], v[1], i_o[0] * scale, i_o[1] * scale)
 
 
 @inlined
@@ -241,7 +222,7 @@ def _drive(c, s, part, E, h):
         1.0 - x2 * (1 / 2 - x2 * (1 / 24 - x2 * (1 / 720 - x2 * (1 / 40320)))),
         x * (1.0 - x2 * (1 / 6 - x2 * (1 / 120 - x2 * (1 / 5040 - x2 * (1 / 362880))))),
     )
-    calm = magnitude(x) < _SERIES
+    calm = abs(x) < _SERIES
     driven, held = times(E, _z(s.unit, 0)), times(_z(c.E_grid, 0), _z(s.unit, 1))
     for m in range(_MODES):
         rate, decay = _z(c.rate, m), _z(c.decay_z[part], m)
@@ -315,7 +296,7 @@ def _dc_link(c, s, part, half, drawn):
     put(s.x[V_DC], v)
     put(s.i_reg, i)
     _low_pass(c, s, part, 0, v_0, v_middle, v)
-    return calm & (magnitude(v_5) <= _ROUGH) & _asks(c, v, i, i_u)
+    return calm & (abs(v_5) <= _ROUGH) & _asks(c, v, i, i_u)
 
 
 @inlined
@@ -354,10 +335,10 @@ def _advance(c, s, parts, ages):
         turned = times(scaled, (unit[0], -unit[1]))
         put(s.x[2 * i], turned[0])
         put(s.x[2 * i + 1], turned[1])
-        calm = calm & (magnitude(w[0]) + magnitude(w[1]) < _FAR)
+        calm = calm & (abs(w[0]) + abs(w[1]) < _FAR)
     v_dc, delta, i_reg = vector(s.x[V_DC]), vector(s.x[DELTA]), vector(s.i_reg)
-    calm = calm & (v_dc > 0.0) & (v_dc < _FAR) & (magnitude(delta) < _FAR * _FAR)
-    return calm & (magnitude(i_reg) < _FAR)
+    calm = calm & (v_dc > 0.0) & (v_dc < _FAR) & (abs(delta) < _FAR * _FAR)
+    return calm & (abs(i_reg) < _FAR)
 
 
 @inlined
@@ -371,7 +352,7 @@ def _is_within(c, trip, quantity, sign):
 def _protect(c, s):
     """As of `gfm_plant.protection`: which lanes have no quantity beyond its threshold."""
     i_d, i_q, v_d, v_q = vector(s.x[0]), vector(s.x[1]), vector(s.x[2]), vector(s.x[3])
-    i, v = sqrt(i_d * i_d + i_q * i_q), sqrt(v_d * v_d + v_q * v_q)
+    i, v = np.sqrt(i_d * i_d + i_q * i_q), np.sqrt(v_d * v_d + v_q * v_q)
     v_dc, omega = vector(s.x[V_DC]), vector(s.u_now[1])
     return (
         _is_within(c, 0, i, 1.0) & _is_within(c, 1, v, 1.0) & _is_within(c, 2, v, -1.0)
@@ -384,11 +365,11 @@ def _protect(c, s):
 def _keep(n, s, used, columns, k):
     """Record what moves of the used lanes, as `gfm_plant.emulator.plant_truth`."""
     i_d, i_q, v_d, v_q = vector(s.x[0]), vector(s.x[1]), vector(s.x[2]), vector(s.x[3])
-    p, _, V = _terminal((v_d, v_q), (vector(s.x[4]), vector(s.x[5])))
+    p, _, V = terminal(v_d, v_q, vector(s.x[4]), vector(s.x[5]))
     put(s.kept[0], p)
     put(s.kept[1], vector(s.u_now[1]))
     put(s.kept[2], V)
-    put(s.kept[3], sqrt(i_d * i_d + i_q * i_q))
+    put(s.kept[3], np.sqrt(i_d * i_d + i_q * i_q))
     put(s.kept[4], vector(s.x[DELTA]))
     for j in range(n):
         for i in range(len(columns) if used[j] else 0):

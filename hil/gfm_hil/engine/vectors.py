@@ -2,14 +2,16 @@
 
 LLVM makes such instructions of a loop over eight numbers by itself, but each loop begins with a
 look whether its arrays overlap, and leaves its numbers in memory. A vector is a value as a number
-is: ``+``, ``-``, ``*``, ``/``, comparisons, and ``&``, ``|`` and ``~`` of these act on all eight,
-with the bits that each would have alone. A number beside a vector counts eight times.
+is: ``+``, ``-``, ``*``, ``/``, ``abs``, ``max``, ``min``, ``np.sqrt``, ``np.floor``, comparisons,
+and ``&``, ``|`` and ``~`` of these act on all eight, with the bits that each would have alone, so
+that functions without a branch take vectors too. A number beside a vector counts eight times.
 """
 
 import operator
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core.cgutils import get_or_insert_function
@@ -51,6 +53,9 @@ def _repeat(context: Any, builder: Any, kind: Any, vector: Vector, number: Any) 
     )
 
 
+_OF_ONE = (operator.neg, operator.invert, abs, np.sqrt, np.floor)
+
+
 def _operator(symbol: Any, of: Vector, result: Vector, make: Callable[..., Any]) -> None:
     """Define an operator of vectors of a kind, and of such a vector and a number."""
 
@@ -64,12 +69,16 @@ def _operator(symbol: Any, of: Vector, result: Vector, make: Callable[..., Any])
             return None
 
     infer_global(symbol)(Template)
-    operands = 1 if symbol in (operator.neg, operator.invert) else 2
+    operands = 1 if symbol in _OF_ONE else 2
     lower_builtin(symbol, *[of] * operands)(lambda _, builder, kind, args: make(builder, *args))
 
 
 def _compare(how: str) -> Callable[..., Any]:
     return lambda builder, a, b: builder.fcmp_ordered(how, a, b)
+
+
+def _chosen(how: str) -> Callable[..., Any]:
+    return lambda builder, a, b: builder.select(builder.fcmp_ordered(how, b, a), b, a)
 
 
 for _symbol, _made in (
@@ -82,6 +91,8 @@ for _symbol, _how in (
     (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="),
 ):  # fmt: skip
     _operator(_symbol, _FLOATS, _TRUTHS, _compare(_how))
+for _symbol, _how in ((max, ">"), (min, "<")):  # the second, if it is; a NaN that is first stays
+    _operator(_symbol, _FLOATS, _FLOATS, _chosen(_how))
 _operator(operator.ne, _FLOATS, _TRUTHS, lambda builder, a, b: builder.fcmp_unordered("!=", a, b))
 _operator(operator.eq, _INTEGERS, _TRUTHS, lambda builder, a, b: builder.icmp_signed("==", a, b))
 _operator(operator.and_, _TRUTHS, _TRUTHS, ir.IRBuilder.and_)
@@ -89,22 +100,18 @@ _operator(operator.or_, _TRUTHS, _TRUTHS, ir.IRBuilder.or_)
 _operator(operator.invert, _TRUTHS, _TRUTHS, lambda builder, a: builder.not_(a))
 
 
-def _of_llvm(name: str) -> Any:
-    """A function of LLVM for vectors of float64."""
+def _of_llvm(name: str) -> Callable[..., Any]:
+    def make(builder: Any, x: Any) -> Any:
+        kind = ir.FunctionType(_FLOATS.llvm, [_FLOATS.llvm])
+        function = get_or_insert_function(builder.module, kind, f"llvm.{name}.v{WIDTH}f64")
+        return builder.call(function, [x])
 
-    @intrinsic
-    def function(typingctx, x):
-        def make(context: Any, builder: Any, kind: Any, arguments: Any) -> Any:
-            whole = f"llvm.{name}.v{WIDTH}f64"
-            made = ir.FunctionType(_FLOATS.llvm, [_FLOATS.llvm])
-            return builder.call(get_or_insert_function(builder.module, made, whole), arguments)
-
-        return _FLOATS(_FLOATS), make
-
-    return function
+    return make
 
 
-sqrt, magnitude, floor = map(_of_llvm, ("sqrt", "fabs", "floor"))
+_operator(np.sqrt, _FLOATS, _FLOATS, _of_llvm("sqrt"))
+_operator(np.floor, _FLOATS, _FLOATS, _of_llvm("floor"))
+_operator(abs, _FLOATS, _FLOATS, _of_llvm("fabs"))
 
 
 @intrinsic
@@ -163,13 +170,6 @@ def bits(typingctx, truths):
         return builder.zext(builder.bitcast(arguments[0], ir.IntType(WIDTH)), ir.IntType(64))
 
     return types.int64(_TRUTHS), make
-
-
-@inlined
-def limited(x, low, high):
-    """As ``min(max(x, low), high)`` of numbers: a NaN stays."""
-    x = where(low > x, low, x)
-    return where(high < x, high, x)
 
 
 @inlined

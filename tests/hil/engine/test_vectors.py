@@ -6,16 +6,16 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 from hypothesis.strategies import floats
 
-from gfm_hil.engine import vectors as v
 from gfm_hil.engine.vectors import WIDTH, bits, everywhere, put, times, vector, where
+from gfm_runtime.inner.stage import limited
 
 
 @numba.njit(error_model="numpy")
 def _compute(a, b, ages, made):
     x, y = vector(a), vector(b)
     put(made[0], x + y * 2.0 - 1 / x)
-    put(made[1], v.sqrt(v.magnitude(x)) + v.floor(-y))
-    put(made[2], v.limited(x, y, 3.0))
+    put(made[1], np.sqrt(abs(x)) + np.floor(-y))
+    put(made[2], limited(x, y, 3.0))
     put(made[3], where((x > y) & ~(y >= 0.0) | (x != x), 0.0, y))
     put(made[4], where(vector(ages) == 2, x, 5.0))
     put(made[5], times((x, y), (y, x))[1])
