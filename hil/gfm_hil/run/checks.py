@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.columns import symbol_of, unit_of
-from gfm_hil.run.modes import fast_mode, swing
+from gfm_hil.run.modes import Oscillations
 
 Vector = NDArray[np.float64]
 
@@ -141,13 +141,13 @@ def envelope(w: Window, low: Vector, high: Vector, longest: float = 0.0) -> Viol
     return Violation(text, float(w.t[worst]), w.t, low, high)
 
 
-def damped(w: Window, min_ratio: float, T_s: float, f_n: float) -> Violation | None:
-    """The swing after the step has at least this damping ratio, and no faster oscillation grows.
+def damped(w: Window, min_ratio: float, found: Oscillations) -> Violation | None:
+    """The swing ``found`` in w has at least this damping ratio, and no faster oscillation grows.
 
     The line's own DC offset, an oscillation at f_n, decays with the line's R/L whatever the law
     does; so a faster oscillation need only not grow.
     """
-    slow, fast = swing(w.x, T_s, f_n), fast_mode(w.x, T_s, f_n)
+    slow, fast = found
     if slow is not None and slow.damping < min_ratio:
         ratio, f = slow.damping, slow.hz
     elif fast is not None and fast.damping < 0.0:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gfm_hil.recording.columns import PIECE, ColumnLike, Columns, pieces
 from gfm_hil.run.cycles import Vector, cycle_means, cycle_ticks, whole_ticks
-from gfm_hil.run.modes import LONGEST, fast_mode, swing
+from gfm_hil.run.modes import LONGEST, oscillations
 
 ROCOF_WINDOW = 0.1  # s; df/dt is the slope over this window
 METRICS = (
@@ -123,7 +123,7 @@ def _settling(
 def _oscillations(p: ColumnLike, first: int, stop: int, T_s: float, f_n: float) -> dict[str, float]:
     """Damping and frequency of the swing and of the fast mode of p, of those that there are."""
     x = p[first : max(first, min(stop, first + round(LONGEST / T_s)))]
-    slow, fast = swing(x, T_s, f_n), fast_mode(x, T_s, f_n)
+    slow, fast = oscillations(x, T_s, f_n)
     found: dict[str, float] = {}
     if slow is not None:
         found |= {"damping_ratio": slow.damping, "oscillation_hz": slow.hz}

@@ -105,9 +105,15 @@ def free_from(acts: Sequence[Acting], start: int, stop: int) -> int:
     return max(start, held if held < stop else min(moved, stop))
 
 
-def swing(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
-    """The strongest oscillation below f_n/2 in the first 2 s of x; None without one, or if x is not
-    finite there.
+class Oscillations(NamedTuple):
+    """The strongest oscillations in a recording; None where there is none."""
+
+    swing: Oscillation | None  # below f_n/2
+    fast: Oscillation | None  # above
+
+
+def oscillations(x: Vector, T_s: float, f_n: float) -> Oscillations:
+    """The strongest oscillations in the first 2 s of x; none if x is not finite there.
 
     Args:
         x: p.u., shape (ticks,).
@@ -116,24 +122,25 @@ def swing(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
     """
     window = x[: round(LONGEST / T_s)]
     if not np.all(np.abs(window) < _MOST):
-        return None
-    slow = _means(window, cycle_ticks(T_s, f_n))
+        return Oscillations(None, None)
+    width = cycle_ticks(T_s, f_n)
+    slow = _means(window, width)
+    rest = _beside(window, slow, width)
+    rest = _beside(rest, _means(rest, width), width)  # a swing leaves 1e-4 of itself
+    return Oscillations(_swing(slow, T_s, f_n), _fast_mode(rest, T_s, f_n))
+
+
+def _swing(slow: Vector, T_s: float, f_n: float) -> Oscillation | None:
+    """The strongest oscillation below f_n/2, from the means of each cycle."""
     stride = max(1, len(slow) // _SAMPLES)
     thin = _thin_out(slow, stride)
     longest = _HALF / max(len(thin) * stride * T_s, T_s)
     return _strongest(thin, stride * T_s, (longest, 0.5 * f_n), _LEAST, 0.0)
 
 
-def fast_mode(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
-    """The strongest oscillation above f_n/2 in the first 2 s of x; None without one.
-
-    It is sought around the largest line of the spectrum. Args as for ``swing``.
-    """
-    window = x[: round(LONGEST / T_s)]
-    if not np.all(np.abs(window) < _MOST):
-        return None
-    width = cycle_ticks(T_s, f_n)
-    rest = _without_means(_without_means(window, width), width)  # a swing leaves 1e-4 of itself
+def _fast_mode(rest: Vector, T_s: float, f_n: float) -> Oscillation | None:
+    """The strongest oscillation above f_n/2, from what the means of each cycle leave; it is sought
+    around the largest line of the spectrum."""
     if len(rest) < _FEW:
         return None
     length = fast_length(len(rest))
@@ -149,9 +156,8 @@ def fast_mode(x: Vector, T_s: float, f_n: float) -> Oscillation | None:
     return _strongest(thin[:_FAST_SAMPLES], stride * T_s, band, _LEAST_FAST, _SHARE)
 
 
-def _without_means(x: Vector, width: float) -> Vector:
+def _beside(x: Vector, slow: Vector, width: float) -> Vector:
     """What the mean of the cycle around each tick leaves; empty without a whole cycle."""
-    slow = _means(x, width)
     middle = (whole_ticks(width) - 1) // 2
     return x[middle : middle + len(slow)] - slow
 

@@ -8,7 +8,7 @@ import numpy as np
 from gfm_hil.core.errors import UserError
 from gfm_hil.recording.run import nominal_frequency
 from gfm_hil.run import checks
-from gfm_hil.run.modes import acting, free_from
+from gfm_hil.run.modes import acting, free_from, oscillations
 from gfm_hil.testing.steps import Steps, beside
 
 _NEAR = 0.02  # s that a figure shows on each side of a moment
@@ -70,8 +70,8 @@ class Experiment(Steps):
         if free >= len(w.x):
             raise UserError("assert_damped: a ramp is not over at the end of the run")
         w = replace(w, t=w.t[free:], x=w.x[free:])
-        found = checks.damped(w, min_ratio, scenario.T_s, nominal_frequency(scenario))
-        self._judge(w.name, "damped", found)
+        modes = oscillations(w.x, scenario.T_s, nominal_frequency(scenario))
+        self._judge(w.name, "damped", checks.damped(w, min_ratio, modes))
 
     def assert_bump_below(self, limit: float) -> None:
         """No change of law moved an input by more than ``limit`` p.u. in its tick."""

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.run.checks import Window, damped, envelope, overshoot, read_envelope, settles
+from gfm_hil.run.checks import (
+    Violation,
+    Window,
+    damped,
+    envelope,
+    overshoot,
+    read_envelope,
+    settles,
+)
+from gfm_hil.run.modes import oscillations
 from gfm_hil.testing import Experiment
 
 pytestmark = pytest.mark.processes
@@ -281,17 +290,21 @@ def test_envelope_of_a_file_ends_with_its_lines(tmp_path):
             read_envelope(file, T)
 
 
+def judged(x: np.ndarray, min_ratio: float) -> Violation | None:
+    return damped(window(x), min_ratio, oscillations(x, 1e-3, 50.0))
+
+
 def test_damped_reads_the_ratio():
     x = 1 + np.exp(-0.2 * 20 * T) * np.cos(20 * np.sqrt(1 - 0.2**2) * T)
-    assert damped(window(x), 0.19, 1e-3, 50.0) is None
-    found = damped(window(x), 0.21, 1e-3, 50.0)
+    assert judged(x, 0.19) is None
+    found = judged(x, 0.21)
     assert found is not None
     assert "has 0.2" in found.text
-    assert damped(window(np.ones(1001)), 0.9, 1e-3, 50.0) is None
+    assert judged(np.ones(1001), 0.9) is None
     offset = np.exp(-5 * T) * np.cos(100 * np.pi * T)
-    assert damped(window(x + offset), 0.19, 1e-3, 50.0) is None  # of the line, which decays
+    assert judged(x + offset, 0.19) is None  # of the line, which decays
     grows = 0.01 * np.exp(2 * T) * np.cos(100 * np.pi * T)
-    found = damped(window(x + grows), 0.19, 1e-3, 50.0)
+    found = judged(x + grows, 0.19)
     assert found is not None and "at 50 Hz" in found.text and found.text.endswith("it grows.")
 
 

@@ -14,7 +14,7 @@ from gfm_hil.api.law import as_law
 from gfm_hil.core.errors import UserError
 from gfm_hil.run.cycles import cycle_means, fast_length
 from gfm_hil.run.metrics import METRICS, event_metrics
-from gfm_hil.run.modes import _TAPS, Acting, _filter, acting, fast_mode, free_from, swing
+from gfm_hil.run.modes import _TAPS, Acting, _filter, acting, free_from, oscillations
 from gfm_hil.scenario import check_scenario
 
 T_s, F_N = 1e-3, 50.0
@@ -123,14 +123,14 @@ def test_an_unstable_oscillation_has_negative_damping():
 @given(st.floats(0.02, 0.8), st.floats(0.5, 20.0), st.floats(3e-2, 1.0))
 def test_the_dominant_oscillation_is_found_whatever_it_is(zeta, f, size):
     x = size * (second_order(zeta, f) - 1.0)
-    found = swing(0.5 + x, T_s, F_N)
+    found = oscillations(0.5 + x, T_s, F_N).swing
     assert found.damping == pytest.approx(zeta, abs=0.01)
     assert found.hz == pytest.approx(f, rel=0.01)
 
 
 def test_of_two_oscillations_the_stronger_is_named():
     x = 0.1 * np.exp(-t) * np.sin(2 * np.pi * 2 * t) + 0.02 * np.exp(-t) * np.sin(2 * np.pi * 9 * t)
-    assert swing(0.5 + x, T_s, F_N).hz == pytest.approx(2.0, rel=0.02)
+    assert oscillations(0.5 + x, T_s, F_N).swing.hz == pytest.approx(2.0, rel=0.02)
 
 
 @pytest.mark.parametrize("length", [1, 2, 19])
@@ -200,7 +200,7 @@ def test_a_fast_mode_is_found_beside_a_larger_swing_without_aliasing(hertz, sigm
     fast = size * np.exp(sigma * now) * np.cos(2 * np.pi * hertz * now)
     slow = 0.2 * np.exp(-3 * now) * np.cos(2 * np.pi * 3 * now)
     p = 0.7 + slow + fast
-    found, swings = fast_mode(p, 1e-4, F_N), swing(p, 1e-4, F_N)
+    swings, found = oscillations(p, 1e-4, F_N)
     assert found.hz == pytest.approx(hertz, rel=1e-4)
     assert found.damping == pytest.approx(-sigma / math.hypot(sigma, 2 * np.pi * hertz), abs=1e-5)
     assert swings.hz == pytest.approx(3.0, rel=1e-3)
@@ -225,8 +225,8 @@ def test_the_low_pass_is_that_of_scipy(stride):
 def test_the_offset_of_the_line_is_no_swing():
     """A DC offset of the line shows in p at 50 Hz, dying with the line's R/L."""
     p = 0.5 + 0.2 * np.exp(-30 * t) * np.cos(2 * np.pi * 50 * t)
-    assert swing(p, T_s, F_N) is None
-    found = fast_mode(p, T_s, F_N)
+    swings, found = oscillations(p, T_s, F_N)
+    assert swings is None
     assert (found.hz, found.damping) == (
         pytest.approx(50.0, rel=1e-6), pytest.approx(30 / math.hypot(30, 100 * np.pi), rel=1e-6),
     )  # fmt: skip
@@ -235,8 +235,7 @@ def test_the_offset_of_the_line_is_no_swing():
 @pytest.mark.parametrize("last", [[math.inf], [math.nan], [-math.inf, 0.0], [1e200, 1e300]])
 def test_what_is_not_finite_has_no_modes(last):
     p = np.concatenate([0.5 + 0.1 * np.sin(2 * np.pi * 3 * t[:1500]), last])
-    assert swing(p, T_s, F_N) is None
-    assert fast_mode(p, T_s, F_N) is None
+    assert oscillations(p, T_s, F_N) == (None, None)
 
 
 @pytest.mark.parametrize("first", [(1.0,), (-7.7, -60.3, 37495.7, -0.39, -8.55), (1e-3, -40, 1e6)])
@@ -245,7 +244,7 @@ def test_a_pole_that_grows_beyond_all_numbers_neither_hangs_nor_fails(first):
     for length in range(40, 240, 7):
         x = np.zeros(length)
         x[-len(first) :] = first
-        found = fast_mode(x, T_s, F_N), swing(x, T_s, F_N)
+        found = oscillations(x, T_s, F_N)
         assert all(one is None or math.isfinite(one.damping) for one in found)
 
 

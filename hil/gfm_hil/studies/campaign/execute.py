@@ -30,9 +30,9 @@ from gfm_hil.studies.campaign.worker import (
 )
 from gfm_hil.studies.workers import SILENT, Pool, Watch, WorkerLost, pool_of, run_tasks
 
-#: runs a task, at most: a second, so that little is lost and little is waited for; fewer leave
-#: lanes empty for longer, at the end of each task
-CHUNK = 64
+#: runs a task, at most: about a second, so that little is lost and little is waited for; fewer
+#: leave lanes empty for longer, at the end of each task
+CHUNK = 128
 _FILE = "runs.jsonl"
 _PATIENCE_S = 1.0  # how long the checks may go on without a word
 

@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import Field
 
 from gfm_hil.run import checks
-from gfm_hil.run.modes import Oscillation
+from gfm_hil.run.modes import Oscillation, Oscillations
 from gfm_hil.studies.conformity.criteria.base import Moment
 from gfm_hil.studies.conformity.criteria.damped import Damped
 from gfm_hil.studies.conformity.verdict import Verdict
@@ -24,10 +24,11 @@ class AdequatelyDamped(Damped):
     ratio: float = Field(0.05, description="least damping ratio from 0.6 Hz on")
     halving_s: float = Field(5.0, gt=0, description="longest halving time below, s")
 
-    def judge_swing(self, m: Moment, raw: checks.Window, mode: Oscillation | None) -> Verdict:
+    def judge_modes(self, m: Moment, raw: checks.Window, modes: Oscillations) -> Verdict:
         """The value is the halving time, s, or the damping ratio, or None without a swing."""
+        mode = modes.swing
         if mode is None or mode.hz >= _FAST:
-            return super().judge_swing(m, raw, mode)
+            return super().judge_modes(m, raw, modes)
         halves = halving_s(mode)
         text = f"The swing of p at {mode.hz:.3g} Hz " + (
             f"halves in {halves:.3g} s." if halves < math.inf else "does not decay."

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from gfm_hil.run import checks
 from gfm_hil.run.cycles import whole_ticks
-from gfm_hil.run.modes import Oscillation, acting, free_from, swing
+from gfm_hil.run.modes import Oscillations, acting, free_from, oscillations
 from gfm_hil.studies.conformity.criteria.base import Moment, Windowed
 from gfm_hil.studies.conformity.verdict import Verdict
 
@@ -31,11 +31,11 @@ class Damped(Windowed):
             x=m.raw("p")[m.first : m.last],
             t=m.T_s * np.arange(m.first, m.last, dtype=np.float64),
         )
-        return self.judge_swing(m, raw, swing(raw.x, m.T_s, m.f_n))
+        return self.judge_modes(m, raw, oscillations(raw.x, m.T_s, m.f_n))
 
-    def judge_swing(self, m: Moment, raw: checks.Window, mode: Oscillation | None) -> Verdict:
-        """The verdict on p of every tick from where no event acts any more, and its swing."""
-        found = checks.damped(raw, self.ratio, m.T_s, m.f_n)
+    def judge_modes(self, m: Moment, raw: checks.Window, modes: Oscillations) -> Verdict:
+        """The verdict on p of every tick from where no event acts any more, and its modes."""
+        found, mode = checks.damped(raw, self.ratio, modes), modes.swing
         value = None if mode is None else mode.damping
         if found is not None:
             text = found.text
