@@ -48,6 +48,8 @@ Row = dict[int, float]
 
 LARGEST = 6.0
 """Of the norm of A times the length of an interval; a longer one is cut."""
+MOST_STEPS = 1000
+"""Into which a tick is cut, at most; a circuit that needs more is refused."""
 DENSE = 200
 """States up to which a norm is taken of the whole matrix."""
 
@@ -525,12 +527,29 @@ def pack_sparse(net: Any, wiring: Wiring, looked_at: Mapping[int, str]) -> float
             circuit, hanging = wiring.circuit(wiring.blocked, contact, axis)
             one = of_circuit(wiring, circuit, frozenset(looked_at.values()))
             _write(net, 2 * j + axis, one)
+            if one.norm * float(net["T_s"]) > LARGEST * MOST_STEPS:
+                raise ValueError(_stiffest(circuit, wiring.omega_b))
             if wiring.sinks:
                 fastest = max(fastest, one.fastest)
             for place, node in looked_at.items():
                 there = wiring.hangs_on(node, circuit, hanging)
                 net["node_column"][2 * j + axis, place] = one.node.get(there, -1)
     return fastest
+
+
+def _stiffest(circuit: Circuit, omega_b: float) -> str:
+    """Which part of a circuit makes it stiff, and what to do."""
+    charged, by_L = {bank.node for bank in circuit.capacitors}, defaultdict[str, float](float)
+    for branch in circuit.branches:
+        for node, _ in branch.taken():
+            by_L[node] += 1 / branch.L
+    rates = [(branch.R / branch.L, branch.name, branch.R) for branch in circuit.branches]
+    rates += [(s.R * by_L[s.node], s.name, s.R) for s in circuit.shunts if s.node not in charged]
+    rate, name, R = max(rates)
+    return (
+        f"{name}: with its R = {R:.3g} p.u. and the inductors there the circuit is too stiff:"
+        f" {omega_b * rate:.2g} 1/s; a load needs some Q, or its node one of network.capacitors"
+    )
 
 
 def of_circuit(wiring: Wiring, circuit: Circuit, kept: frozenset[str] = frozenset()) -> Sparse:

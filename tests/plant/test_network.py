@@ -593,6 +593,21 @@ def test_a_large_network_at_rest_stays_there():
     assert np.abs(plant.now["w"] - phasors).max() < 1e-13
 
 
+def test_a_large_circuit_that_is_too_stiff(monkeypatch):
+    """A small load of R alone on inductors: its series had 15,000 steps a tick."""
+    monkeypatch.setattr(build, "MOST_BY_MODES", 0)
+    line = {"l": {"start": "bus", "end": "far", "L": 0.1}}
+    message = r"z: with its R = 1e\+06 p\.u\. .* too stiff: .* 1/s; a load needs some Q"
+    with pytest.raises(ValueError, match=message):
+        make(BUS, grid="far", lines=line, loads={"z": {"node": "bus", "P": 1e-6}})
+    by_Q = make(BUS, grid="far", lines=line, loads={"z": {"node": "bus", "P": 1e-6, "Q": 1e-6}})
+    charged = make(
+        BUS, grid="far", lines=line, loads={"z": {"node": "bus", "P": 1e-6}},
+        capacitors={"c": {"node": "bus", "Q": 0.01}},
+    )  # fmt: skip
+    assert by_Q.net["sparse"] and charged.net["sparse"]
+
+
 def test_a_plant_chooses_by_its_size():
     """Up to `build.MOST_BY_MODES` currents and voltages it has modes; a series needs no room that
     grows with the square of its size."""

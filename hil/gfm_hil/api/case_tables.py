@@ -1,7 +1,6 @@
 """A power-flow case as the files of other programs have it, and its net of pandapower."""
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -78,7 +77,8 @@ class CaseTables:
 
     def join_series_capacitors(self) -> None:
         """Join each with the line behind it where nothing is between them, as a part of that line's
-        reactance; charging and shunts between them then are at the far end."""
+        reactance; charging and shunts between them then are at the far end, so that the power flow
+        is another one."""
         count = 0
         while joint := next(self._joints(), None):
             capacitor, line, between = joint
@@ -102,20 +102,3 @@ class CaseTables:
                 loop = len(there) == 1 and {*there[0][:2]} == {*one[:2]}
                 if len(there) == 1 and not there[0][5] and not loop and self._passes(between):
                     yield one, there[0], between
-
-    def cut_dead_ends(self) -> None:
-        """Take out the buses that end a branch without charging and have nothing."""
-        while True:
-            ends = Counter(int(k) for b in self.branches for k in b[:2])
-            dead = [
-                (k, b)
-                for b in self.branches
-                for k in map(int, b[:2])
-                if ends[k] == 1 and b[4] == 0.0 and self._passes(k) and not any(self.buses[k][3:5])
-            ]
-            if not dead:
-                break
-            k, branch = dead[0]
-            self.branches.remove(branch)
-            del self.buses[k]
-            self.ignored.append(f"bus {k}: nothing is there, and it is left out with its branch.")

@@ -136,13 +136,13 @@ class MpcCase(CaseTables):
             if bus[0] == 2.0 and k not in self.generators:
                 bus[0] = 1.0  # its generators are out of service
         self.join_series_capacitors()
-        self.cut_dead_ends()
         if lines := len(self.fields.get("dcline", ())):
             self.ignored.append(f"{lines} dcline{'s' * (lines > 1)}: left out.")
 
     def _generator(self, p: dict[str, float]) -> None:
         """One that holds the voltage of its bus; elsewhere P and Q come as from a load. Its rating
-        is the largest of MBASE, which most files leave at the power of the case, PMAX and PG."""
+        is the largest of MBASE, which most files leave at the power of the case, PMAX, and what PG
+        and QG are together."""
         k = int(p["GEN_BUS"])
         bus = self.buses[k]
         if bus[0] == 1.0:
@@ -152,7 +152,7 @@ class MpcCase(CaseTables):
         if k not in self.generators:
             bus[5] = p["VG"]
         P, S, _ = self.generators.get(k, (0.0, 0.0, 0.0))
-        S += max(p["MBASE"], p["PMAX"], p["PG"], 0.0) or self.S_b
+        S += max(p["MBASE"], p["PMAX"], abs(complex(p["PG"], p["QG"]))) or self.S_b
         self.generators[k] = (P + p["PG"], S, math.inf)
 
     def _branch(self, where: str, p: dict[str, float]) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from gfm_design.model.operating_point import node_voltages, operating_point
+from gfm_hil.api.case_reduction import reduced
 from gfm_hil.api.dyr_machines import Machines, read_machines
 from gfm_hil.api.power_flow import PowerFlow, named, read_pandapower
 from gfm_hil.core.errors import UserError
@@ -141,7 +142,7 @@ def network_from(
             part that a network cannot have; a generator without a rating; a law that has no steady
             state there.
     """
-    flow = read_pandapower(case, title, frequency)
+    flow = reduced(read_pandapower(case, title, frequency))
     machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
     flow = _with_following(flow, machines)
     names = [bus.name for bus in flow.buses]
@@ -235,8 +236,8 @@ class _Build:
         if bus.rating is None:
             grid = ", or stand a grid there: slack = grid" if k == self.flow.slack else ""
             raise UserError(
-                f"{self.flow.name}: {named(bus.name)}: its generator has no rating: give sn_mva or"
-                f" max_p_mw{grid}"
+                f"{self.flow.name}: {named(bus.name)}: its generator has no rating: give sn_mva,"
+                f" max_p_mw or max_q_mvar{grid}"
             )
         return bus.rating * self.flow.S_b
 
@@ -337,14 +338,10 @@ class _Build:
         if drawn.real or drawn.imag > 0:
             P_Q = {"P": drawn.real, "Q": max(drawn.imag, 0.0)}
             self._put("loads", f"load{self.names[k]}", {"node": self._node(k), **P_Q})
-        if shunt.real > 0:
-            self._put("loads", f"shunt{self.names[k]}", {"node": self._node(k), "P": shunt.real})
-        if shunt.imag < 0:
-            self._put(
-                "loads",
-                f"reactor{self.names[k]}",
-                {"node": self._node(k), "P": 0.0, "Q": -shunt.imag},
-            )
+        if shunt.real > 0 or shunt.imag < 0:  # in series: with a large R alone the circuit is stiff
+            name = "reactor" if shunt.imag < 0 else "shunt"
+            P_Q = {"P": max(shunt.real, 0.0), "Q": max(-shunt.imag, 0.0)}
+            self._put("loads", f"{name}{self.names[k]}", {"node": self._node(k), **P_Q})
         if capacitor:
             self._put(
                 "capacitors", f"charging{self.names[k]}", {"node": self._node(k), "Q": capacitor}

@@ -124,7 +124,8 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
         Z = complex(row[2], row[3])
         branches.append(FlowBranch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
-    ratings, static = _ratings(case, where, place, S_b), _static(case, where, place, S_b)
+    ratings, by_power = _ratings(case, where, place, S_b)
+    static = _static(case, where, place, S_b)
     sources = _sources(case, where, place)
     ignored += [
         f"{len(case[table])} {table}: {why}."
@@ -133,6 +134,11 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
     ]
     if turning := int((case.trafo.shift_degree % 30 != 0).sum()):
         ignored.append(f"{turning} trafo: they turn no phase.")
+    for k in by_power:
+        if abs(comes[k]) > ratings[k]:
+            ratings[k] = abs(comes[k])
+            name = named(names[int(bus[k, 0])])
+            ignored.append(f"Machines at {name}: max_p_mw is less than they bring, their rating.")
     buses = [
         Bus(names[int(row[0])], V[k], load[k] + static.get(k, (0j, 0.0))[0], shunt[k],
             comes[k] if k in ratings else 0j, ratings.get(k), *static.get(k, (0j, 0.0)),
@@ -151,18 +157,19 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
 
 def _ratings(
     case: Any, where: Any, place: Mapping[int, int], S_b: float
-) -> dict[int, float | None]:
-    """Rating of the generators of each bus, p.u.; None if one of them has none."""
-    ratings: dict[int, float | None] = {}
+) -> tuple[dict[int, float | None], set[int]]:
+    """Rating of the generators of each bus, p.u., None if one of them has none; and of which buses
+    it is their largest power, or the largest reactive power of a condenser, which has no other."""
+    ratings, by_power = dict[int, float | None](), set[int]()
     for table in ("gen", "ext_grid"):
         for _, row in _working(case, case[table]).iterrows():
-            own = next(
-                (float(row[n]) for n in ("sn_mva", "max_p_mw") if n in row and row[n] > 0), None
-            )
+            by = [n for n in ("sn_mva", "max_p_mw", "max_q_mvar") if n in row and row[n] > 0]
             k = place[int(where[row.bus])]
             before = ratings.get(k, 0.0)
-            ratings[k] = None if own is None or before is None else before + own / S_b
-    return ratings
+            ratings[k] = None if not by or before is None else before + float(row[by[0]]) / S_b
+            if by and by[0] != "sn_mva":
+                by_power.add(k)
+    return ratings, {k for k in by_power if ratings[k] is not None}
 
 
 def _sources(case: Any, where: Any, place: Mapping[int, int]) -> dict[int, float]:

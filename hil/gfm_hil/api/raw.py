@@ -158,7 +158,6 @@ class RawCase(CaseTables):
         self._lines()
         self._transformers()
         self.join_series_capacitors()
-        self.cut_dead_ends()
         for kind, each in _LEFT_OUT.items():
             if count := len(self.sections[kind]) // each:
                 self.ignored.append(f"{count} {kind}{'s' * (count > 1)}: left out.")

@@ -1,6 +1,7 @@
 """Power-flow cases as networks, against the power flow of pandapower."""
 
 import copy
+import re
 
 import numpy as np
 import pytest
@@ -34,6 +35,11 @@ def small():
     ("case", "converters"),
     [
         ("case9", {"2": "droop-3", "3": "mimo-gfm"}),
+        ("case24_ieee_rts", {"14": "vsg-2"}),  # in place of a condenser, which has no max_p_mw
+        ("case30", {"13": "droop-3"}),  # a branch to a bus without anything
+        # a negative reactance in a path, and iron losses, which make a circuit stiff
+        pytest.param("case300", {"8": "droop-3"}, marks=pytest.mark.full),
+        pytest.param("case89pegase", {"912": "droop-3"}, marks=pytest.mark.full),
         ("case14", {"1": "vsg-2"}),  # taps, and a converter at the slack
         ("case9", {"2": ("droop-3", 0.4), "1": ("vsg-2", 0.5)}),  # beside machines
         ("case9", {"1": "vsg-2", "2": "grid-following"}),  # which takes no V_ref
@@ -52,7 +58,12 @@ def test_the_steady_state_is_the_power_flow(case, converters, tmp_path):
     )
     published = dict(zip(net.bus.name.astype(str), net.res_bus.vm_pu, strict=True))
     own = {node.removeprefix("bus"): abs(v) for node, v in made.voltages.items()}
-    assert own == pytest.approx(published, abs=1e-8)
+    gone = {
+        bus for note in made.ignored if "left out" in note or "are one" in note
+        for bus in re.findall(r"\d+", note)
+    }  # fmt: skip
+    assert published.keys() - gone == own.keys()
+    assert own == pytest.approx({bus: published[bus] for bus in own}, abs=1e-8)
 
 
 @pytest.mark.full
@@ -77,6 +88,22 @@ def test_of_python_a_net_of_ones_own(tmp_path):
     assert network["synchronous_machines"]["Ga"]["S"] == pytest.approx(100 / 60)
     # the load draws at its voltage what the case says: 50 MW of 60 MVA
     assert network["loads"]["loadc"]["P"] * abs(case.voltages["busc"]) ** 2 == pytest.approx(5 / 6)
+
+
+def test_branches_that_no_circuit_can_have():
+    """Two in a row that lead nowhere; and X = 0.3 - 0.1 p.u. over a bus without anything."""
+    net = small()
+    a, b, c = net.bus.index
+    d, e, f = (pandapower.create_bus(net, 110.0, name=name) for name in "def")
+    for start, end, X in ((c, d, 0.1), (d, e, 0.1), (a, f, 0.3), (f, b, -0.1)):
+        pandapower.create_impedance(net, start, end, 0.0, X, 100.0)
+    made = gfmhil.network_from(net, {"b": "droop-3"})
+    assert made.voltages.keys() == {"busa", "busb", "busc"}
+    assert made.content["network"]["lines"]["linea-b-2"]["L"] == pytest.approx(0.2 * 0.6)
+    assert made.ignored == [
+        "What leads to buses e, d alone is left out: nothing stands there.",
+        "The branches at bus f are one: a reactance there is negative.",
+    ]
 
 
 @pytest.mark.full
@@ -158,11 +185,11 @@ def generates(net):
     [
         (without_slack, "mine: has no slack: an ext_grid, or a gen with slack"),
         (island, "mine: bus c has no path to the slack"),
-        (without_rating, "mine: bus b: its generator has no rating: give sn_mva or max_p_mw"),
+        (without_rating, "mine: bus b: its generator has no rating: give sn_mva, max_p_mw or"),
         (
             slack_without_rating,
-            "mine: bus a: its generator has no rating: give sn_mva or max_p_mw,"
-            " or stand a grid there: slack = grid",
+            "mine: bus a: its generator has no rating: give sn_mva, max_p_mw or"
+            " max_q_mvar, or stand a grid there: slack = grid",
         ),
         (too_much, "mine: its power flow does not converge: "),
         (generates, "mine: bus c: its loads draw -0.06 p.u.; make them static generators"),

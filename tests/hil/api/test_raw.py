@@ -124,7 +124,7 @@ def test_a_series_capacitor_is_a_part_of_its_line(tmp_path):
     assert (line["L"], line["R"], line["B"]) == pytest.approx((0.03, 0.012, 0.04 / 0.6))
     assert case.ignored == [
         "2 series capacitors: a part of their lines' reactance.",
-        "bus 5: nothing is there, and it is left out with its branch.",
+        "What leads to bus 5 alone is left out: nothing stands there.",
     ]
 
 
