@@ -186,7 +186,12 @@ def _make(
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
     st["phase_seen"] = st["phase_sums"] = math.nan
     network.net["conversions"] = conversions
-    network.net["followers"] = any(one.commands_any(converters) for _, one in supervisors)
+    supervisor = network.net["supervisor"][0]
+    for number, (name, controller) in enumerate(supervisors, 1):
+        controller.supervise(name, number, wiring, supervisor)
+    network.net["followers"] = supervisor[: len(par)].any()
+    follow = np.flatnonzero(supervisor[len(par) :])
+    network.of(GridFollowing)["follower"][follow] = len(par) + follow
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
@@ -301,8 +306,8 @@ def _network(
             if isinstance(one, Fed):
                 record["source"] = places[one.sources(name)[0]]
             elif isinstance(one, PlantController):
-                neighbours = parts[DYNAMIC.index(GridFollowing)]
-                one.place(name, record, k + 1, wiring, net["supervisor"][0], neighbours)
+                one.place(name, record, wiring)
+                record["number"] = k + 1
     net["n_dynamic"] = len(dynamic)
     return Network(par, st, net, now, tuple(parts), wiring)
 

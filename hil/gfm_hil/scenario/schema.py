@@ -401,8 +401,8 @@ class Scenario(StrictSchema):
     def exchanged(self) -> int:
         """The signals of frames, ``signal_set`` and with a plant controller ``SET_POINTS``."""
         each = {} if self.network is None else self.network.plant_controllers
-        sent = any(one.commands_any(self.converters) for one in each.values())
-        return self.signal_set + SET_POINTS * sent
+        followers = {n for one in each.values() for n in one.converters or self.converters}
+        return self.signal_set + SET_POINTS * (not followers.isdisjoint(self.converters))
 
     @property
     def optional_signals(self) -> tuple[str, ...]:

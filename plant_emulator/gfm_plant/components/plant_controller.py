@@ -22,7 +22,7 @@ the start, and by how much P_set or X has moved since, in p.u. of its own rating
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
@@ -276,10 +276,6 @@ class PlantController(Dynamic):
         """The reference that it does not hold."""
         return "Q_ref" if self.control == "V" else "V_ref"
 
-    def commands_any(self, converters: Iterable[str]) -> bool:
-        """Whether it sends set-points to any of these converters."""
-        return self.converters is None or not {*self.converters}.isdisjoint(converters)
-
     def measures(self, name: str, ends: Mapping[str, Sequence[Terminal]]) -> Terminal:
         """Where it measures.
 
@@ -333,28 +329,28 @@ class PlantController(Dynamic):
         refs = self.P_ref, self.Q_ref, self.V_ref, self.omega_ref
         record["ref"] = [math.nan if ref is None else ref for ref in refs]
 
-    def place(
-        self, name: str, record: Any, number: int, wiring: Wiring, supervisor: Any, neighbours: Any
-    ) -> None:
-        """Set where it measures, and which converters are its own.
-
-        Args:
-            name: its own.
-            number: from 1 on.
-            supervisor: by converter, then by neighbour, the number of its plant controller, 0: it
-                has none.
-            neighbours: the records of those that follow the grid.
-
-        Raises:
-            ValueError: there is no such converter, or it has another plant controller, or does not
-                take what this one sends.
-        """
+    def place(self, name: str, record: Any, wiring: Wiring) -> None:
+        """Set where it measures; ``name`` is its own."""
         row = 0
         for terminal in wiring.recorded:
             if terminal.name == name:
                 record["row"] = row + len(terminal.columns) - len(terminal.more)
                 record["node"] = wiring.recorded_nodes.index(terminal.node)
             row += len(terminal.columns)
+
+    def supervise(self, name: str, number: int, wiring: Wiring, supervisor: Any) -> None:
+        """Write its number where its converters have that of their plant controller.
+
+        Args:
+            name: its own.
+            number: from 1 on.
+            supervisor: by converter, then by neighbour, the number of its plant controller, 0: it
+                has none.
+
+        Raises:
+            ValueError: there is no such converter, or it has another plant controller, or does not
+                take what this one sends.
+        """
         own = [unit.name for unit in wiring.units]
         names = [*own, *wiring.neighbours]
         at = f"network.plant_controllers.{name}"
@@ -367,13 +363,10 @@ class PlantController(Dynamic):
                 again = "is there twice" if supervisor[k] == number else again
                 raise ValueError(f"{at}.converters: {one!r} {again}")
             supervisor[k] = number
-            if k >= len(own):
-                neighbours["follower"][k - len(own)] = k
-                if "V_ref" in self.sent():
-                    raise ValueError(
-                        f'{at}.sends = "V_ref": {one} follows the grid and takes "Q_ref" only'
-                    )
-        record["number"] = number
+            if k >= len(own) and "V_ref" in self.sent():
+                raise ValueError(
+                    f'{at}.sends = "V_ref": {one} follows the grid and takes "Q_ref" only'
+                )
 
 
 def begin_set_points(plant: Network, references: NDArray[np.float64]) -> None:
