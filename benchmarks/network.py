@@ -125,7 +125,7 @@ class Case:
         began = time.process_time()
         self.benches = benches = make_benches(scenario)
         self.set_up = time.process_time() - began
-        self.ticks, self.columns = ticks, len(benches[0].flows)
+        self.ticks, self.columns = ticks, len(benches[0].columns.flows)
         self.kept = [*zip(*make_room(benches), strict=True)]
         self.plants = [*{id(bench.plant): bench.plant for bench in benches}.values()]
         self.starts = [plant.copy() for plant in self.plants]

@@ -95,10 +95,10 @@ class Controller:
         #: called before ``laws`` change, which other controllers may share
         self.before_retuning: Callable[[], None] = _nothing
         self.states = np.zeros(len(self.laws), state_dtype(real))
-        self.inner = INNER if any(d.law.inner is not None for d in self.discrete) else PLAIN
+        self.signal_set = INNER if any(d.law.inner is not None for d in self.discrete) else PLAIN
         counts = [d.law.counts is not None for d in self.discrete]
         if all(counts):
-            self.inner = COUNTS
+            self.signal_set = COUNTS
         elif any(counts):
             without = self.labels[counts.index(False)]
             why = "has no [measure] and [modulate], which others have; give the scenario counts"
@@ -221,7 +221,7 @@ class Controller:
     def find_inner_tick(self) -> None:
         """Compile, or load, what `control` calls of laws with an inner stage, if there are any;
         before the first tick in this process."""
-        if self.inner:
+        if self.signal_set:
             self.ctl["inner_tick"] = inner_tick(self.laws.dtype, self.states.dtype)
 
     @property

@@ -118,7 +118,8 @@ NY_COUNTS, NU_COUNTS = NY_INNER + N_ADC, NU_INNER + N_LEGS  # of one that measur
 N_SET = 3  # set-points of a plant controller
 NY_MOST = NY_COUNTS + N_SET
 
-#: what a run exchanges beside y and u of Phi: nothing, the signals of an inner stage, and counts
+#: signal sets: what a run exchanges beside y and u of Phi, nothing, the signals of an inner stage,
+#: and counts
 PLAIN, INNER, COUNTS = range(3)
 #: what a frame has besides, as a sum with these: set-points at the end of y
 SET_POINTS = 4
@@ -141,23 +142,23 @@ P_SET, Q_SET, V_SET = range(N_SET)
 SET_LOW, SET_HIGH = tuple(s.low for s in group("set")), tuple(s.high for s in group("set"))
 
 
-def carried_rows(vector: Vector, inner: int) -> tuple[Signal, ...]:
+def carried_rows(vector: Vector, signal_set: int) -> tuple[Signal, ...]:
     """What a run exchanges: y or u, and after them the signals of an inner stage and counts;
-    ``inner``: ``PLAIN``, ``INNER`` or ``COUNTS``, of y with ``SET_POINTS`` if those follow."""
+    ``signal_set``: ``PLAIN``, ``INNER`` or ``COUNTS``, of y with ``SET_POINTS`` if those follow."""
     more: tuple[Group, Group] = ("y_inner", "adc") if vector == "y" else ("u_inner", "compare")
-    last: tuple[Group, ...] = ("set",) if vector == "y" and inner & SET_POINTS else ()
-    names = (*more[: inner & ~SET_POINTS], *last)
+    last: tuple[Group, ...] = ("set",) if vector == "y" and signal_set & SET_POINTS else ()
+    names = (*more[: signal_set & ~SET_POINTS], *last)
     return group(vector) + tuple(row for name in names for row in group(name))
 
 
-def carried(vector: Vector, inner: int) -> tuple[str, ...]:
+def carried(vector: Vector, signal_set: int) -> tuple[str, ...]:
     """The names of ``carried_rows``."""
-    return tuple(s.name for s in carried_rows(vector, inner))
+    return tuple(s.name for s in carried_rows(vector, signal_set))
 
 
-def command_rows(inner: int) -> tuple[Signal, ...]:
+def command_rows(signal_set: int) -> tuple[Signal, ...]:
     """u as firmware and models have it: with an inner stage the third is the bridge's e_d."""
-    i_u, omega_u, E, *E_q = carried_rows("u", min(inner, INNER))
+    i_u, omega_u, E, *E_q = carried_rows("u", min(signal_set, INNER))
     if E_q:
         text = E_q[0].description.replace("q component", "d component")
         E = replace(E_q[0], name="E_d", symbol="E_d", default=E.default, description=text)

@@ -19,7 +19,7 @@ from gfm_design.tuning.gains import free_gains
 from gfm_design.tuning.paper import PaperProblem
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import Bench, make_bench
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.scenario import check_scenario
 from gfm_plant import NoEquilibrium, Plant, make_plant
 from gfm_plant.model import DELTA, f
@@ -173,7 +173,7 @@ def bench_of(
 
 def recorded(bench: Bench, ticks: int) -> dict[str, np.ndarray]:
     """The plant's columns by name, of a run from the bench's start."""
-    names, others = (signals_of(role, True) for role in ("plant", "controller"))
+    names, others = (ColumnSet(True).signals(role) for role in ("plant", "controller"))
     rows, other = np.full((1, ticks, len(names)), np.nan), np.empty((1, ticks, len(others)))
     assert run_ticks(bench.plant.records, stack([bench]), rows, other, 0, ticks) == ticks
     return dict(zip(names, rows[0].T, strict=True))

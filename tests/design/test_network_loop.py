@@ -16,7 +16,7 @@ from gfm_design.model.network import LINES, NetworkLoop
 from gfm_hil.core.errors import UserError
 from gfm_hil.engine.inproc import run_ticks, stack
 from gfm_hil.engine.setup import make_benches
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.scenario import Scenario, check_scenario, plant_of, toml_text
 from gfm_plant import NoEquilibrium
 from gfm_runtime import discretise, load_law
@@ -192,8 +192,8 @@ def recorded(of: Scenario, ticks: int, **changed: float) -> dict[str, dict[str, 
     benches = make_benches(of)
     for name, by in changed.items():
         benches[0].controller.set(name, getattr(of.each[of.converters[0]].references, name) + by)
-    inner = benches[0].inner
-    names, others = (signals_of(role, inner) for role in ("plant", "controller"))
+    inner = benches[0].signal_set
+    names, others = (ColumnSet(inner).signals(role) for role in ("plant", "controller"))
     rows = np.full((len(benches), ticks, len(names)), np.nan)
     other = np.empty((len(benches), ticks, len(others)))
     assert run_ticks(benches[0].plant.records, stack(benches), rows, other, 0, ticks) == ticks

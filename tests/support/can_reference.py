@@ -8,7 +8,7 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links.can.dbc import read_dbc, write_dbc
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario import Scenario
 from gfm_plant import plant_advance, plant_sample
@@ -36,7 +36,7 @@ def quantised_run(scenario: Scenario, folder: Path, every: int = 1) -> dict[str,
     """
     b = make_bench(scenario)
     timeline = Timeline(b, folder / "events.jsonl", ROLES)
-    columns = signals_of("plant", b.inner)
+    columns = ColumnSet(b.signal_set).signals("plant")
     rows = np.full((scenario.ticks, len(columns)), np.nan)
     command, sent, plant = b.u.copy(), [], b.plant.records
     for tick in range(scenario.ticks):

@@ -123,7 +123,7 @@ def bench(law: str, inner: str, real: str, ref: Any, y: Any, u: Any) -> Controll
     one.start(np.zeros(one.active_law.order), u[:NU])
     own = np.array(u[:NU])
     settle_into(one.laws[0], one.states[0], ref, y, own, np.zeros(NU))
-    if one.inner:
+    if one.signal_set:
         settle(one.laws[:1], one.states[:1], own, y, u[2], u[3])
     return one
 

@@ -171,7 +171,7 @@ def run_pair(
     wheres = where if isinstance(where, dict) else dict.fromkeys(ROLES, where)
     benches = {role: make_bench(scenario) for role in ROLES}
     parts = {
-        role: RolePart.create(folder, role, scenario.ticks, benches[role].inner) for role in ROLES
+        role: RolePart.create(folder, role, scenario.ticks, benches[role].columns) for role in ROLES
     }
     for role in ROLES:
         compile_role(role, [benches[role]], [parts[role]])
@@ -179,7 +179,7 @@ def run_pair(
 
     def call(role: Role) -> None:
         bench, part, impairment = benches[role], parts[role], scenario.link.impairment
-        end = open_link(link, role, wheres[role], options, bench.inner)
+        end = open_link(link, role, wheres[role], options, bench.signal_set)
         timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         used = end
         if impairment is not None and impairment.hits(role):

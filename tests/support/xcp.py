@@ -9,7 +9,7 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import ROLES
 from gfm_hil.ports.xcp.memory import Memory
 from gfm_hil.ports.xcp.slave import Slave
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.scenario.events import AnyEvent
 
 LAWS = ("mimo-gfm", "vsg-5", "vsg-2")
@@ -24,7 +24,7 @@ class MadeUpRun:
     def __init__(self) -> None:
         self.told: list[dict[str, Any]] = []
         self.refuses = ""
-        names = [name for role in ROLES for name in signals_of(role, inner=False)]
+        names = [name for role in ROLES for name in ColumnSet(False).signals(role)]
         self.now: dict[str, Any] = {name: 0.5 + k for k, name in enumerate(names)}
         self.now |= {"tick": 7, "state": "RUNNING", "active": "vsg-5", "gains": {}}
         self.now |= {"ref_P_ref": 0.5, "law": 1.0}

@@ -15,6 +15,7 @@ from gfm_hil.api.law import Law, law_files, scenario_under
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
 from gfm_hil.engine.processes import Progress
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.foreign import open_recording
 from gfm_hil.recording.run import Run, converters_of, nominal_frequency
 from gfm_hil.results.between_figure import plot_between
@@ -435,9 +436,8 @@ def _compare_in(
     """Run scenarios of different laws, each in a folder; an interruption ends all. ``beside`` are
     those that are run already."""
     first = next(iter(scenarios.values()))
-    rows = first.ticks * len(scenarios) * max(1, len(first.parts))
-    what = first.signal_set, first.optional_signals
-    run_folder.check_free(folder, rows, *what, rows * len(first.flows))
+    ticks, converters = first.ticks * len(scenarios), max(1, len(first.parts))
+    run_folder.check_free(folder, ticks, ColumnSet.of(first), converters)
     made: dict[str, dict[str, Run]] = {}
     for name, one in scenarios.items():
 

@@ -125,7 +125,9 @@ class DllController(MappedController):
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
         self._names = self._out.names
-        self._wiring = wire(where, ports, self._in.names, self._names, context.inner, context.bases)
+        self._wiring = wire(
+            where, ports, self._in.names, self._names, context.signal_set, context.bases
+        )
         self._parameters = _parameters(where, info, ports)
         declared = info.FixedStepBaseSampleTime
         if ports.step_s and declared and abs(ports.step_s - declared) > 1e-6 * declared:

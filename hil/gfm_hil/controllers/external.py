@@ -15,7 +15,7 @@ from gfm_hil.controllers.phases import Frame
 from gfm_hil.controllers.ports import MODULATION, PortWiring, Vector
 from gfm_hil.core.errors import UserError
 from gfm_plant import Bases
-from gfm_runtime.signals import NU_INNER, Y_V_D, Y_V_DC, Y_V_Q
+from gfm_runtime.signals import NU_INNER, PLAIN, Y_V_D, Y_V_DC, Y_V_Q
 
 if TYPE_CHECKING:
     from gfm_runtime.assembly import Controller
@@ -32,7 +32,7 @@ class BenchContext:
     """What a controller is connected to."""
 
     T_s: float = 1e-4  # sampling time of the run, s
-    inner: int = False  # whether the run has an inner stage, so that y and u have its signals
+    signal_set: int = PLAIN  # of y and u, see ``Scenario.signal_set``
     bases: Bases = field(default_factory=Bases)  # of the converter
     delay: float = 0.0  # from the sampling of y to the moment when u acts, in ticks
 
@@ -198,11 +198,11 @@ def refuse_source(text: str) -> None:
         )
 
 
-def check_currents(text: str, inner: int) -> None:
+def check_currents(text: str, signal_set: int) -> None:
     """Check that a run carries what a controller takes, see ``Scenario.signal_set``. Raises
     UserError: ``text`` is ``c:FILE``, and the run has no inner stage."""
     refuse_source(text)
-    if text.startswith("c:") and not inner:
+    if text.startswith("c:") and not signal_set:
         raise UserError(
             f"controller {text}: measures currents, which only a run with an inner stage carries: "
             "choose --inner virtual-stator"

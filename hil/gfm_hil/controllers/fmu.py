@@ -69,7 +69,7 @@ class FmuController(MappedController):
                 f"{where}: initial in its map: an FMU's outputs begin as it says itself"
             )
         self._wiring = wire(
-            where, ports, [v.name for v in inputs], self._names, context.inner, context.bases
+            where, ports, [v.name for v in inputs], self._names, context.signal_set, context.bases
         )
         self._in, self._out = _by_type(inputs), _by_type(outputs)
         self._fixed: list[tuple[Any, float]] = []
@@ -78,7 +78,7 @@ class FmuController(MappedController):
                 raise UserError(f"{where}: parameters.{name}: is no parameter of the FMU")
             self._fixed.append((variables[name], value))
         #: of an FMU of ours: where the outputs begin
-        self._begins = [variables.get(f"start.{s.name}") for s in command_rows(context.inner)]
+        self._begins = [variables.get(f"start.{s.name}") for s in command_rows(context.signal_set)]
         self._T_s = context.T_s
         self._every = ticks_a_step(where, ports.step_s or self._T_s, self._T_s)
         self._frame = Frame(context, self._every)

@@ -65,11 +65,11 @@ class LibraryController(ExternalController):
                 f"{path.name}: {', '.join(beyond)} in its map: of a map it takes step_s only; its"
                 " ports are fixed"
             )
-        check_currents(f"c:{path.name}", context.inner)
+        check_currents(f"c:{path.name}", context.signal_set)
         self._of = _load(path)
         said = self._of.gfmhil_name()
         self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
-        self._context, self._counts = context, context.inner == COUNTS
+        self._context, self._counts = context, context.signal_set == COUNTS
         _check_step(self._of, path, self._counts)
         self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
         bases, self._frame = context.bases, Frame(context, self._every)

@@ -98,8 +98,8 @@ class PilController(ExternalController):
                 f"{k} {discrete.law.name}" if self._firmware is None else discrete.law.name,
                 discrete.law,
                 record,
-                controller.inner > 0,
-                controller.inner == COUNTS,
+                controller.signal_set > 0,
+                controller.signal_set == COUNTS,
             )
             for k, (discrete, record) in enumerate(ready)
         ]
@@ -194,7 +194,7 @@ class PilController(ExternalController):
             active = int(c.ctl["active"][0])
             self._rests = active, c.states[active].copy()
         k, rests = self._rests
-        self._aligns &= c.inner == COUNTS
+        self._aligns &= c.signal_set == COUNTS
         request, state = self._request, self._state
         request["what"], request["law"] = loop.START, self._place(k)
         request["limited"] = rests["limited"]

@@ -146,17 +146,17 @@ def wire(
     ports: PortMap,
     inputs: Sequence[str],
     outputs: Sequence[str],
-    inner: int,
+    signal_set: int,
     bases: Bases,
 ) -> PortWiring:
     """Map a controller's ports, which are in its order, to the signals of a run. Raises UserError:
     a port or a signal that is not there, a port without a signal, or a signal of u that comes from
     nowhere or twice."""
-    known = [*names("ref"), *carried("y", inner), ENABLE]
-    u = [s.name for s in command_rows(inner)]
-    phases = inner not in (0, COUNTS)
+    known = [*names("ref"), *carried("y", signal_set), ENABLE]
+    u = [s.name for s in command_rows(signal_set)]
+    phases = signal_set not in (0, COUNTS)
     known += PHASES if phases else ()
-    u += names("compare") if inner == COUNTS else ()
+    u += names("compare") if signal_set == COUNTS else ()
     commands = [*u, *(BRIDGE if phases else ())]
     for table, there in (("inputs", inputs), ("outputs", outputs), ("initial", outputs)):
         for port in getattr(ports, table):

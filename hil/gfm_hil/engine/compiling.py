@@ -31,6 +31,7 @@ from gfm_plant.ways import find_ways
 from gfm_runtime.compiled import wheel_code
 from gfm_runtime.garbage import garbage_kept
 from gfm_runtime.inner_tick import inner_tick
+from gfm_runtime.signals import PLAIN
 
 
 class Set(NamedTuple):
@@ -218,7 +219,7 @@ def _role(role: Role, found: Callable[[], list[Bench]], which: str = "") -> Set:
         benches = found()
         parts = [
             RolePart(
-                rows(1, 1, bench.inner, bench.options)[role == "controller"][0],
+                rows(1, 1, bench.columns)[role == "controller"][0],
                 np.empty((0, len(kept_of(role))), np.int64),
                 np.zeros(2, np.int64),
             )
@@ -229,7 +230,7 @@ def _role(role: Role, found: Callable[[], list[Bench]], which: str = "") -> Set:
     return Set(f"the {role}{which}", compile_it)
 
 
-def _link(name: str, options: dict[str, Any], inner: int = False) -> Set:
+def _link(name: str, options: dict[str, Any], signal_set: int = PLAIN) -> Set:
     kind = link_kind(name)
-    checked = kind.options.model_validate(options).of_run(inner)
+    checked = kind.options.model_validate(options).of_run(signal_set)
     return Set(f"the link {name}", lambda: kind.warm_up(checked))

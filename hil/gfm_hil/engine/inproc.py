@@ -20,7 +20,7 @@ from gfm_hil.engine.setup import Bench, follow_trips
 from gfm_hil.engine.tick import answer, apply_peer_state, asks_to_start, sample, take
 from gfm_hil.engine.timeline import Timeline, report_check
 from gfm_hil.realtime.atomics import prefetch, row_at
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.parts import MemoryPart, RolePart
 from gfm_hil.recording.recorder import record_command, record_controller
 from gfm_plant import PlantRecords, plant_flows, plant_is_delayed, plant_step
@@ -195,7 +195,7 @@ def run_ticks(
     Args:
         plant, controllers: at tick ``start``.
         plant_rows, controller_rows: shape (N, ticks, columns), of every tick from ``first`` on,
-            columns as ``signals_of`` says.
+            columns as ``ColumnSet.signals`` says.
         survives_trip: the run does after a trip.
         trace: what the run replays, if anything.
         flows: of the network, (ticks, columns), likewise; None: nothing.
@@ -308,8 +308,8 @@ def _run_plant(
     controllers = stack(benches)
     piece = max(_LEAST_PIECE, _PIECE // len(benches))
     where = _where_they_stay(plant_parts, controller_parts)
-    plant_rows, controller_rows = rows(len(benches), piece, bench.inner, bench.options)
-    flows = np.empty((piece, len(of_part.columns if of_part else bench.flows)))
+    plant_rows, controller_rows = rows(len(benches), piece, bench.columns)
+    flows = np.empty((piece, len(of_part.columns if of_part else bench.columns.flows)))
     here = where or places(plant_rows, controller_rows, [flows])
     if of_part is not None:
         here = of_part.put_to(flows, 0, here)
@@ -352,7 +352,7 @@ def _run_plant(
 
 def _run_parts(whole: Converters, cores: int, chunk: int, ask: Callable[[int], bool]) -> int:
     """``_run_plant`` of all parts of a plant, a thread each, on some processor cores."""
-    names, flow_rows = whole.benches[0].flows, whole.plant_parts[0].flow_rows
+    names, flow_rows = whole.benches[0].columns.flows, whole.plant_parts[0].flow_rows
     parts = dict[int, list[int]]()
     for k, bench in enumerate(whole.benches):
         parts.setdefault(id(bench.plant), []).append(k)
@@ -401,15 +401,15 @@ def _where_they_stay(
 
 
 def rows(
-    converters: int, ticks: int, inner: int, options: tuple[str, ...]
+    converters: int, ticks: int, columns: ColumnSet
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Room for what the loop records: of the plant and of the controllers, each of shape
     (converters, ticks, columns)."""
-    plant, controller = (len(signals_of(role, inner, options)) for role in ("plant", "controller"))
+    plant, controller = (len(columns.signals(role)) for role in ("plant", "controller"))
     return np.empty((converters, ticks, plant)), np.empty((converters, ticks, controller))
 
 
 def compile_loop(benches: Sequence[Bench]) -> None:
     """Compile (or load from cache) the loop without running a tick."""
-    room = rows(len(benches), 1, benches[0].inner, benches[0].options)
+    room = rows(len(benches), 1, benches[0].columns)
     run_ticks(benches[0].plant.typed, stack(benches), *room, 0, 0)

@@ -591,7 +591,7 @@ def is_plain(bench: Bench) -> bool:
         and not (n["sparse"] or n["unbalanced"][0] or n["conversions"] > 1)
         and r["filtered"] and r["noisy"] and r["i_peak"] == math.inf and r["places"] == 0
         and r["dc_steps"] == 1 and r["tau_dc"] == 0 and r["energy"] == 0 and r["array"] == 0
-        and r["chopper"][0] == 0 and r["delay"] > 0 and not bench.inner
+        and r["chopper"][0] == 0 and r["delay"] > 0 and not bench.signal_set
         and (laws["n"] <= _ORDER).all() and (laws["error_map"] == LINEAR).all()
         and laws.dtype["A"].base == np.float64 and len(bench.trace.plan) == 0
     )  # fmt: skip

@@ -131,10 +131,8 @@ class _SideResources:
         self.scenario = scenario = bench.scenario
         _begin(folder, scenario)
         if scenario.mode == "realtime":
-            keep_in_memory(folder, scenario.ticks, notice, bench.inner, bench.options, bench.flows)
-        self.part = RolePart.create(
-            folder, role, scenario.ticks, bench.inner, bench.options, bench.flows
-        )
+            keep_in_memory(folder, scenario.ticks, notice, bench.columns)
+        self.part = RolePart.create(folder, role, scenario.ticks, bench.columns)
         self.timeline = Timeline(bench, folder / f"events_{role}.jsonl", (role,))
         stack.callback(self.timeline.close)
 
@@ -142,9 +140,8 @@ class _SideResources:
         """Open the link. Raises UserError: the endpoint cannot be opened."""
         given = self.scenario.link
         assert given.endpoint is not None
-        self.good = open_link(
-            given.type, self.role, given.endpoint, given.options, self.bench.inner
-        )  # fmt: skip
+        signals = self.bench.signal_set
+        self.good = open_link(given.type, self.role, given.endpoint, given.options, signals)
         self.link: Link = self.good
         if given.impairment is not None and given.impairment.hits(self.role):
             self.link = ImpairedLink(self.good, given.impairment, self.role)  # compiles: now
@@ -269,9 +266,10 @@ def _meet(
 def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) every function that Python calls for a side; those that only
     these call become part of them."""
-    inner = benches[0].scenario.exchanged
+    signals = benches[0].scenario.exchanged
     for group in DATA_IDS:
-        values = np.zeros(len(carried(group, inner)))
-        FrameReader(group, inner).unpack(FrameWriter(group, inner).pack(0, 0, 0, values), values)
+        values = np.zeros(len(carried(group, signals)))
+        frame = FrameWriter(group, signals).pack(0, 0, 0, values)
+        FrameReader(group, signals).unpack(frame, values)
     compile_loops(role, benches, parts)
     pump.warm_up()

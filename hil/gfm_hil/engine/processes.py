@@ -14,7 +14,7 @@ from gfm_hil.core.stopping import Interrupt
 from gfm_hil.links import link_kind
 from gfm_hil.realtime.environment import available_memory
 from gfm_hil.realtime.priority import processors
-from gfm_hil.recording.columns import bytes_per_tick
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.log import Outcome, read_events
 from gfm_hil.recording.parts import RolePart, keep_in_memory
 from gfm_hil.scenario import Scenario
@@ -117,7 +117,7 @@ class Processes:
         recording = self._recording()
         with contextlib.ExitStack() as stack:
             endpoints = {}
-            for name in self._places:
+            for k, name in enumerate(self._places):
                 link = (self.scenario.each[name] if name else self.scenario).link
                 if link.endpoint is None:  # a Unix socket's path may hold 107 bytes
                     fresh = stack.enter_context(scratch.temporary("gfmhil-run-"))
@@ -125,10 +125,8 @@ class Processes:
                 else:
                     endpoints[name] = link.endpoint
                 if self.scenario.mode == "realtime":
-                    flows = self.scenario.flows if name == next(iter(self._places)) else ()
-                    keep_in_memory(
-                        self._places[name], self.scenario.ticks, self.notice, flows=flows
-                    )
+                    columns = ColumnSet.of(self.scenario, k)
+                    keep_in_memory(self._places[name], self.scenario.ticks, self.notice, columns)
             self._say_what_starts(recording)
             self._plant = _Process("plant", "plant", self.folder, self._plant_command(endpoints))
             self._controllers = {
@@ -157,8 +155,7 @@ class Processes:
         UserError: there is less."""
         if self.scenario.mode != "realtime":
             return 0.0
-        what = self.scenario.signal_set, self.scenario.optional_signals
-        a_tick = len(self._places) * bytes_per_tick(*what) + 8 * len(self.scenario.flows)
+        a_tick = ColumnSet.of(self.scenario).bytes_per_tick(len(self._places))
         needed, free = self.scenario.ticks * a_tick / 1e9, available_memory() / 1e9
         if needed > free:
             raise UserError(

@@ -22,18 +22,11 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.engine.external_ticks import SteppedController
 from gfm_hil.engine.replay import Trace, no_trace, trace_of
 from gfm_hil.engine.snapshot import start_from
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.scenario import Scenario, plant_of
 from gfm_hil.scenario.events.fault import Fault
 from gfm_hil.scenario.events.gains import gains_of
-from gfm_plant import (
-    BATTERY,
-    CONNECTION,
-    Network,
-    NoEquilibrium,
-    begin_set_points,
-    start_again,
-    take_out,
-)
+from gfm_plant import Network, NoEquilibrium, begin_set_points, start_again, take_out
 from gfm_plant.model import DELTA
 from gfm_plant.names import MAY_START
 from gfm_plant.parted import cut
@@ -64,23 +57,16 @@ class Bench:
     y_sent: NDArray[np.float64]
     # inputs of the current tick, shape (3,), or (4,) with an inner stage, p.u.
     u: NDArray[np.float64]
+    columns: ColumnSet  # what its recording has
     # what computes u in place of the law; None for the law
     external: SteppedController | None = None
     trace: Trace = field(default_factory=no_trace)  # what the run replays
     before: int = 0  # ticks of the plant before tick 0, of a run that starts from a snapshot
-    # columns of the network, which the recording of its first converter has
-    flows: tuple[str, ...] = ()
 
     @property
-    def inner(self) -> int:
+    def signal_set(self) -> int:
         """What frames and recording carry, see ``Scenario.signal_set``."""
-        return self.controller.inner
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """What the recording has by the plant's options."""
-        n = self.plant.net[0]
-        return (CONNECTION if n["connections"] else ()) + (BATTERY if n["batteries"] else ())
+        return self.columns.signal_set
 
     def keep(self, plant: Network) -> None:
         """Remember this instant as the start, to which a reset goes back; ``plant`` is a copy of
@@ -99,7 +85,7 @@ class Bench:
         """Put the plant and its grid back to their start at a tick, and clear the trip."""
         self.plant.restore(self._plant)
         self.plant.st["tick"] = tick + self.before
-        self.u[:] = _commands(self.start, self.inner)
+        self.u[:] = _commands(self.start, self.signal_set)
 
     def reset_controller(self) -> None:
         """Take the controller from SAFE to READY, with its first law and references.
@@ -117,14 +103,14 @@ class Bench:
         c.asked, c.gains = self._asked, {}
         c.ctl["state"], c.ctl["changes"], c.ctl["inner_tick"] = READY, changes, inner_tick
         c.ctl["joins"] = self.plant.net["joins"]
-        c.ctl["aligns"] = self.inner == COUNTS
-        self.u[:] = _commands(self.start, self.inner)
+        c.ctl["aligns"] = self.signal_set == COUNTS
+        self.u[:] = _commands(self.start, self.signal_set)
 
 
-def _commands(start: OperatingPoint, inner: int) -> NDArray[np.float64]:
+def _commands(start: OperatingPoint, signal_set: int) -> NDArray[np.float64]:
     """u at rest; without compare values, so that the plant's own modulator gives them until the
     controller does."""
-    u = np.full(len(carried("u", inner)), -1.0)
+    u = np.full(len(carried("u", signal_set)), -1.0)
     u[:NU_INNER] = start.commands[: len(u)]
     return u
 
@@ -192,14 +178,14 @@ def make_benches(
     for k, (bench, start) in enumerate(zip(benches, starts, strict=True)):
         bench.plant, kept, bench.place = plants[k]
         bench.start, controller = start, bench.controller
-        if bench.inner:
+        if bench.signal_set:
             own = np.concatenate([start.y, start.x[: NY_INNER - NY]])
             angle = np.exp(1j * start.x[DELTA])
             rows = plant.without_current(k, controller.calibrations)
             controller.start(start.x_law, start.u, own, start.e, angle, rows)
         else:
             controller.start(start.x_law, start.u)
-        bench.u[:] = _commands(start, bench.inner)
+        bench.u[:] = _commands(start, bench.signal_set)
         bench.trace = trace_of(bench.scenario, bench.u)
         bench.keep(kept)
         gains_of(bench.scenario, controller.omega_b)
@@ -236,11 +222,11 @@ def unstarted_benches(
     vectors: tuple[Vector, Vector] = "y", "u"
     for k, one in enumerate([*scenario.each.values()] or [scenario]):
         controller = _controller(one, plant, real)
-        inner = controller.inner = scenario.signal_set
+        columns = ColumnSet.of(scenario, k)
+        controller.signal_set = columns.signal_set
         y, u = (np.zeros(len(carried(group, scenario.exchanged))) for group in vectors)
-        own = y[: len(carried("y", inner))]
-        flows = scenario.flows if k == 0 else ()
-        benches.append(Bench(one, plant, k, controller, nowhere, own, y, u, flows=flows))
+        own = y[: len(carried("y", columns.signal_set))]
+        benches.append(Bench(one, plant, k, controller, nowhere, own, y, u, columns))
     return benches
 
 

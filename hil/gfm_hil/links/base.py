@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, PrivateAttr, ValidationError
 from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.roles import Role
 from gfm_hil.links.port import Port
+from gfm_runtime.signals import PLAIN
 
 LONGEST = 504  # bytes: every link carries a message, frame or greeting, up to this length
 
@@ -70,18 +71,18 @@ class LinkOptions(BaseModel):
     """Base class of a link's own options, the table ``link.options`` of a scenario."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-    _inner: int = PrivateAttr(False)
+    _signal_set: int = PrivateAttr(PLAIN)
 
     @property
-    def inner(self) -> int:
-        """What the frames carry, see ``Scenario.signal_set``. The laws of the run say so, not the
-        user."""
-        return self._inner
+    def signal_set(self) -> int:
+        """What the frames carry, as the laws of the run say and not the user: ``PLAIN``, ``INNER``
+        or ``COUNTS`` of ``gfm_runtime.signals``."""
+        return self._signal_set
 
-    def of_run(self, inner: int) -> Self:
-        """The same options in a run that carries what ``inner`` says."""
+    def of_run(self, signal_set: int) -> Self:
+        """The same options in a run with this signal set."""
         options = self.model_copy()
-        options._inner = inner
+        options._signal_set = signal_set
         return options
 
 
@@ -111,11 +112,11 @@ class LinkKind:
     exact: bool = True
 
     def checked(
-        self, endpoint: str | None, options: dict[str, Any], inner: int = False
+        self, endpoint: str | None, options: dict[str, Any], signal_set: int = PLAIN
     ) -> LinkOptions:
         """The options as a model, if endpoint (None: a fresh one) and options may be used.
 
-        ``inner``: in a run with an inner stage. Raises ValueError: they may not; one line.
+        ``signal_set``: of the run. Raises ValueError: they may not; one line.
         """
         if endpoint is not None and re.fullmatch(self.pattern, endpoint) is None:
             raise ValueError(f"endpoint = {endpoint!r}: must be {self.form}")
@@ -125,4 +126,4 @@ class LinkKind:
             wrong = lines(problem, self.options)
             raise ValueError("; ".join(f"options.{line}" for line in wrong)) from None
         self.check_both(endpoint, found)
-        return found.of_run(inner)
+        return found.of_run(signal_set)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.crc import crc32
 from gfm_hil.realtime.atomics import load32, store32
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import NU_COUNTS, NY_MOST, TABLE_VERSION, Vector, carried
+from gfm_runtime.signals import NU_COUNTS, NY_MOST, PLAIN, TABLE_VERSION, Vector, carried
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 MAGIC = 0x4647  # "GF"
@@ -250,11 +250,12 @@ class FrameError(ValueError):
         self.fault = fault
 
 
-def frame_dtype(group: Vector, inner: int = False) -> np.dtype:
+def frame_dtype(group: Vector, signal_set: int = PLAIN) -> np.dtype:
     """The layout as a NumPy record with one field per signal, for tools that read recordings."""
-    wire = wire_dtype(len(carried(group, inner)))
+    wire = wire_dtype(len(carried(group, signal_set)))
     fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
-    return np.dtype([*fields, *((name, "<f8") for name in carried(group, inner)), ("crc", "<u4")])
+    values = [(name, "<f8") for name in carried(group, signal_set)]
+    return np.dtype([*fields, *values, ("crc", "<u4")])
 
 
 class FrameWriter:
@@ -262,12 +263,12 @@ class FrameWriter:
 
     Args:
         group: ``"y"`` or ``"u"``.
-        inner: the run has an inner stage, whose signals follow in the frame.
+        signal_set: what follows the vector in the frame, see ``carried_rows``.
     """
 
-    def __init__(self, group: Vector, inner: int = False) -> None:
+    def __init__(self, group: Vector, signal_set: int = PLAIN) -> None:
         self.sequence = np.zeros(1, np.int64)
-        self.frame, self.message = buffer(len(carried(group, inner)), DATA_IDS[group])
+        self.frame, self.message = buffer(len(carried(group, signal_set)), DATA_IDS[group])
 
     def pack(self, tick: int, state: int, reason: int, values: NDArray[np.float64]) -> bytes:
         """One frame; ``values`` has the shape of the group, p.u."""
@@ -285,18 +286,18 @@ class FrameReader:
 
     Args:
         group: ``"y"`` or ``"u"``.
-        inner: as for ``FrameWriter``.
+        signal_set: as for ``FrameWriter``.
         limits: fields of ``reader_dtype``; without them the reader limits neither the tick nor
             the gap.
     """
 
-    def __init__(self, group: Vector, inner: int = False, **limits: int) -> None:
+    def __init__(self, group: Vector, signal_set: int = PLAIN, **limits: int) -> None:
         self.group = group
         self.record = make_reader()
         for name, limit in limits.items():
             self.record[name] = limit
         self.data_id = DATA_IDS[group]
-        self.frame, self.message = buffer(len(carried(group, inner)), self.data_id)
+        self.frame, self.message = buffer(len(carried(group, signal_set)), self.data_id)
 
     @property
     def faults(self) -> dict[Fault, int]:

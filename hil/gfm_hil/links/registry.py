@@ -12,6 +12,7 @@ from typing import Any
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links.base import Link, LinkKind
+from gfm_runtime.signals import PLAIN
 
 GROUP = "gfmhil.links"
 
@@ -46,13 +47,17 @@ def link_kind(name: str) -> LinkKind:
 
 
 def open_link(
-    name: str, role: Role, endpoint: str, options: dict[str, Any] | None = None, inner: int = False
+    name: str,
+    role: Role,
+    endpoint: str,
+    options: dict[str, Any] | None = None,
+    signal_set: int = PLAIN,
 ) -> Link:
-    """Open one end of the link of that name; ``inner``: for a run with an inner stage. Raises
-    UserError: the name, the endpoint or the options are wrong, or the link cannot be opened."""
+    """Open one end of the link of that name, for a run with that signal set. Raises UserError: the
+    name, the endpoint or the options are wrong, or the link cannot be opened."""
     try:
         kind = link_kind(name)
-        checked = kind.checked(endpoint, options or {}, inner)
+        checked = kind.checked(endpoint, options or {}, signal_set)
     except ValueError as problem:
         raise UserError(f"link: {problem}") from None
     return kind.open(role, endpoint, checked)

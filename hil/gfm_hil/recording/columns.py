@@ -5,11 +5,13 @@ the plant itself, of the controller and of the two clocks. Export files, figures
 streams, data frames and the documentation take names and units from here.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,9 @@ from gfm_runtime.signals import (
     names,
 )
 from gfm_runtime.states import STATES
+
+if TYPE_CHECKING:
+    from gfm_hil.scenario import Scenario
 
 PLANT_COLUMNS = (
     *(f"y_{n}" for n in Y_NAMES),
@@ -63,31 +68,47 @@ _MORE_OF: dict[Role, tuple[tuple[str, ...], ...]] = {
 }  # fmt: skip
 
 
-def signals_of(role: Role, inner: int, options: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """The columns that a role records, without times; ``inner``: see ``Scenario.signal_set``;
-    ``options``: what its plant has by options, see ``Scenario.optional_signals``."""
-    found = SIGNALS_OF[role] + tuple(n for more in _MORE_OF[role][:inner] for n in more)
-    return found + (tuple(f"true_{n}" for n in options) if role == "plant" else ())
-
-
-def recorded_in(role: Role, width: int) -> tuple[str, ...]:
-    """The columns of a recording of so many of them; empty if no run records so many."""
-    options = ((), CONNECTION, BATTERY, CONNECTION + BATTERY)
-    each = (signals_of(role, *which) for which in product((PLAIN, INNER, COUNTS), options))
-    return {len(names): names for names in each}.get(width, ())
-
-
 def kept_of(role: Role) -> tuple[str, ...]:
     """The columns that a role keeps beside its signals, integers: times, and counts after them."""
     return TIMES_OF[role] + COUNTS_OF[role]
 
 
-def bytes_per_tick(
-    inner: int = PLAIN, options: tuple[str, ...] = (), flows: tuple[str, ...] = ()
-) -> int:
-    """What a tick takes in the parts of a run; ``flows``: the columns of its network."""
-    signals = [*(signals_of(role, inner, options) for role in SIGNALS_OF), flows]
-    return 8 * sum(map(len, [*signals, *map(kept_of, SIGNALS_OF)]))
+@dataclass(frozen=True)
+class ColumnSet:
+    """Which columns the run of a converter records."""
+
+    signal_set: int = PLAIN  # see ``Scenario.signal_set``
+    options: tuple[
+        str, ...
+    ] = ()  # what its plant has by options, see ``Scenario.optional_signals``
+    flows: tuple[str, ...] = ()  # of its network, see ``Scenario.flows``; the plant records them
+
+    @classmethod
+    def of(cls, scenario: Scenario, place: int = 0) -> Self:
+        """Those of the converter at a place of a scenario's network; the first has the flows."""
+        flows = scenario.flows if place == 0 else ()
+        return cls(scenario.signal_set, scenario.optional_signals, flows)
+
+    def signals(self, role: Role) -> tuple[str, ...]:
+        """Those of a role, without times and flows."""
+        found = SIGNALS_OF[role] + tuple(n for x in _MORE_OF[role][: self.signal_set] for n in x)
+        return found + (tuple(f"true_{n}" for n in self.options) if role == "plant" else ())
+
+    def bytes_per_tick(self, converters: int = 1) -> int:
+        """What a tick takes in the parts of all converters of a run."""
+        each = sum(len(self.signals(role)) + len(kept_of(role)) for role in SIGNALS_OF)
+        return 8 * (converters * each + len(self.flows))
+
+
+PLAIN_COLUMNS = ColumnSet()  #: those of every run
+ALL_COLUMNS = ColumnSet(COUNTS, CONNECTION + BATTERY)  #: all but those of a network
+
+
+def recorded_in(role: Role, width: int) -> tuple[str, ...]:
+    """The columns of a recording of so many of them; empty if no run records so many."""
+    options = ((), CONNECTION, BATTERY, CONNECTION + BATTERY)
+    each = (ColumnSet(*which).signals(role) for which in product((PLAIN, INNER, COUNTS), options))
+    return {len(names): names for names in each}.get(width, ())
 
 
 PIECE = 1 << 18  # ticks of a column that a reader holds in memory at a time

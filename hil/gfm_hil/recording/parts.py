@@ -22,7 +22,7 @@ from gfm_hil.core import temporary as scratch
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import open_file
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import bytes_per_tick, kept_of, recorded_in, signals_of
+from gfm_hil.recording.columns import PLAIN_COLUMNS, ColumnSet, kept_of, recorded_in
 from gfm_hil.recording.npz import read_header
 
 _MEMORY = Path("/dev/shm")
@@ -51,19 +51,10 @@ class RolePart:
 
     @staticmethod
     def create(
-        folder: Path,
-        role: Role,
-        ticks: int,
-        inner: int = False,
-        options: tuple[str, ...] = (),
-        flows: tuple[str, ...] = (),
+        folder: Path, role: Role, ticks: int, columns: ColumnSet = PLAIN_COLUMNS
     ) -> RolePart:
-        """New files in ``folder``/parts, filled so that no page is first touched in the loop.
-
-        ``inner``, ``options``: what the run records besides, see ``signals_of``; ``flows``: the
-        columns of its network, which the plant alone records.
-        """
-        columns, times = signals_of(role, inner, options), kept_of(role)
+        """New files in ``folder``/parts, filled so that no page is first touched in the loop."""
+        names, times = columns.signals(role), kept_of(role)
         parts = folder / "parts"
         parts.mkdir(parents=True, exist_ok=True)  # may be a link, see ``keep_in_memory``
 
@@ -78,16 +69,16 @@ class RolePart:
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
-        of_network: tuple[str, ...] = flows if role == "plant" else ()
-        if of_network:
-            np.save(parts / _NAMES, np.array(of_network))
-        whole = (ticks, len(of_network))
+        flows: tuple[str, ...] = columns.flows if role == "plant" else ()
+        if flows:
+            np.save(parts / _NAMES, np.array(flows))
+        whole = (ticks, len(flows))
         return RolePart(
-            made(f"{role}_signals.npy", "f8", (ticks, len(columns)), np.nan),
+            made(f"{role}_signals.npy", "f8", (ticks, len(names)), np.nan),
             made(f"{role}_times.npy", "i8", (ticks, len(times)), -1),
             made(f"{role}_progress.npy", "i8", (3,), 0),
-            made(FLOWS, "f8", whole, np.nan) if of_network else np.empty(whole),
-            of_network,
+            made(FLOWS, "f8", whole, np.nan) if flows else np.empty(whole),
+            flows,
         )
 
     @property
@@ -171,21 +162,19 @@ class MemoryPart:
     Args:
         role: whose.
         ticks: of a run.
-        inner, options: what the run records besides, see ``signals_of``.
-        only: names of the columns that are kept; None: all.
-        flows: the columns of the network, which are kept.
+        columns: what the run records.
+        only: names of the columns that are kept beside the flows; None: all.
     """
 
     def __init__(
         self,
         role: Role,
         ticks: int,
-        inner: int = False,
-        options: tuple[str, ...] = (),
+        columns: ColumnSet = PLAIN_COLUMNS,
         only: Collection[str] | None = None,
-        flows: tuple[str, ...] = (),
     ) -> None:
-        recorded = signals_of(role, inner, options)
+        recorded = columns.signals(role)
+        flows = columns.flows if role == "plant" else ()
         self._names = [name for name in recorded if only is None or name in only]
         self._places = [recorded.index(name) for name in self._names]
         shapes = (len(self._names), ticks), (len(flows), ticks)
@@ -213,9 +202,7 @@ def keep_in_memory(
     folder: Path,
     ticks: int,
     notice: Callable[[str], None] = lambda text: None,
-    inner: int = False,
-    options: tuple[str, ...] = (),
-    flows: tuple[str, ...] = (),
+    columns: ColumnSet = PLAIN_COLUMNS,
 ) -> None:
     """Keep the parts of a run in memory until they are merged, if there is room.
 
@@ -229,7 +216,7 @@ def keep_in_memory(
     if not _MEMORY.is_dir():
         return
     _rescue(notice)
-    needed = bytes_per_tick(inner, options, flows) * ticks
+    needed = columns.bytes_per_tick() * ticks
     parts = folder / "parts"
     if not parts.is_symlink():
         if shutil.disk_usage(_MEMORY).free < 2 * needed:

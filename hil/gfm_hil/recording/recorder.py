@@ -43,7 +43,7 @@ def record_command(row, u):
 
 @compiled
 def record_controller(row, ctl, states, est):
-    """One row of CONTROLLER_COLUMNS, and what ``signals_of`` has after them if it is longer."""
+    """One row of CONTROLLER_COLUMNS, and what ``ColumnSet`` has after them if it is longer."""
     prefetch(row.ctypes.data + _SOON * row.nbytes)
     c = ctl[0]
     for j in range(NY):

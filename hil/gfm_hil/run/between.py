@@ -188,7 +188,7 @@ def between_ticks(
     if run.summary.get("controller", OUR_CONTROLLER) != OUR_CONTROLLER:
         raise UserError(f"controller = {run.summary['controller']!r}: only runs of a law repeat")
     bench = make_bench(scenario)
-    what = scenario.ticks, bench.inner, bench.options
+    what = scenario.ticks, bench.columns
     plant, controller = (
         MemoryPart("plant", *what, only=_SAME),
         MemoryPart("controller", *what, only=()),

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
-from gfm_hil.recording.columns import bytes_per_tick
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.run.stalls import ProcessorWatch
 from gfm_hil.run.taken import ProcessorTime
 
@@ -31,7 +31,7 @@ _FAST_CLOCKS = {"tsc", "arch_sys_counter", "riscv_clocksource", "kvm-clock"}
 _FAST_CLOCKS |= {"hyperv_clocksource_tsc_page"}
 _IRQ_US, _IRQ_TIMES = 1000, 100  # of an interrupt in a second on one processor
 _WAKE_US = 20  # of a tick of 100 µs
-_MINUTE_BYTES = 60 * 10_000 * bytes_per_tick()
+_MINUTE_BYTES = 60 * 10_000 * ColumnSet().bytes_per_tick()
 _NEEDED = ("numpy", "numba", "pyzmq", "python-can")
 
 

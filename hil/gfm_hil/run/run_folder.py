@@ -25,7 +25,7 @@ from gfm_hil.core.files import check_empty, read_json, sync_folder, unfinished, 
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.setup import make_bench
-from gfm_hil.recording.columns import Columns, bytes_per_tick
+from gfm_hil.recording.columns import PLAIN_COLUMNS, Columns, ColumnSet
 from gfm_hil.recording.log import Outcome, read_events, read_log, worst
 from gfm_hil.recording.merge import merge
 from gfm_hil.recording.npz import ColumnGroup, write_npz
@@ -43,14 +43,12 @@ _ENDED = "ended.json"  # how the run ended, while its folder is not complete
 
 
 def check_free(
-    folder: Path, ticks: int, inner: int = False, options: tuple[str, ...] = (), besides: int = 0
+    folder: Path, ticks: int, columns: ColumnSet = PLAIN_COLUMNS, converters: int = 1
 ) -> None:
-    """See that a run may be recorded in ``folder``, which need not exist.
+    """See that a run of some converters may be recorded in ``folder``, which need not exist.
 
-    ``inner``, ``options``: what the run records besides, see ``signals_of``; ``besides``: and how
-    many values of a network in all. Raises UserError:
-    it holds something, cannot be made or written, or the disk is too full; a memory-mapped file on
-    a full disk would end the process without a word.
+    Raises UserError: it holds something, cannot be made or written, or the disk is too full; a
+    memory-mapped file on a full disk would end the process without a word.
     """
     there = folder
     while not there.exists():
@@ -60,12 +58,12 @@ def check_free(
     if there == folder and any(folder.iterdir()):
         raise UserError(f"{folder}: is not empty; choose another --out")
     # the parts stay until the run's files are there, which compression may not make smaller
-    needed = 2 * ((bytes_per_tick(inner, options) + 16) * ticks + 8 * besides)  # with tick and t
+    needed = 2 * ticks * (columns.bytes_per_tick(converters) + 16 * converters)  # with tick and t
     free = shutil.disk_usage(there).free
     if needed > free:
         raise UserError(
-            f"{folder}: {ticks} ticks need {needed / 1e9:.3g} GB, free are {free / 1e9:.3g} GB; "
-            "shorten duration or choose another --out"
+            f"{folder}: {ticks * converters} ticks need {needed / 1e9:.3g} GB, free are "
+            f"{free / 1e9:.3g} GB; shorten duration or choose another --out"
         )
 
 
@@ -313,7 +311,7 @@ def merge_roles(first: Path, second: Path, folder: Path, report: Report | None =
     if names[0] != names[1]:
         raise UserError(f"{first}, {second}: are of different converters: {names[0]}, {names[1]}")
     done = plant.summary["ticks"]
-    check_free(folder, done, "inner" in plant.summary, plant.scenario.optional_signals)
+    check_free(folder, done, ColumnSet("inner" in plant.summary, plant.scenario.optional_signals))
     log = read_log(*(run.file("events.jsonl") for run in roles.values()))
     links = {
         role: _link_end(role, roles[role].summary)

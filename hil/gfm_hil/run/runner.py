@@ -27,7 +27,7 @@ from gfm_hil.engine.process import run_role
 from gfm_hil.engine.processes import Processes, Progress
 from gfm_hil.engine.setup import ONE_CONVERTER, Bench, make_benches
 from gfm_hil.engine.timeline import Timeline, TimelineInMemory
-from gfm_hil.recording.columns import ColumnLike
+from gfm_hil.recording.columns import ColumnLike, ColumnSet
 from gfm_hil.recording.log import Outcome
 from gfm_hil.recording.merge import known_laws, laws_used
 from gfm_hil.recording.parts import MemoryPart, RolePart, remove_parts
@@ -182,9 +182,7 @@ def _record(
 ) -> dict[str, Run]:
     """Have ``work`` run the benches of some roles in the folders of a run, and complete them."""
     places = _places(scenario, folder)
-    besides = scenario.ticks * len(scenario.flows)
-    what = scenario.signal_set, scenario.optional_signals
-    check_free(folder, scenario.ticks * len(places), *what, besides)
+    check_free(folder, scenario.ticks, ColumnSet.of(scenario), len(places))
     # here, so that two processes do not compile the same at a time
     benches = compiled_benches(scenario, notice, roles)
     with ExitStack() as stack:
@@ -263,12 +261,13 @@ def _run_here(
     benches: Sequence[Bench], places: Sequence[Path], progress: Progress, interrupt: Interrupt
 ) -> float:
     """Run both sides of each converter in this process; returns when the first tick was run."""
-    ticks, what = benches[0].scenario.ticks, (benches[0].inner, benches[0].options)
-    plant_parts = [
-        RolePart.create(place, "plant", ticks, *what, bench.flows)
-        for place, bench in zip(places, benches, strict=True)
-    ]
-    controller_parts = [RolePart.create(place, "controller", ticks, *what) for place in places]
+    plant_parts, controller_parts = (
+        [
+            RolePart.create(place, role, bench.scenario.ticks, bench.columns)
+            for place, bench in zip(places, benches, strict=True)
+        ]
+        for role in ("plant", "controller")
+    )
     timelines = [
         Timeline(bench, place / "events_both.jsonl", ROLES)
         for bench, place in zip(benches, places, strict=True)
@@ -324,11 +323,8 @@ def _benches(scenario: Scenario, notice: Notice | None) -> list[Bench]:
 
 def make_room(benches: Sequence[Bench]) -> list[tuple[MemoryPart, MemoryPart]]:
     """Room for all columns of the benches of a run, of the plant and of the controller each."""
-    whats = [(bench.scenario.ticks, bench.inner, bench.options) for bench in benches]
-    return [
-        (MemoryPart("plant", *what, flows=bench.flows), MemoryPart("controller", *what))
-        for bench, what in zip(benches, whats, strict=True)
-    ]
+    whats = [(bench.scenario.ticks, bench.columns) for bench in benches]
+    return [(MemoryPart("plant", *what), MemoryPart("controller", *what)) for what in whats]
 
 
 def memory_steps(

@@ -83,7 +83,7 @@ def test_our_own_model_gives_the_run_of_the_law(exported, kind, inner, tmp_path,
         plant_sample(bench.plant.copy().records, 0, y)
         own = bench.u[:3].copy()  # with a stage its E_u begins at e_d: no port says more
         settle_into(c.laws[0], c.states[0], c.ctl["ref"][0], y[:5], own, np.zeros(3))
-        if bench.inner:
+        if bench.signal_set:
             settle(c.laws[:1], c.states[:1], own, y, *c.ctl["out"][0, 2:])
         return [bench]
 
@@ -262,7 +262,7 @@ class Waves(MappedController):
         self._names, self._e, self.seen, self._T_s = ["a", "b", "c"], e, [], rig.T_s
         self._every = ticks_a_step("waves", ports.step_s or rig.T_s, rig.T_s)
         inputs = [*"ABC", *"IJK", "P"]
-        self._wiring = wire("waves", ports, inputs, self._names, rig.inner, rig.bases)
+        self._wiring = wire("waves", ports, inputs, self._names, rig.signal_set, rig.bases)
         self._frame = Frame(rig, self._every)
 
     def _step(self, inputs: Any) -> Any:

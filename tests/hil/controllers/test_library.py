@@ -110,10 +110,18 @@ def test_phases_are_those_of_the_turning_frame(step_ticks, delay, tmp_path, monk
 @pytest.mark.parametrize(
     ("rig", "ports", "message"),
     [
-        (BenchContext(inner=False), PortMap(), "choose --inner virtual-stator"),
-        (BenchContext(inner=COUNTS), PortMap(), "no function gfmhil_isr, and the scenario's laws"),
-        (BenchContext(inner=True), PortMap(blocks="x"), "of a map it takes step_s only"),
-        (BenchContext(inner=True), PortMap(step_s=1.5e-4), "must be a multiple of the run's T_s"),
+        (BenchContext(signal_set=False), PortMap(), "choose --inner virtual-stator"),
+        (
+            BenchContext(signal_set=COUNTS),
+            PortMap(),
+            "no function gfmhil_isr, and the scenario's laws",
+        ),
+        (BenchContext(signal_set=True), PortMap(blocks="x"), "of a map it takes step_s only"),
+        (
+            BenchContext(signal_set=True),
+            PortMap(step_s=1.5e-4),
+            "must be a multiple of the run's T_s",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(rig, ports, message, tmp_path, monkeypatch):
@@ -218,7 +226,7 @@ def test_in_real_time_a_library_that_takes_too_long_ends_the_run(failing, tmp_pa
 
 @pytest.mark.apt
 def test_what_is_no_such_library_is_refused(tmp_path, monkeypatch):
-    rig = BenchContext(inner=True)
+    rig = BenchContext(signal_set=True)
     (tmp_path / "text.so").write_text("no library")
     (tmp_path / "other.c").write_text("int other(void) { return 0; }\n")
     assert cc(tmp_path, *SHARED, "other.c", "-o", "other.so").returncode == 0

@@ -20,7 +20,7 @@ from gfm_hil.engine.setup import make_bench
 from gfm_hil.engine.timeline import Timeline
 from gfm_hil.links import Link, Port, open_link, port_function
 from gfm_hil.links.frame import FrameReader, FrameWriter
-from gfm_hil.recording.columns import signals_of
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.log import read_log
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.scenario import Scenario
@@ -244,7 +244,7 @@ def alone(
     """Run one side's loop over messages that are in the link before it starts."""
     endpoint = f"shm://{folder.name}" if link == "shm" else f"ipc://{folder}/link"
     bench = make_bench(scenario)
-    part = RolePart.create(folder, role, scenario.ticks, bench.inner)
+    part = RolePart.create(folder, role, scenario.ticks, bench.columns)
     compile_role(role, [bench], [part])
     ends = {s: open_link(link, s, endpoint) for s in ROLES}
     other: Role = "plant" if role == "controller" else "controller"
@@ -256,8 +256,8 @@ def alone(
         t0 = time.monotonic_ns()
         share = Share(bench, ends[role], part, timeline)
         (reader,) = run_loop(role, [share], t0, stopped)
-        answers = FrameReader("u" if role == "controller" else "y", bench.inner)
-        values, said = np.zeros(len(carried(answers.group, bench.inner))), []
+        answers = FrameReader("u" if role == "controller" else "y", bench.signal_set)
+        values, said = np.zeros(len(carried(answers.group, bench.signal_set))), []
         while ends[other].wait(0.05):
             message = ends[other].receive()
             assert message is not None
@@ -281,7 +281,7 @@ def test_extrapolation_is_a_straight_line_through_the_last_two_and_then_hold(inn
     content["plant"] = {"protection": {"over_current": {"enabled": False}}}
     stage = inner != "none"
     plant = alone("plant", make(**content), place, frames("u", 0, 1, inner=stage))
-    columns = signals_of("plant", stage)
+    columns = ColumnSet(stage).signals("plant")
     u = plant.part.signals[:, [columns.index(f"u_{n}") for n in carried("u", stage)]]
     assert plant.end == ("safe", "no fresh u for longer than late_policy.hold allows", 23)
     first = np.resize(ONES["u"], 3 + stage)
@@ -303,7 +303,7 @@ def test_the_first_u_of_a_tick_stands(place, make, attack_now):
     heard = frames("u", 0, 1)
     plant = alone("plant", scenario, place, after(heard, "u", 1, RUNNING))
     u = plant.part.signals[
-        :, [signals_of("plant", False).index(f"u_{n}") for n in carried("u", False)]
+        :, [ColumnSet(False).signals("plant").index(f"u_{n}") for n in carried("u", False)]
     ]
     assert (u[1] == ONES["u"] + 0.001 * np.arange(3)).all()
     assert u[2].tobytes() == u[1].tobytes()  # tick 2 has no u, and the plant holds the last one

@@ -96,12 +96,12 @@ def test_the_range_of_every_signal_fits(row):
 @given(st.data(), st.sampled_from(ALL))
 def test_packing_is_that_of_cantools(data, frame):
     fd, name, plan, part = frame
-    rows = carried_rows(name, plan.inner)
+    rows = carried_rows(name, plan.signal_set)
     names = [row.name for row in rows]
     sent = np.array(data.draw(st.lists(values, min_size=len(rows), max_size=len(rows))))
     tick = data.draw(st.integers(0, 2**40))
     sender = VectorSender(plan, name, 1)
-    payloads = dict(sender.frames(FrameWriter(name, plan.inner).pack(tick, RUNNING, 0, sent)))
+    payloads = dict(sender.frames(FrameWriter(name, plan.signal_set).pack(tick, RUNNING, 0, sent)))
     payload = payloads[part.number]
 
     message = DBC[fd].get_message_by_frame_id(part.number)
@@ -114,7 +114,7 @@ def test_packing_is_that_of_cantools(data, frame):
     decoded = message.decode(payload, decode_choices=False)
     receiver = VectorReceiver(plan, name)
     *_, whole = (receiver.take(*one) for one in payloads.items())
-    got = np.frombuffer(whole, frame_dtype(name, plan.inner))
+    got = np.frombuffer(whole, frame_dtype(name, plan.signal_set))
     assert {n: got[n][0] for n in ends} == {n: decoded[n] for n in ends}
     for n, (low, high) in ends.items():
         value, scale = sent[names.index(n)], rows[names.index(n)].scale

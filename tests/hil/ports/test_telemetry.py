@@ -1,5 +1,6 @@
 """A run's streams, to a subscriber of PlotJuggler's documented format and to ours."""
 
+import io
 import json
 import shutil
 import subprocess
@@ -19,8 +20,16 @@ from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.streams import BlockReader
 from gfm_hil.ports.streams.messages import Sampler, block_dtype, block_messages
 from gfm_hil.ports.streams.port import Follower, NewRows, Publisher
-from gfm_hil.recording.columns import CONTROLLER_TIMES, PLANT_COLUMNS, PLANT_TIMES
+from gfm_hil.recording.columns import (
+    CONTROLLER_TIMES,
+    PLANT_COLUMNS,
+    PLANT_TIMES,
+    ColumnSet,
+    kept_of,
+)
 from gfm_hil.recording.parts import RolePart
+from gfm_plant import BATTERY, CONNECTION
+from gfm_runtime.signals import COUNTS, INNER, PLAIN
 
 from ...support.processes import PATIENCE_S, takes_commands, wait_for
 
@@ -221,7 +230,24 @@ def test_ticks_never_recorded_and_numbers_that_json_has_not_are_left_out():
 def test_large_blocks_are_cut():
     found = block_messages(rows(7, 12_000))
     assert [topic for topic, _ in found] == [b"gfmhil/plant"] * 3
-    assert max(len(payload) for _, payload in found) < 5010 * block_dtype("plant").itemsize
+    assert (
+        max(len(payload) for _, payload in found)
+        < 5010 * block_dtype("plant", PLANT_COLUMNS).itemsize
+    )
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize(
+    "columns", [ColumnSet(COUNTS), ColumnSet(PLAIN, CONNECTION), ColumnSet(INNER, BATTERY)]
+)
+def test_blocks_have_the_columns_that_the_run_records(columns, role):
+    names = columns.signals(role)
+    signals = np.arange(3.0 * len(names)).reshape(3, -1)
+    times = np.zeros((3, len(kept_of(role))), np.int64)
+    ((_, payload),) = block_messages(NewRows(role, 5, signals, times))
+    block = np.load(io.BytesIO(payload))
+    assert [n for n in block.dtype.names if n != "tick" and not n.endswith("_ns")] == [*names]
+    assert np.array_equal(np.stack([block[n] for n in names], axis=1), signals)
 
 
 def test_a_role_alone_streams_its_own_columns(start, listen, tmp_path, endpoint):

@@ -92,7 +92,7 @@ def check_budget(options: CanOptions, T_s: float) -> None:
         return
     fd, rates = options.fd, f"{options.bitrate / 1e6:g}"
     rates += f"/{options.data_bitrate / 1e6:g}" if fd else ""
-    with_fd = plan if fd else load_plan(CanOptions().of_run(options.inner))
+    with_fd = plan if fd else load_plan(CanOptions().of_run(options.signal_set))
     faster = [r for r in DATA_RATES if not fd or r > options.data_bitrate]
     fits = [r for r in faster if budget(with_fd, options.bitrate, r).exchange <= period]
     nearest = [f"every = {need.every(T_s)}"]

@@ -24,7 +24,7 @@ from gfm_hil.links.can.dbc import (
     write_dbc,
 )
 from gfm_runtime.regular import read_regular
-from gfm_runtime.signals import Vector, carried
+from gfm_runtime.signals import PLAIN, Vector, carried
 
 _MOST_BYTES = 16 << 20  # of a DBC file
 
@@ -59,7 +59,7 @@ class Plan:
     # sides compare it
     digest: int
     fd: bool  # CAN FD rather than classic
-    inner: int = False  # the vectors have the signals of an inner stage
+    signal_set: int = PLAIN  # of the vectors
 
 
 def _definition(message: Message) -> str:
@@ -99,22 +99,23 @@ def _frames_of(title: str, messages: Mapping[str, Message]) -> list[Message]:
     return sorted(found, key=lambda m: m.frame_id)
 
 
-def plan_of(database: Database, inner: int = False) -> Plan:
-    """The frames of a DBC that the link uses; ``inner``: in a run with an inner stage. Raises
-    ValueError: a frame or a signal is missing or misplaced."""
+def plan_of(database: Database, signal_set: int = PLAIN) -> Plan:
+    """The frames of a DBC that the link uses in a run with that signal set. Raises ValueError: a
+    frame or a signal is missing or misplaced."""
     messages = {m.name: m for m in database.messages}
     missing = sorted({*STATUS.values(), *TRANSPORT.values()} - set(messages))
     if missing:
         raise ValueError(f"frames {missing} are missing")
     vectors: dict[Vector, list[Layout]] = {}
-    for group, title in (INNER if inner else VECTORS).items():
-        wanted = carried(group, inner)
+    for group, title in (INNER if signal_set else VECTORS).items():
+        wanted = carried(group, signal_set)
         vectors[group] = [_layout(m, wanted) for m in _frames_of(title, messages)]
         found = sorted(k for layout in vectors[group] for k in layout.values["index"].tolist())
         if found != list(range(len(wanted))):
-            why = "; this run has an inner stage" if inner else ""
+            why = "; this run has an inner stage" if signal_set else ""
             raise ValueError(f"frames {title}…: must carry each of {list(wanted)} once{why}")
-    unused = {m.name for title in INNER.values() for m in _frames_of(title, messages) if not inner}
+    others = () if signal_set else INNER.values()
+    unused = {m.name for title in others for m in _frames_of(title, messages)}
     defined = [_definition(m) for m in database.messages if m.name not in unused]
     plan = Plan(
         vectors,
@@ -122,7 +123,7 @@ def plan_of(database: Database, inner: int = False) -> Plan:
         {role: messages[TRANSPORT[role]].frame_id for role in ROLES},
         _digest("".join(sorted(defined)), 4),
         any(m.is_fd for m in database.messages),
-        inner,
+        signal_set,
     )
     for layout in [*vectors["y"], *vectors["u"], *plan.status.values()]:
         if [layout.signals.get(name, (-1,))[0] for name in (CRC, COUNTER)] != [0, 1]:
@@ -135,11 +136,11 @@ def load_plan(options: CanOptions) -> Plan:
     """The frames of the DBC that the options name, or of the generated one. Raises ValueError: the
     DBC cannot be read, or lacks what the link needs."""
     if options.dbc is None:
-        return plan_of(read_dbc(write_dbc(options.fd)), options.inner)
+        return plan_of(read_dbc(write_dbc(options.fd)), options.signal_set)
     where = f"dbc = {options.dbc!r}"
     try:
         text = read_regular(options.dbc, _MOST_BYTES).decode("utf-8")
-        plan = plan_of(read_dbc(text), options.inner)
+        plan = plan_of(read_dbc(text), options.signal_set)
     except OSError as problem:
         raise ValueError(f"{where}: {problem.strerror}") from None
     except Exception as problem:  # cantools' parser errors have no common base class

@@ -226,8 +226,8 @@ def warm_up(plan: Plan) -> None:
     for group, role in SENDERS.items():
         mine, theirs = ends[role], ends[OTHER[role]]
         mine.sockets["fd"] = mine.sockets["others"] = -1  # no socket: nothing is sent or received
-        values = np.zeros(len(carried(group, plan.inner)))
-        words = FrameWriter(group, plan.inner).pack(0, 0, 0, values)
+        values = np.zeros(len(carried(group, plan.signal_set)))
+        words = FrameWriter(group, plan.signal_set).pack(0, 0, 0, values)
         send(mine.handle, np.frombuffer(bytearray(words), np.uint8))
         put(mine.handle, mine.out[:1])
         process(theirs.handle, mine.out[0], message)

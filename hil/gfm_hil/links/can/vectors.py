@@ -98,7 +98,7 @@ def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
 def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
     r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
-    _, message = buffer(len(carried(group, plan.inner)), DATA_IDS[group])
+    _, message = buffer(len(carried(group, plan.signal_set)), DATA_IDS[group])
     r["size"], r["head"] = len(message), message[:4].view(np.uint32)[0]
     done = 0
     for k, part in enumerate([*parts, status]):

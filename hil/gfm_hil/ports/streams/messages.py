@@ -27,7 +27,7 @@ import zmq
 from numpy.typing import NDArray
 
 from gfm_hil.core.roles import ROLES, Role
-from gfm_hil.recording.columns import SIGNALS_OF, TIMES_OF, Columns, named, recorded_in, signals_of
+from gfm_hil.recording.columns import ALL_COLUMNS, TIMES_OF, Columns, named, recorded_in
 from gfm_hil.recording.timing import SLACK, missed
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:9873"
@@ -122,18 +122,16 @@ class Sampler:
         return sample
 
 
-def block_dtype(role: Role, inner: int = False) -> np.dtype:
-    """The dtype of one row of a side; ``inner``: of a run with an inner stage."""
-    signals, times = signals_of(role, inner), TIMES_OF[role]
-    return np.dtype(
-        [("tick", "<i8"), *((n, "<f8") for n in signals), *((f"{n}_ns", "<i8") for n in times)]
-    )
+def block_dtype(role: Role, signals: tuple[str, ...]) -> np.dtype:
+    """The dtype of one row of a side that records these columns."""
+    times = [(f"{name}_ns", "<i8") for name in TIMES_OF[role]]
+    return np.dtype([("tick", "<i8"), *((name, "<f8") for name in signals), *times])
 
 
 def block_messages(rows: NewRows) -> list[list[bytes]]:
     """The blocks of some rows."""
     columns = recorded_in(rows.role, rows.signals.shape[1])
-    whole = np.empty(len(rows.signals), block_dtype(rows.role, columns != SIGNALS_OF[rows.role]))
+    whole = np.empty(len(rows.signals), block_dtype(rows.role, columns))
     whole["tick"] = np.arange(rows.first, rows.first + len(whole))
     for j, name in enumerate(columns):
         whole[name] = rows.signals[:, j]
@@ -171,9 +169,8 @@ class BlockReader:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._socket.set(zmq.RCVHWM, ROOM)
-        self._socket.set(
-            zmq.MAXMSGSIZE, _HEAD + _MOST * max(block_dtype(s, True).itemsize for s in ROLES)
-        )
+        most = max(block_dtype(role, ALL_COLUMNS.signals(role)).itemsize for role in ROLES)
+        self._socket.set(zmq.MAXMSGSIZE, _HEAD + _MOST * most)
         self._socket.subscribe(f"{_topic(converter)}{role}")
         self._socket.connect(endpoint)
 

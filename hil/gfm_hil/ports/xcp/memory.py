@@ -25,7 +25,7 @@ from typing import Any
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.port import Refusal, refusing
-from gfm_hil.recording.columns import describe, signals_of
+from gfm_hil.recording.columns import ColumnSet, describe
 from gfm_hil.scenario.events.reference import check_reference
 from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
@@ -78,7 +78,7 @@ class Memory:
     """
 
     def __init__(
-        self, operator: Operator, laws: Iterable[str], inner: int, recorded: Callable[[], int]
+        self, operator: Operator, laws: Iterable[str], inner: bool, recorded: Callable[[], int]
     ) -> None:
         self._operator, self._recorded = operator, recorded
         self._laws = list(laws)
@@ -88,7 +88,8 @@ class Memory:
         digest = hashlib.sha256(f"{table_hash()}{content}".encode()).hexdigest()[:32]
         #: what the memory is of: which gfmhil, and a digest of the laws and of the signals
         self.epk = f"gfmhil {version('gfmhil')}; {digest}"
-        names = ["tick", *signals_of("plant", inner), *signals_of("controller", inner)]
+        columns = ColumnSet(inner)
+        names = ["tick", *columns.signals("plant"), *columns.signals("controller")]
         for k, name in enumerate(names):
             self._add(self._measurement(name, _MEASURED + k * CELL))
         for k, s in enumerate(group("ref")):

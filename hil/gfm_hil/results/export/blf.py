@@ -75,7 +75,7 @@ def can_frames(run: Run, options: CanOptions) -> Iterator[Timed]:
 
 def _measurements(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
     """The plant's: one vector a tick, or every n-th."""
-    writer, sender = FrameWriter("y", plan.inner), VectorSender(plan, "y", options.heartbeat)
+    writer, sender = FrameWriter("y", plan.signal_set), VectorSender(plan, "y", options.heartbeat)
     begin = _begin(run, "plant")
     for first, last in _pieces(run):
         rows, times = _vector(run, "y", first, last), _times(run, "plant", begin, first, last)
@@ -92,7 +92,7 @@ def _commands(run: Run, options: CanOptions, plan: Plan) -> Iterator[Timed]:
 
     With n ticks to an exchange the plant takes u[k] at k + n, as the link has it.
     """
-    writer, sender = FrameWriter("u", plan.inner), VectorSender(plan, "u", options.heartbeat)
+    writer, sender = FrameWriter("u", plan.signal_set), VectorSender(plan, "u", options.heartbeat)
     n = options.every
     # codes of the reasons for which it was in SAFE; the log has them in words
     told = [e for e in run.events if "controller" in e.get("role", "") and "reason" in e]

@@ -15,6 +15,7 @@ from gfm_hil.engine.compiling import SIDE_BY_SIDE, compile_sets, compiled_benche
 from gfm_hil.engine.inproc import Steps
 from gfm_hil.engine.lanes import is_plain, run_together
 from gfm_hil.engine.setup import make_bench
+from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.parts import MemoryPart
 from gfm_hil.results.report import finite
 from gfm_hil.run.network_run import NetworkRun
@@ -99,11 +100,8 @@ def _record_steps(
 
 def kept(scenario: Scenario) -> tuple[MemoryPart, MemoryPart]:
     """Room for the columns of a run that its summary reads."""
-    ticks, inner = scenario.ticks, scenario.signal_set
-    plant, controller = (
-        MemoryPart(role, ticks, inner, only=READ) for role in ("plant", "controller")
-    )
-    return plant, controller
+    what = scenario.ticks, ColumnSet.of(scenario), READ
+    return MemoryPart("plant", *what), MemoryPart("controller", *what)
 
 
 def simulate(
