@@ -10,10 +10,11 @@ from gfm_hil.api.runs import load_run
 from gfm_hil.cli import common
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import replacing
+from gfm_hil.core.schema import read_model
 from gfm_hil.results.between_figure import SIZE, draw_between
 from gfm_hil.results.table import Table
 from gfm_hil.run.between import BetweenTicks
-from gfm_hil.run.losses import load_data_sheet
+from gfm_hil.run.losses import DataSheet
 
 _PICTURES, _TABLES = (".png", ".svg", ".pdf"), (".csv", ".npz")
 
@@ -45,7 +46,7 @@ def call(options: argparse.Namespace) -> int:
         if file.suffix not in _PICTURES + _TABLES:
             known = ", ".join(_PICTURES + _TABLES)
             raise UserError(f"--out {file}: must end in one of {known}")
-    sheet = None if options.data_sheet is None else load_data_sheet(options.data_sheet)
+    sheet = None if options.data_sheet is None else read_model(options.data_sheet, DataSheet)
     run = load_run(options.folder)
     start, stop = options.window
     between = run.between_ticks(start, stop, options.step)

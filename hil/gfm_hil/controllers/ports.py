@@ -6,18 +6,17 @@ of the bridge's voltage, ``e_a`` to ``e_c``, which ``Frame`` turns into u; or ``
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from gfm_hil.controllers.phases import MEASURED
-from gfm_hil.core.errors import UserError, lines
-from gfm_hil.core.schema import StrictSchema
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.schema import StrictSchema, read_model
 from gfm_plant import Bases
 from gfm_runtime.signals import COUNTS, SIGNALS, carried, command_rows, names
 
@@ -76,16 +75,7 @@ class PortMap(StrictSchema):
 def read_map(file: Path | None) -> PortMap:
     """The map in a file; an empty one without a file. Raises UserError: the file cannot be read, or
     a key or value is wrong."""
-    if file is None:
-        return PortMap()
-    try:
-        return PortMap.model_validate(tomllib.loads(file.read_text(encoding="utf-8")))
-    except OSError as problem:
-        raise UserError(f"{file}: {problem.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
-        raise UserError(f"{file}: {problem}") from None
-    except ValidationError as problem:
-        raise UserError("\n".join(f"{file}: {line}" for line in lines(problem))) from None
+    return PortMap() if file is None else read_model(file, PortMap)
 
 
 Vector = NDArray[np.float64]

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.schema import read_model
 from gfm_hil.run.between import WAYS, BetweenTicks
 from gfm_plant.parameters import NonNegative, Options, Positive
-from gfm_runtime.toml_file import read_toml
 
 _STEP = 0.1  # p.u. of v_dc; a smaller one of a leg is no commutation
 
@@ -54,16 +53,6 @@ class Losses:
         return sum(self.conduction.values()) + sum(self.switching.values())
 
 
-def load_data_sheet(path: str | Path) -> DataSheet:
-    """Read the table of a TOML file. Raises UserError: one line a mistake."""
-    try:
-        return DataSheet.model_validate(read_toml(path))
-    except ValidationError as problem:
-        raise UserError(lines(problem, str(path))) from None
-    except ValueError as problem:
-        raise UserError(f"{path}: {problem}") from None
-
-
 def losses(between: BetweenTicks, sheet: DataSheet | str | Path) -> Losses:
     """What devices with these values would have lost in a window. Raises UserError: one line a
     mistake of the file.
@@ -73,7 +62,7 @@ def losses(between: BetweenTicks, sheet: DataSheet | str | Path) -> Losses:
         sheet: of the devices, or the TOML file of it.
     """
     if not isinstance(sheet, DataSheet):
-        sheet = load_data_sheet(sheet)
+        sheet = read_model(sheet, DataSheet)
     b = between.bases
     A = np.sqrt(2 / 3) * b.S_n / b.V_n
     currents = A * np.column_stack([between.columns[f"i_{phase}"] for phase in "abc"])

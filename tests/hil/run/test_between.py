@@ -189,7 +189,7 @@ def test_the_command_prints_writes_and_refuses(tmp_path, capsys, refused):
     bad = tmp_path / "bad.toml"
     bad.write_text(SHEET.read_text(encoding="utf-8").replace("E_on = 2.0e-3", "E_on = -1.0"))
     said = refused("waveforms", folder, "0.06:0.08", "--data-sheet", str(bad))
-    assert "E_on" in said and "greater than or equal to 0" in said
+    assert said.strip().endswith("bad.toml: E_on: must be greater than or equal to 0, not -1.0")
     gfmhil.run("pref_step", duration=0.1, events=[]).save(tmp_path / "average")
     assert "kind = 'average': has nothing between" in refused(
         "waveforms", str(tmp_path / "average"), "0.01:0.02"

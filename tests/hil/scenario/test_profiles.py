@@ -176,7 +176,7 @@ def test_a_recorded_voltage_is_played_as_the_grid_that_made_it(tmp_path):
     ("change", "says"),
     [
         ({"file": "none.csv"}, r"none\.csv: no such file"),
-        ({"map": "none.toml"}, r"none\.toml: No such file"),
+        ({"map": "none.toml"}, r"none\.toml: cannot be read: No such file"),
         ({"to": "none/grid.csv"}, r"none/grid\.csv: No such file"),
         ({"f": ""}, r"map\.toml: channels\.f: missing; the grid needs it"),
         ({"f": "g"}, r"site\.csv: channel 'g': is not in it"),

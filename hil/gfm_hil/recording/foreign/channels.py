@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-import tomllib
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from gfm_hil.core.errors import UserError, lines
 from gfm_hil.core.schema import StrictSchema
 from gfm_hil.recording.foreign.files import TIME
 
@@ -162,15 +159,3 @@ def _size(name: str, unit: str, measures: str, of: RecordingMap) -> float:
     if divisor is None:
         raise ValueError(f"{name}: unit = {unit!r}: needs the base V_dc")
     return size / divisor
-
-
-def read_recording_map(file: Path) -> RecordingMap:
-    """The map in a file. Raises UserError: the file cannot be read, or a key or value is wrong."""
-    try:
-        return RecordingMap.model_validate(tomllib.loads(file.read_text(encoding="utf-8")))
-    except OSError as problem:
-        raise UserError(f"{file}: {problem.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
-        raise UserError(f"{file}: {problem}") from None
-    except ValidationError as problem:
-        raise UserError("\n".join(f"{file}: {line}" for line in lines(problem))) from None

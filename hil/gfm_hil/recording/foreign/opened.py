@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from gfm_hil.core.errors import UserError
-from gfm_hil.recording.foreign.channels import RecordingMap, read_recording_map
+from gfm_hil.core.schema import read_model
+from gfm_hil.recording.foreign.channels import RecordingMap
 from gfm_hil.recording.foreign.files import read_channels
 from gfm_hil.recording.foreign.signals import SampledRecording, Vector, at_ticks, sampled, sequences
 from gfm_hil.recording.run import Run, nominal_frequency
@@ -47,7 +48,7 @@ def open_recording(file: str | Path, map_file: str | Path, scenario: Scenario) -
         map_file: what its channels are, see ``RecordingMap``.
         scenario: what was done; its first event is where the recording is aligned.
     """
-    file, of = Path(file), read_recording_map(Path(map_file))
+    file, of = Path(file), read_model(map_file, RecordingMap)
     f_n, T_s = nominal_frequency(scenario), scenario.T_s
     try:
         s = sampled(read_channels(file), of, f_n)

@@ -7,7 +7,8 @@ import numpy as np
 
 from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.recording.foreign.channels import read_recording_map
+from gfm_hil.core.schema import read_model
+from gfm_hil.recording.foreign.channels import RecordingMap
 from gfm_hil.recording.foreign.files import read_channels
 from gfm_hil.recording.foreign.signals import sampled
 from gfm_hil.scenario.events.grid_profile import MOST_LINES, RANGES
@@ -35,7 +36,7 @@ def grid_profile(
         if not (math.isfinite(value) and value > 0):
             raise UserError(f"{name} = {value}: must be > 0")
     try:
-        s = sampled(read_channels(Path(file)), read_recording_map(Path(map)), f_n)
+        s = sampled(read_channels(Path(file)), read_model(map, RecordingMap), f_n)
     except UserError as problem:
         words = str(problem)
         known = words.startswith((f"{file}:", f"{map}:"))

@@ -8,9 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from pydantic import ValidationError
-
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.errors import UserError
+from gfm_hil.core.schema import validate
 from gfm_hil.scenario import check_scenario, find_file, load_scenario, plant_of, toml_text
 from gfm_hil.studies.campaign.spec import Campaign, CampaignFile, put
 from gfm_runtime import law_titles
@@ -57,11 +56,7 @@ def load_campaign(
             raise UserError(f"{path}: {problem}") from None
     if changes or laws:
         text, content = None, {**content, **changes} | ({"laws": [*laws]} if laws else {})
-    try:
-        file = CampaignFile.model_validate(content)
-    except ValidationError as problem:
-        wrong = lines(problem, CampaignFile, content=content)
-        raise UserError("\n".join(f"{path}: {line}" for line in wrong)) from None
+    file = validate(path, CampaignFile, content)
     if text is None:
         text = toml_text(content)
     base = load_scenario(_beside(path, file.scenario), in_process=True)

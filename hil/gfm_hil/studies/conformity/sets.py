@@ -15,18 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.errors import UserError
 from gfm_hil.core.files import write_text
-from gfm_hil.core.schema import StrictSchema
+from gfm_hil.core.schema import StrictSchema, read_model, validate
 from gfm_hil.scenario import SCENARIO_FOLDERS, Scenario, check_scenario, toml_text
 from gfm_hil.studies.conformity.criteria import Criterion
 from gfm_hil.studies.conformity.criteria.base import KNOWN, Clause, Publication, UnderTest
 from gfm_hil.studies.conformity.criteria.plot import Plot
 from gfm_plant import ConverterParameters, load_converter
 from gfm_runtime.errors import allowed, printable
-from gfm_runtime.toml_file import read_toml
 
 ALL = "all"
 #: what a test may set of a converter's plant: its grid, and in a network its line to the bus
@@ -162,12 +161,12 @@ def _files(name: str, shipped: Mapping[str, Path]) -> list[Path]:
 
 
 def _load_case(path: Path) -> Case:
-    test = _read(path, Test)
+    test = read_model(path, Test)
     case = Case(f"{path.resolve().parent.name}/{path.stem}", path, test)
     for part in test.runs():
         if part.cannot is None:
             content = content_of(case, part, {})
-            _validate(path, Scenario, content, "scenario.")
+            validate(path, Scenario, content, "scenario.")
             wrong = _mistakes(test, part, content)
             if wrong:
                 raise UserError("\n".join(printable(f"{path}: {line}") for line in wrong))
@@ -250,7 +249,7 @@ def load_under_test(given: str | Path | None) -> UnderTest:
     """The converter under test, of a file; the shipped one if None. Raises UserError: one line per
     mistake."""
     path = under_test_file(given)
-    under = _read(path, UnderTest)
+    under = read_model(path, UnderTest)
     beside = path.parent / under.plant.converter
     if under.plant.converter.endswith(".toml") and beside.is_file():
         plant = under.plant.model_copy(update={"converter": str(beside.resolve())})
@@ -260,22 +259,6 @@ def load_under_test(given: str | Path | None) -> UnderTest:
     except (OSError, ValueError) as problem:
         raise UserError(f"{path}: plant.converter = {under.plant.converter!r}: {problem}") from None
     return under
-
-
-def _read(path: Path, model: type[Any]) -> Any:
-    try:
-        content = read_toml(path)
-    except (OSError, ValueError) as problem:
-        raise UserError(printable(f"{path}: {problem}")) from None
-    return _validate(path, model, content)
-
-
-def _validate(path: Path, model: type[BaseModel], content: Any, table: str = "") -> Any:
-    try:
-        return model.model_validate(content)
-    except ValidationError as problem:
-        told = [f"{path}: {table}{line}" for line in lines(problem, model, content=content)]
-        raise UserError("\n".join(told)) from None
 
 
 def scenario_of(
