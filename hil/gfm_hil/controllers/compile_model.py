@@ -40,17 +40,8 @@ def compile_model(sources: Sequence[Path], include: Sequence[Path], library: Pat
         raise UserError("gcc is not there; apt-get install gcc")
     folders = [f"-I{x.absolute()}" for x in (_WINDOWS, *include)]
     with replacing(library) as part:
-        command = [
-            "gcc",
-            "-O2",
-            "-w",
-            "-shared",
-            "-fPIC",
-            "-Wl,-z,defs",
-            *folders,
-            "-include",
-            "windows.h",
-        ]
-        command += ["-o", str(part.absolute()), *(str(x.absolute()) for x in used), "-lm"]
+        options = ["-O2", "-w", "-shared", "-fPIC", "-Wl,-z,defs", "-include", "windows.h"]
+        files = [str(x.absolute()) for x in used]
+        command = ["gcc", *options, *folders, "-o", str(part.absolute()), *files, "-lm"]
         run_tool(command, used[0].parent)
     return used

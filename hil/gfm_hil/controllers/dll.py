@@ -19,6 +19,7 @@ from gfm_hil.controllers.external import (
     State,
     put_back,
     run_name,
+    text_of,
     ticks_a_step,
 )
 from gfm_hil.controllers.phases import Frame
@@ -121,7 +122,7 @@ class DllController(MappedController):
     def __init__(self, path: Path, ports: PortMap, context: BenchContext) -> None:
         where = path.name
         self._of, info = _open(path)
-        self.name = run_name("dll", _text(info.ModelName) or path.stem)
+        self.name = run_name("dll", text_of(info.ModelName) or path.stem)
         self._in = _Values(where, _fields(info.InputPortsInfo, info.NumInputPorts))
         self._out = _Values(where, _fields(info.OutputPortsInfo, info.NumOutputPorts))
         self._names = self._out.names
@@ -203,7 +204,7 @@ class DllController(MappedController):
     def _call(self, name: str) -> None:
         self._now.LastErrorMessage = None
         if getattr(self._of, name)(c.byref(self._now)) == _ERROR:
-            said = _text(self._now.LastErrorMessage) or "it does not say why"
+            said = text_of(self._now.LastErrorMessage) or "it does not say why"
             raise ControllerError(f"{self.name}: {name} failed: {said}")
 
 
@@ -240,33 +241,29 @@ def describe_model(path: Path) -> tuple[str, list[tuple[str, str, str, str]]]:
     ):
         for port in ports[:count]:
             width = str(port.Width) if port.Width > 1 else ""
-            rows.append((f"{kind}.{_text(port.Name)}", width, port))
+            rows.append((f"{kind}.{text_of(port.Name)}", width, port))
     values = _parameters(path.name, info, PortMap())
     for row in info.ParametersInfo[: info.NumParameters]:
         is_text = row.DataType == _TEXT
-        default = "text" if is_text else f"{values.view(_text(row.Name))[0]:g}"
-        rows.append((f"parameters.{_text(row.Name)}", default, row))
+        default = "text" if is_text else f"{values.view(text_of(row.Name))[0]:g}"
+        rows.append((f"parameters.{text_of(row.Name)}", default, row))
     step = info.FixedStepBaseSampleTime
     every = f"every {step:g} s" if step else "at any step"
     states = info.NumIntStates + info.NumFloatStates + info.NumDoubleStates
-    told = f"{_text(info.ModelName)} {_text(info.ModelVersion)}: runs {every}, {states} states"
-    return told, [(n, w, _text(x.Unit), _text(x.Description)) for n, w, x in rows]
-
-
-def _text(said: bytes | None) -> str:
-    return (said or b"").decode("utf-8", "replace").strip()
+    told = f"{text_of(info.ModelName)} {text_of(info.ModelVersion)}: runs {every}, {states} states"
+    return told, [(n, w, text_of(x.Unit), text_of(x.Description)) for n, w, x in rows]
 
 
 def _fields(ports: Any, count: int) -> list[tuple[str, int, int]]:
-    return [(_text(ports[k].Name), ports[k].DataType, ports[k].Width) for k in range(count)]
+    return [(text_of(ports[k].Name), ports[k].DataType, ports[k].Width) for k in range(count)]
 
 
 def _parameters(where: str, info: _Info, ports: PortMap) -> _Values:
     """The parameters at their defaults, or at the map's values."""
     rows = [info.ParametersInfo[k] for k in range(info.NumParameters)]
-    values = _Values(where, [(_text(row.Name), row.DataType, 1) for row in rows])
+    values = _Values(where, [(text_of(row.Name), row.DataType, 1) for row in rows])
     for row in rows:
-        view = values.view(_text(row.Name))
+        view = values.view(text_of(row.Name))
         view[:] = np.frombuffer(bytes(row.DefaultValue.bytes), view.dtype, 1)
     for name, value in ports.parameters.items():
         if name not in values.names:

@@ -209,6 +209,11 @@ def check_currents(text: str, signal_set: int) -> None:
         )
 
 
+def text_of(said: bytes | None) -> str:
+    """What C code says, NULL for nothing."""
+    return (said or b"").decode("utf-8", "replace").strip()
+
+
 def run_name(kind: str, controller: str) -> str:
     """What a run calls a controller, from what the controller calls itself."""
     plain = "".join(c if " " <= c <= "~" else "?" for c in f"{kind} {controller}")

@@ -2,6 +2,7 @@
 
 import contextlib
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ class FmuController(MappedController):
 
     def start(self, u: Vector) -> None:
         super().start(u)
-        try:
+        with self._calls():
             if not self._fresh:
                 self._it.reset()
             self._fresh = False
@@ -105,28 +106,22 @@ class FmuController(MappedController):
                 self._it.setupExperiment(startTime=0.0)
             self._it.enterInitializationMode()
             self._it.exitInitializationMode()
-        except self._failed as problem:
-            raise ControllerError(self._why(problem)) from None
 
     def _step(self, inputs: Vector) -> Vector:
         outputs = np.zeros(len(self._names))
-        try:
+        with self._calls():
             for kind, places, references in self._in:
                 self._set(kind, references, inputs[places])
             self._it.doStep(self._time, self._every * self._T_s)
             for kind, places, references in self._out:
                 outputs[places] = getattr(self._it, f"get{kind}")(references)
-        except self._failed as problem:
-            raise ControllerError(self._why(problem)) from None
         return outputs
 
     def state(self) -> State:
-        try:
+        with self._calls():
             found = self._it.getFMUState()
             data = bytes(self._it.serializeFMUState(found))
             self._it.freeFMUState(found)
-        except self._failed as problem:
-            raise ControllerError(self._why(problem)) from None
         return super().state() | {"FMUState": np.frombuffer(data, np.uint8)}
 
     def restore(self, kept: State) -> None:
@@ -134,12 +129,10 @@ class FmuController(MappedController):
         data = kept.get("FMUState")
         if data is None:
             raise UserError(f"{self.name}: the snapshot has nothing for its FMUState")
-        try:
+        with self._calls():
             found = self._it.deserializeFMUState(data.tobytes())
             self._it.setFMUState(found)
             self._it.freeFMUState(found)
-        except self._failed as problem:
-            raise ControllerError(self._why(problem)) from None
 
     def close(self) -> None:
         with contextlib.suppress(self._failed):
@@ -151,8 +144,14 @@ class FmuController(MappedController):
         plain = [float(v) if kind in _NUMBERS else int(v) for v in values]
         getattr(self._it, f"set{kind}")(references, plain)
 
-    def _why(self, problem: Exception) -> str:
-        return f"{self.name}: {problem}{f' ({self._said})' if self._said else ''}"
+    @contextlib.contextmanager
+    def _calls(self) -> Iterator[None]:
+        """Call the FMU. Raises ControllerError: a call failed; with what the FMU logged last."""
+        try:
+            yield
+        except self._failed as problem:
+            said = f" ({self._said})" if self._said else ""
+            raise ControllerError(f"{self.name}: {problem}{said}") from None
 
 
 def _check_size(path: Path) -> None:

@@ -18,6 +18,7 @@ from gfm_hil.controllers.external import (
     ExternalController,
     check_currents,
     run_name,
+    text_of,
     ticks_a_step,
 )
 from gfm_hil.controllers.phases import MEASURED, Frame
@@ -67,8 +68,7 @@ class LibraryController(ExternalController):
             )
         check_currents(f"c:{path.name}", context.signal_set)
         self._of = _load(path)
-        said = self._of.gfmhil_name()
-        self.name = run_name("c", (said or b"").decode("utf-8", "replace") or path.stem)
+        self.name = run_name("c", text_of(self._of.gfmhil_name()) or path.stem)
         self._context, self._counts = context, context.signal_set == COUNTS
         _check_step(self._of, path, self._counts)
         self._every = ticks_a_step(path.name, ports.step_s or context.T_s, context.T_s)
@@ -145,7 +145,7 @@ class LibraryController(ExternalController):
             if hasattr(self._of, "gfmhil_fault"):
                 self._of.gfmhil_fault.restype = c.c_char_p
                 said = self._of.gfmhil_fault(c.c_void_p(self._self), c.c_int(number))
-            words = (said or b"").decode("utf-8", "replace").strip() or "it does not say what it is"
+            words = text_of(said) or "it does not say what it is"
             raise ControllerError(f"{self.name}: blocks the bridge: fault {number}, {words}")
         given = {**{f"e[{k}]": e for k, e in enumerate(self._out.e)}, "i_dc": self._out.i_dc}
         for field, value in given.items():

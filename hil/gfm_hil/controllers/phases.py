@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from gfm_hil.controllers.external import BenchContext
 
 _A = cmath.exp(2j * math.pi / 3)
-TURNS = np.array(
-    [1.0, _A**2, _A]
-)  # phases a, b, c are the real parts of a space vector times these
+#: phases a, b, c are the real parts of a space vector times these
+TURNS = np.array([1.0, _A**2, _A])
 #: what has phases, in the order of the rows of ``measured``, and where y has its d component
 MEASURED = {"v": Y_V_D, "i": Y_I_D, "i_o": Y_I_OD}
 _PLACES = np.array(list(MEASURED.values()))

@@ -155,7 +155,7 @@ def wire(
                     f"{where}: {table}.{port} in its map: it has {', '.join(there) or 'none'}"
                 )
 
-    def wire(
+    def place(
         what: str, of: Mapping[str, _Asked], all_: Sequence[str], signals: Sequence[str]
     ) -> tuple[Vector, list[tuple[int, int, float]]]:
         constants, rows = np.zeros(len(all_)), list[tuple[int, int, float]]()
@@ -167,12 +167,12 @@ def wire(
         return constants, rows
 
     plain = {port: _GROUP.sub("", port) for port in (*inputs, *outputs)}
-    constants, into = wire(
+    constants, into = place(
         "input", {**{p: plain[p] for p in inputs}, **ports.inputs}, inputs, known
     )
     own = {p: plain[p] for p in outputs if plain[p] in commands}
-    _, out = wire("output", {**own, **ports.outputs}, outputs, commands)
-    begin, begins = wire("initial", ports.initial, outputs, known)
+    _, out = place("output", {**own, **ports.outputs}, outputs, commands)
+    begin, begins = place("initial", ports.initial, outputs, known)
     fixed = np.zeros(len(u))
     for name, value in ports.fixed.items():
         fixed[_place(f"{where}: fixed", name, u, bases)[0]] = value

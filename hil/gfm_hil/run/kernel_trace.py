@@ -276,23 +276,18 @@ class KernelTrace:
                     self._found.append((cpu, begin, end, end - begin, named))
 
     def _name(self, kind: int, number: int, thread: bytes) -> str:
-        match kind:
-            case _ if kind == _THREAD:
-                return f"thread {thread.split(bytes(1))[0].decode('utf-8', 'replace')} ({number})"
-            case _ if kind == _IRQ:
-                with suppress(OSError):
-                    actions = Path(f"/sys/kernel/irq/{number}/actions").read_text("utf-8").strip()
-                    return f"irq {number}, {actions}"
-                return f"irq {number}"
-            case _ if kind == _SOFTIRQ:
-                return f"softirq {_SOFTIRQS[number] if number < len(_SOFTIRQS) else number}"
-            case _ if kind == _VECTOR:
-                return f"interrupt {self._vectors[number]}"
-            case _ if kind == _STOPPED:
-                return STOPPED
-            case _ if kind == _UNREAD:
-                return UNREAD
-        return WAITS
+        if kind == _THREAD:
+            return f"thread {thread.split(bytes(1))[0].decode('utf-8', 'replace')} ({number})"
+        if kind == _IRQ:
+            with suppress(OSError):
+                actions = Path(f"/sys/kernel/irq/{number}/actions").read_text("utf-8").strip()
+                return f"irq {number}, {actions}"
+            return f"irq {number}"
+        if kind == _SOFTIRQ:
+            return f"softirq {_SOFTIRQS[number] if number < len(_SOFTIRQS) else number}"
+        if kind == _VECTOR:
+            return f"interrupt {self._vectors[number]}"
+        return {_STOPPED: STOPPED, _UNREAD: UNREAD, _WAITS: WAITS}[kind]
 
     def _read(self, name: str) -> str:
         return (self._here / name).read_text("utf-8")

@@ -18,6 +18,8 @@ class Flows:
 
     def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
         self._runs = runs
+        self._first = next(iter(runs.values()))  # which records what is of the network
+        self._scenario: Any = self._first.record.scenario
         _, laws, nodes = single_line.converters_of(self._scenario)
         bars, lines = single_line.bars_of(self._scenario, nodes)
         rows = single_line.assign_rows(bars, lines)
@@ -45,23 +47,18 @@ class Flows:
             "mesh": single_line.collide(bars, lines), "stacked": _stack(bars, lines),
         }  # fmt: skip
 
-    @property
-    def _scenario(self) -> Any:
-        return next(iter(self._runs.values())).record.scenario
-
     def now(self) -> dict[str, Any]:
         """The newest tick of each converter; P and Q, p.u., of each part that the run records, of a
         line at its start; and whether the breaker of each part is closed."""
         converters = {name: _newest(run) for name, run in self._runs.items()}
         closed = dict(self._closed)
-        for entry in next(iter(self._runs.values())).happened()["events"]:
+        for entry in self._first.happened()["events"]:
             if (change := switched(entry)) is not None:
                 closed[change[0]] = change[1]
         return {"converters": converters, "flows": self._recorded_flows(), "closed": closed}
 
     def _recorded_flows(self) -> dict[str, list[float]]:
-        run = next(iter(self._runs.values()))
-        columns, done = run.record.columns, run.pyramid.done
+        columns, done = self._first.record.columns, self._first.pyramid.done
         names = [n.removesuffix(".P") for n in self._scenario.flows if n.endswith(".P")]
         if not done:
             return {}
