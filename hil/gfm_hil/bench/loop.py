@@ -39,9 +39,9 @@ from gfm_hil.links import link_kind, open_link
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.recording.recorder import record_command, record_controller, record_sample
 from gfm_hil.run.attribution import OURS, Times, attribute, bursts, counts, missed_ticks
+from gfm_hil.run.processor_time import ProcessorTime
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.run.stalls import ProcessorWatch, loops_of
-from gfm_hil.run.taken import ProcessorTime
 from gfm_hil.scenario import INPROC, Scenario, check_scenario, load_scenario
 from gfm_plant import plant_advance, plant_sample
 from gfm_runtime.compiled import compiled

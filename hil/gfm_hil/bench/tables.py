@@ -8,7 +8,7 @@ from typing import Any
 from gfm_hil.bench.contenders import ELSEWHERE
 from gfm_hil.bench.histogram import SHARES
 from gfm_hil.results.table import Table, shown
-from gfm_hil.run.taken import METHODS
+from gfm_hil.run.processor_time import METHODS
 
 Row = dict[str, Any]
 #: a column of a table: the key of what it shows, in a row or, after dots, in what a row has; or a

@@ -71,7 +71,7 @@ class _End:
         scenario, port = bench.scenario, link.port
         plant = role == "plant"
         self.bench, self.link = bench, link
-        self.writer = FrameWriter("y" if plant else "u", scenario.exchanged)
+        self.writer = FrameWriter("y" if plant else "u", scenario.frame_signals)
         hold = int(bench.controller.ctl["hold"][0])  # of the watchdog, for both sides
         every = getattr(link, "every", 1)
         self.reader = limited_reader(role, scenario, hold, every)

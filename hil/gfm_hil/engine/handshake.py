@@ -328,7 +328,7 @@ def _tick(message: bytes, scenario: Scenario) -> int | None:
     """The tick of a plant's frame that a controller would accept as its first; None otherwise."""
     try:
         return limited_reader("controller", scenario).unpack(
-            message, np.empty(len(carried("y", scenario.exchanged)))
+            message, np.empty(len(carried("y", scenario.frame_signals)))
         )
     except FrameError:
         return None

@@ -177,4 +177,4 @@ def limited_reader(role: Role, scenario: Scenario, hold: int = 0, every: int = 1
         limits["behind"] = hold + (2 * every - 1 if every > 1 else 0)
     if scenario.survives_trips:
         limits["leaving"] = STOPPED
-    return FrameReader("u" if plant else "y", scenario.exchanged, **limits)
+    return FrameReader("u" if plant else "y", scenario.frame_signals, **limits)

@@ -266,7 +266,7 @@ def _meet(
 def compile_role(role: Role, benches: Sequence[Bench], parts: Sequence[RolePart]) -> None:
     """Compile (or load from cache) every function that Python calls for a side; those that only
     these call become part of them."""
-    signals = benches[0].scenario.exchanged
+    signals = benches[0].scenario.frame_signals
     for group in DATA_IDS:
         values = np.zeros(len(carried(group, signals)))
         frame = FrameWriter(group, signals).pack(0, 0, 0, values)

@@ -224,7 +224,7 @@ def unstarted_benches(
         controller = _controller(one, plant, real)
         columns = ColumnSet.of(scenario, k)
         controller.signal_set = columns.signal_set
-        y, u = (np.zeros(len(carried(group, scenario.exchanged))) for group in vectors)
+        y, u = (np.zeros(len(carried(group, scenario.frame_signals))) for group in vectors)
         own = y[: len(carried("y", columns.signal_set))]
         benches.append(Bench(one, plant, k, controller, nowhere, own, y, u, columns))
     return benches

@@ -25,7 +25,7 @@ from gfm_hil.engine.announcement import not_running, running_roles
 from gfm_hil.links.zeromq.options import beyond_loopback
 from gfm_hil.ports import PORTS, make_port
 from gfm_hil.ports.commands import Operator
-from gfm_hil.recording.live import begun
+from gfm_hil.recording.live import has_begun
 from gfm_hil.recording.run import converters_of
 from gfm_runtime.children import guarded
 
@@ -151,7 +151,7 @@ def has_recording(folder: Path) -> bool:
     network those of all converters."""
     if converters := converters_of(folder):
         return all(has_recording(folder / name) for name in converters)
-    return (folder / "signals.npz").is_file() or begun(folder)
+    return (folder / "signals.npz").is_file() or has_begun(folder)
 
 
 class OperatorPort(ABC):

@@ -80,7 +80,7 @@ class LiveRun:
         return int(self.parts["controller"].progress[1]) if self.done("controller") else 0
 
 
-def begun(folder: Path) -> bool:
+def has_begun(folder: Path) -> bool:
     """Whether a role of a run has begun to record in a folder that has the scenario."""
     recorded = any((folder / f"parts/{role}_progress.npy").is_file() for role in ROLES)
     return recorded and (folder / "scenario.toml").is_file()

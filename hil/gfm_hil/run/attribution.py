@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.realtime.clock import AHEAD_NS
-from gfm_hil.run.taken import ProcessorTime, nobody
+from gfm_hil.run.processor_time import ProcessorTime, nobody
 
 CAUSES = ("own work", "link", "late wake-up", "stalled host")
 _OWN, _LINK, _WAKE, _STALL = range(len(CAUSES))

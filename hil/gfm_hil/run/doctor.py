@@ -17,8 +17,8 @@ from typing import Any, Literal, NamedTuple
 from gfm_hil.realtime.environment import StealTime, environment
 from gfm_hil.realtime.priority import PRIORITY
 from gfm_hil.recording.columns import ColumnSet
+from gfm_hil.run.processor_time import ProcessorTime
 from gfm_hil.run.stalls import ProcessorWatch
-from gfm_hil.run.taken import ProcessorTime
 
 Level = Literal["green", "yellow", "red"]
 Facts = dict[str, Any]

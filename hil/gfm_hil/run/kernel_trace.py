@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.run.taken import STOPPED, UNREAD, WAITS, ProcessorTime, collect
+from gfm_hil.run.processor_time import STOPPED, UNREAD, WAITS, ProcessorTime, collect
 from gfm_runtime.compiled import cached, compiled
 
 _PREFIX = "gfmhil-"  # of our instances, before the number of the process

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from gfm_hil.run.taken import STOPPED, ProcessorTime, collect, nobody
+from gfm_hil.run.processor_time import STOPPED, ProcessorTime, collect, nobody
 
 _BETWEEN_S = 0.1  # readings
 _LEAST_NS = 20_000  # of waiting between two readings

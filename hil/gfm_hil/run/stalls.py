@@ -12,7 +12,7 @@ from gfm_hil.core.roles import ROLES
 from gfm_hil.recording.parts import RolePart
 from gfm_hil.run.kernel_trace import KernelTrace, tracefs
 from gfm_hil.run.proc_watch import ProcWatch
-from gfm_hil.run.taken import ProcessorTime
+from gfm_hil.run.processor_time import ProcessorTime
 
 LEAST_NS = 5_000  # shorter times make no tick late
 

@@ -398,7 +398,7 @@ class Scenario(StrictSchema):
         return INNER if any(stage is not None for stage in inner) else PLAIN
 
     @property
-    def exchanged(self) -> int:
+    def frame_signals(self) -> int:
         """The signals of frames, ``signal_set`` and with a plant controller ``SET_POINTS``."""
         each = {} if self.network is None else self.network.plant_controllers
         followers = {n for one in each.values() for n in one.converters or self.converters}
@@ -467,7 +467,7 @@ class Scenario(StrictSchema):
                     "counts, which laws with [measure] and [modulate] exchange": COUNTS,
                     "set-points, which network.plant_controllers send": SET_POINTS,
                 }
-                lacks = [what for what, bit in more.items() if self.exchanged & bit]
+                lacks = [what for what, bit in more.items() if self.frame_signals & bit]
                 if lacks and link.type not in _WITH_MORE:
                     problems.append(
                         f"{where}.type = {link.type!r}: carries no {lacks[0]}; use"

@@ -239,8 +239,8 @@ def test_neighbours_that_follow_the_grid_take_its_set_points() -> None:
 
 
 def test_the_frames_of_converters_that_it_does_not_command_are_those_without_it() -> None:
-    assert load_scenario(wind_park({}, link={"type": "can"})).exchanged == 0
-    assert load_scenario(wind_park({"converters": ["w1", "A"]})).exchanged == 4
+    assert load_scenario(wind_park({}, link={"type": "can"})).frame_signals == 0
+    assert load_scenario(wind_park({"converters": ["w1", "A"]})).frame_signals == 4
 
 
 @pytest.mark.full

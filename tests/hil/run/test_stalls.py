@@ -16,9 +16,9 @@ from gfm_hil.realtime.environment import may_sched_fifo
 from gfm_hil.run.attribution import CAUSES, attribute, missed_ticks
 from gfm_hil.run.kernel_trace import tracefs
 from gfm_hil.run.proc_watch import ProcWatch
+from gfm_hil.run.processor_time import STOPPED, UNREAD, nobody
 from gfm_hil.run.runner import run_scenario
 from gfm_hil.run.stalls import ProcessorWatch, loops_of
-from gfm_hil.run.taken import STOPPED, UNREAD, nobody
 from gfm_hil.scenario import check_scenario
 
 pytestmark = [pytest.mark.processes, pytest.mark.alone]

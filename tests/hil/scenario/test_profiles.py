@@ -195,7 +195,7 @@ def test_what_cannot_be_played_as_a_grid_is_refused_in_one_line(
     change, says, tmp_path, monkeypatch
 ):
     if "most" in change:
-        monkeypatch.setattr("gfm_hil.recording.foreign.played.MOST_LINES", change["most"])
+        monkeypatch.setattr("gfm_hil.recording.foreign.voltage_profile.MOST_LINES", change["most"])
     columns = {
         "t": 1e-3 * np.arange(10), "p": np.full(10, 0.5), "u": np.ones(10), "hz": np.full(10, 50.0),
         "volts": np.where(np.arange(10) == 3, 380.0, 1.0), "below": 0.8 - 0.1 * np.arange(10),

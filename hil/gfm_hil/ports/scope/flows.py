@@ -19,12 +19,13 @@ class Flows:
     def __init__(self, runs: Mapping[str, WatchedRun]) -> None:
         self._runs = runs
         self._first = next(iter(runs.values()))  # which records what is of the network
-        self._scenario: Any = self._first.record.scenario
+        self._scenario = self._first.record.scenario
         _, laws, nodes = single_line.converters_of(self._scenario)
         bars, lines = single_line.bars_of(self._scenario, nodes)
         rows = single_line.assign_rows(bars, lines)
         self._closed = dict.fromkeys(nodes, True) | {n: one.closed for n, one in lines.items()}
         network = self._scenario.network
+        assert network is not None
         feeds = {name for _, name, one in network.components() if one.feeds} | {GRID}
         nodes_shown: list[dict[str, Any]] = []
         for name, bar in bars.items():

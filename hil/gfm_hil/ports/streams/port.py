@@ -18,7 +18,7 @@ from gfm_hil.core.supervised import attempt
 from gfm_hil.engine.announcement import not_running
 from gfm_hil.ports.port import INTERRUPTED, BesideRun, OperatorPort, check_number, say
 from gfm_hil.ports.streams.messages import ROOM, NewRows, Sampler, block_messages
-from gfm_hil.recording.live import LiveRun, begun
+from gfm_hil.recording.live import LiveRun, has_begun
 from gfm_hil.recording.timing import ROUND_TRIP, SLACK, count_misses
 
 _LAST = 1  # newest rows not read yet: a tick's last time is written after it counts as done
@@ -56,7 +56,7 @@ class Follower:
     def __init__(self, folder: Path, converter: str = "") -> None:
         if (folder / "summary.json").is_file():
             raise UserError(f"{folder}: the run is over, see gfmhil export")
-        if not begun(folder):
+        if not has_begun(folder):
             raise UserError(f"{not_running(folder)}; --wait waits for one")
         self.folder, self.converter, self.run = folder, converter, LiveRun(folder)
         self.T_s = self.run.T_s
