@@ -17,7 +17,7 @@ from gfm_hil.links import ring
 from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, frame_dtype
 from gfm_hil.links.shm import segment
 from gfm_hil.scenario import load_scenario
-from gfm_runtime.signals import TABLE_VERSION, Vector, group, table_hash
+from gfm_runtime.signals import TABLE_VERSION, VectorName, group, table_hash
 from gfm_runtime.states import REASONS, RUNNING, STATES
 
 _KINDS = {"u1": "uint8", "<u2": "uint16", "<u4": "uint32", "<u8": "uint64", "<f8": "float64"}
@@ -32,7 +32,10 @@ _MEANING = {
     "tick": "$k$; a frame of $u$ has the tick of the $y$ that it answers",
     "crc": "CRC-32 over all bytes before it",
 }
-_EXAMPLES: dict[Vector, tuple[float, ...]] = {"y": (1.0, 0.5, 1.0, 0.0, 1.0), "u": (0.5, 1.0, 1.0)}
+_EXAMPLES: dict[VectorName, tuple[float, ...]] = {
+    "y": (1.0, 0.5, 1.0, 0.0, 1.0),
+    "u": (0.5, 1.0, 1.0),
+}
 _BOOT, _T0 = "b0c1d2e3-0123-4567-89ab-cdef01234567", 81234567890123
 _RUN = "0123456789abcdef"
 

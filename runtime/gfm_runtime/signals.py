@@ -27,7 +27,7 @@ from typing import Literal, get_args
 TABLE_VERSION = 4
 
 Group = Literal["y", "u", "y_inner", "u_inner", "adc", "compare", "ref", "d", "set"]
-Vector = Literal["y", "u"]
+VectorName = Literal["y", "u"]
 Channel = Literal["v_dc", "i_a", "i_b", "i_c", "v_a", "v_b", "v_c", "i_o_a", "i_o_b", "i_o_c"]
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
 """Of the A/D at a converter's phases, in the order of the group ``adc``."""
@@ -142,7 +142,7 @@ P_SET, Q_SET, V_SET = range(N_SET)
 SET_LOW, SET_HIGH = tuple(s.low for s in group("set")), tuple(s.high for s in group("set"))
 
 
-def carried_rows(vector: Vector, signal_set: int) -> tuple[Signal, ...]:
+def carried_rows(vector: VectorName, signal_set: int) -> tuple[Signal, ...]:
     """What a run exchanges: y or u, and after them the signals of an inner stage and counts;
     ``signal_set``: ``PLAIN``, ``INNER`` or ``COUNTS``, of y with ``SET_POINTS`` if those follow."""
     more: tuple[Group, Group] = ("y_inner", "adc") if vector == "y" else ("u_inner", "compare")
@@ -151,7 +151,7 @@ def carried_rows(vector: Vector, signal_set: int) -> tuple[Signal, ...]:
     return group(vector) + tuple(row for name in names for row in group(name))
 
 
-def carried(vector: Vector, signal_set: int) -> tuple[str, ...]:
+def carried(vector: VectorName, signal_set: int) -> tuple[str, ...]:
     """The names of ``carried_rows``."""
     return tuple(s.name for s in carried_rows(vector, signal_set))
 

@@ -5,7 +5,7 @@ import numpy as np
 from gfm_hil.links.can.layout import Plan
 from gfm_hil.links.can.vectors import NOTHING, decode, part_of, receiver_dtype, set_receiver
 from gfm_hil.links.can.wire import MOST, frame_dtype
-from gfm_runtime.signals import Vector
+from gfm_runtime.signals import VectorName
 
 
 def frame_of(number: int, payload: bytes) -> np.ndarray:
@@ -19,7 +19,7 @@ def frame_of(number: int, payload: bytes) -> np.ndarray:
 class VectorReceiver:
     """Converts CAN frames back to frames of the bench."""
 
-    def __init__(self, plan: Plan, group: Vector) -> None:
+    def __init__(self, plan: Plan, group: VectorName) -> None:
         self._record, self._message = np.zeros(1, receiver_dtype), np.zeros(MOST, np.uint8)
         set_receiver(self._record, plan, group)
 

@@ -12,12 +12,12 @@ from gfm_hil.recording.columns import ColumnSet
 from gfm_hil.recording.recorder import record_command, record_sample
 from gfm_hil.scenario import Scenario
 from gfm_plant import plant_advance, plant_sample
-from gfm_runtime.signals import Vector, carried
+from gfm_runtime.signals import VectorName, carried
 
 DBC = read_dbc(write_dbc(True))
 
 
-def through_cantools(name: Vector, values: np.ndarray) -> None:
+def through_cantools(name: VectorName, values: np.ndarray) -> None:
     """Quantise a vector, with the signals of an inner stage or without, as CAN FD does, with
     cantools alone."""
     inner = len(values) > len(carried(name, False))

@@ -14,7 +14,7 @@ from gfm_hil.bench.one_way import ANSWERED, DUE, HEARD, RECEIVED, SENT
 from gfm_hil.links.frame import DATA_IDS, MAGIC, FrameWriter, is_sealed, pack, record_dtype
 from gfm_hil.realtime.clock import now_ns, sleep_until, spin_or_yield, wait_until, yield_processor
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import TABLE_VERSION, Vector
+from gfm_runtime.signals import TABLE_VERSION, VectorName
 from gfm_runtime.states import RUNNING, SAFE
 
 _Y, _U = DATA_IDS["y"], DATA_IDS["u"]
@@ -32,7 +32,7 @@ class Frames(NamedTuple):
     message: NDArray[np.uint8]
 
 
-def frames(group: Vector, inner: bool = False, clocks: bool = False) -> Frames:
+def frames(group: VectorName, inner: bool = False, clocks: bool = False) -> Frames:
     """Memory for frames of a group; with ``clocks`` their values are integers."""
     writer = FrameWriter(group, inner)
     frame = writer.frame

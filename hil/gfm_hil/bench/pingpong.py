@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.realtime.clock import now_ns, sleep_until, spin_or_yield, wait_until
 from gfm_runtime.compiled import cached
-from gfm_runtime.signals import Vector, names
+from gfm_runtime.signals import VectorName, names
 
 SILENCE_NS = 1_000_000_000
 LONGEST = 65536  # bytes
@@ -35,7 +35,7 @@ Messages = NDArray[np.uint8]
 Numbers = NDArray[np.int64]
 
 
-def frames(group: Vector) -> Messages:
+def frames(group: VectorName) -> Messages:
     """The bench's frames with consecutive sequences; shape (256, bytes)."""
     writer, values = FrameWriter(group), np.ones(len(names(group)))
     packed = b"".join(writer.pack(k, 0, 0, values) for k in range(_DIFFERENT))

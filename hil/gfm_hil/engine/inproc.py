@@ -352,7 +352,7 @@ def _run_plant(
 
 def _run_parts(whole: Converters, cores: int, chunk: int, ask: Callable[[int], bool]) -> int:
     """``_run_plant`` of all parts of a plant, a thread each, on some processor cores."""
-    names, flow_rows = whole.benches[0].columns.flows, whole.plant_parts[0].flow_rows
+    names, flow_rows = whole.benches[0].columns.flows, whole.plant_parts[0].flows
     parts = dict[int, list[int]]()
     for k, bench in enumerate(whole.benches):
         parts.setdefault(id(bench.plant), []).append(k)
@@ -393,11 +393,11 @@ def _where_they_stay(
     plant_parts: Sequence[RolePart | MemoryPart], controller_parts: Sequence[RolePart | MemoryPart]
 ) -> Places | None:
     """The places of the rows of all ticks in the parts; None if one takes them by ``put``."""
-    sides = [[part.rows for part in parts] for parts in (plant_parts, controller_parts)]
+    sides = [[part.signals for part in parts] for parts in (plant_parts, controller_parts)]
     own = [[rows for rows in each if rows is not None] for each in sides]
     if list(map(len, own)) != list(map(len, sides)):
         return None
-    return places(*own, [plant_parts[0].flow_rows])
+    return places(*own, [plant_parts[0].flows])
 
 
 def rows(

@@ -479,7 +479,7 @@ def _columns(stretch: Stretch) -> dict[str, NDArray[np.float64]]:
     return {
         name: column
         for part in parts
-        if isinstance(part, MemoryPart) and part.rows is None
+        if isinstance(part, MemoryPart) and part.signals is None
         for name, column in part.by_name(stretch.stop).items()
     }
 

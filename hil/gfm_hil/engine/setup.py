@@ -33,7 +33,16 @@ from gfm_plant.parted import cut
 from gfm_plant.wiring import Wiring
 from gfm_runtime import law_titles, load_law
 from gfm_runtime.assembly import Controller, copied
-from gfm_runtime.signals import COUNTS, NU_INNER, NY, NY_INNER, REF_NAMES, SET_REF, Vector, carried
+from gfm_runtime.signals import (
+    COUNTS,
+    NU_INNER,
+    NY,
+    NY_INNER,
+    REF_NAMES,
+    SET_REF,
+    VectorName,
+    carried,
+)
 from gfm_runtime.states import READY, SAFE, STATES
 
 ONE_CONVERTER = (
@@ -219,7 +228,7 @@ def unstarted_benches(
     """The benches of all converters before anyone knows the operating point: none can run, but the
     loops can be compiled for their records. Arguments as of ``make_bench``."""
     plant, nowhere, benches = plant or plant_of(scenario), cast(OperatingPoint, None), list[Bench]()
-    vectors: tuple[Vector, Vector] = "y", "u"
+    vectors: tuple[VectorName, VectorName] = "y", "u"
     for k, one in enumerate([*scenario.each.values()] or [scenario]):
         controller = _controller(one, plant, real)
         columns = ColumnSet.of(scenario, k)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gfm_hil.links.crc import crc32
 from gfm_hil.realtime.atomics import load32, store32
 from gfm_runtime.compiled import inlined
-from gfm_runtime.signals import NU_COUNTS, NY_MOST, PLAIN, TABLE_VERSION, Vector, carried
+from gfm_runtime.signals import NU_COUNTS, NY_MOST, PLAIN, TABLE_VERSION, VectorName, carried
 from gfm_runtime.states import REASONS, SAFE, STOPPED
 
 MAGIC = 0x4647  # "GF"
@@ -239,7 +239,7 @@ def judge(reader, overdue, latched):
 
 LAST_TIMES = 3  # how often a side sends its last frame, which says that it leaves
 
-DATA_IDS: dict[Vector, int] = {"y": 1, "u": 2}
+DATA_IDS: dict[VectorName, int] = {"y": 1, "u": 2}
 
 
 class FrameError(ValueError):
@@ -250,7 +250,7 @@ class FrameError(ValueError):
         self.fault = fault
 
 
-def frame_dtype(group: Vector, signal_set: int = PLAIN) -> np.dtype:
+def frame_dtype(group: VectorName, signal_set: int = PLAIN) -> np.dtype:
     """The layout as a NumPy record with one field per signal, for tools that read recordings."""
     wire = wire_dtype(len(carried(group, signal_set)))
     fields = [(name, wire[name]) for name in wire.names or () if name not in ("values", "crc")]
@@ -266,7 +266,7 @@ class FrameWriter:
         signal_set: what follows the vector in the frame, see ``carried_rows``.
     """
 
-    def __init__(self, group: Vector, signal_set: int = PLAIN) -> None:
+    def __init__(self, group: VectorName, signal_set: int = PLAIN) -> None:
         self.sequence = np.zeros(1, np.int64)
         self.frame, self.message = buffer(len(carried(group, signal_set)), DATA_IDS[group])
 
@@ -291,7 +291,7 @@ class FrameReader:
             the gap.
     """
 
-    def __init__(self, group: Vector, signal_set: int = PLAIN, **limits: int) -> None:
+    def __init__(self, group: VectorName, signal_set: int = PLAIN, **limits: int) -> None:
         self.group = group
         self.record = make_reader()
         for name, limit in limits.items():

@@ -81,16 +81,6 @@ class RolePart:
             flows,
         )
 
-    @property
-    def rows(self) -> NDArray[np.float64] | None:
-        """The rows of all ticks, where a loop may write them."""
-        return self.signals
-
-    @property
-    def flow_rows(self) -> NDArray[np.float64]:
-        """Those of the network, likewise."""
-        return self.flows
-
     @staticmethod
     def open(folder: Path, role: Role) -> RolePart | None:
         """The files of a role, or None if they do not exist or one of them is damaged."""
@@ -159,6 +149,10 @@ def check_parts(folder: Path, ticks: int) -> None:
 class MemoryPart:
     """One side's columns in memory, to record one run after another.
 
+    Attributes:
+        signals, flows: as of ``RolePart``, where a loop may write; None for signals of which only
+            some are kept, for which there is ``put``.
+
     Args:
         role: whose.
         ticks: of a run.
@@ -182,8 +176,8 @@ class MemoryPart:
         order: Literal["F", "C"] = "F" if only is None else "C"
         self._columns, self._flows = (np.empty(shape, order=order) for shape in shapes)
         self._of_network = flows
-        self.rows = self._columns.T if only is None else None
-        self.flow_rows = self._flows.T
+        self.signals = self._columns.T if only is None else None
+        self.flows = self._flows.T
 
     def put(self, first: int, rows: NDArray[np.float64], flows: NDArray[np.float64]) -> None:
         """Record rows of consecutive ticks, the first of which is ``first``, and the network's."""

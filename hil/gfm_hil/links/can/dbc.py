@@ -20,16 +20,16 @@ from cantools.database.conversion import BaseConversion
 
 from gfm_hil.core.roles import OTHER, ROLES, Role
 from gfm_runtime.signals import Signal as Row
-from gfm_runtime.signals import Vector, carried_rows, table_hash
+from gfm_runtime.signals import VectorName, carried_rows, table_hash
 from gfm_runtime.states import REASONS, STATES
 
 INT16 = 32767  # largest count; the range is symmetric
 INVALID = -32768
-SENDERS: dict[Vector, Role] = {"y": "plant", "u": "controller"}
+SENDERS: dict[VectorName, Role] = {"y": "plant", "u": "controller"}
 #: frame name of each vector; if a vector needs several frames, they append _1, _2 …
-VECTORS: dict[Vector, str] = {"y": "Measurements", "u": "Commands"}
+VECTORS: dict[VectorName, str] = {"y": "Measurements", "u": "Commands"}
 #: the same in a run with an inner stage
-INNER: dict[Vector, str] = {name: f"{title}Inner" for name, title in VECTORS.items()}
+INNER: dict[VectorName, str] = {name: f"{title}Inner" for name, title in VECTORS.items()}
 STATUS: dict[Role, str] = {"plant": "PlantStatus", "controller": "ControllerStatus"}
 TRANSPORT: dict[Role, str] = {"plant": "PlantTransport", "controller": "ControllerTransport"}
 CRC, COUNTER = "Crc", "Counter"
@@ -80,7 +80,7 @@ def _protection() -> list[Signal]:
     ]
 
 
-def _vector(name: Vector, inner: int, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
+def _vector(name: VectorName, inner: int, fd: bool) -> list[tuple[str, int, int, list[Signal]]]:
     """Name, identifier, length and signals of every frame of a vector."""
     rows, vector = carried_rows(name, inner), (INNER if inner else VECTORS)[name]
     room = len(rows) if fd else (8 - _HEADER) // 2

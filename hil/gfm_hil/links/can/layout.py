@@ -24,7 +24,7 @@ from gfm_hil.links.can.dbc import (
     write_dbc,
 )
 from gfm_runtime.regular import read_regular
-from gfm_runtime.signals import PLAIN, Vector, carried
+from gfm_runtime.signals import PLAIN, VectorName, carried
 
 _MOST_BYTES = 16 << 20  # of a DBC file
 
@@ -52,7 +52,7 @@ class Plan:
     """The frames of a DBC that a run uses."""
 
     # the frames of each vector, in the order of their identifiers
-    vectors: dict[Vector, list[Layout]]
+    vectors: dict[VectorName, list[Layout]]
     status: dict[Role, Layout]  # the frame of each sender
     transport: dict[Role, int]  # the identifier of each sender's ISO-TP frames
     # hash of all definitions, in a run without an inner stage less the frames of such a stage; both
@@ -106,7 +106,7 @@ def plan_of(database: Database, signal_set: int = PLAIN) -> Plan:
     missing = sorted({*STATUS.values(), *TRANSPORT.values()} - set(messages))
     if missing:
         raise ValueError(f"frames {missing} are missing")
-    vectors: dict[Vector, list[Layout]] = {}
+    vectors: dict[VectorName, list[Layout]] = {}
     for group, title in (INNER if signal_set else VECTORS).items():
         wanted = carried(group, signal_set)
         vectors[group] = [_layout(m, wanted) for m in _frames_of(title, messages)]

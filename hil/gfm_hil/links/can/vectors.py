@@ -22,7 +22,7 @@ from gfm_hil.links.can.layout import VALUE, Plan
 from gfm_hil.links.frame import DATA_IDS, buffer, header_dtype, is_sealed, seal
 from gfm_hil.realtime.atomics import copy, load32, store32
 from gfm_runtime.compiled import compiled
-from gfm_runtime.signals import Vector, carried
+from gfm_runtime.signals import VectorName, carried
 
 #: a CAN frame: identifier and payload
 CanFrame = tuple[int, bytes]
@@ -82,20 +82,20 @@ receiver_dtype = np.dtype(
 )
 
 
-def set_sender(sender: np.ndarray, plan: Plan, group: Vector, heartbeat: int) -> None:
+def set_sender(sender: np.ndarray, plan: Plan, group: VectorName, heartbeat: int) -> None:
     """Initialise one record of ``sender_dtype``; it repeats the status every ``heartbeat``
     vectors."""
     _set_table(sender, plan, group)
     sender["heartbeat"], sender["last"], sender["tick"] = heartbeat, NOTHING, NOTHING
 
 
-def set_receiver(receiver: np.ndarray, plan: Plan, group: Vector) -> None:
+def set_receiver(receiver: np.ndarray, plan: Plan, group: VectorName) -> None:
     """Initialise one record of ``receiver_dtype``."""
     _set_table(receiver, plan, group)
     receiver["sequence"] = receiver["status_sequence"] = receiver["counter"] = NOTHING
 
 
-def _set_table(record: np.ndarray, plan: Plan, group: Vector) -> None:
+def _set_table(record: np.ndarray, plan: Plan, group: VectorName) -> None:
     r, parts, status = record[0], plan.vectors[group], plan.status[SENDERS[group]]
     r["parts"], r["flags"] = len(parts), plan.fd * (wire.FD | wire.BRS)
     _, message = buffer(len(carried(group, plan.signal_set)), DATA_IDS[group])
@@ -277,7 +277,7 @@ class VectorSender:
         heartbeat: vectors after which the status is repeated.
     """
 
-    def __init__(self, plan: Plan, group: Vector, heartbeat: int) -> None:
+    def __init__(self, plan: Plan, group: VectorName, heartbeat: int) -> None:
         self.record = np.zeros(1, sender_dtype)
         set_sender(self.record, plan, group, heartbeat)
         self._frames = np.zeros(PARTS + 1, wire.frame_dtype)

@@ -24,7 +24,7 @@ from gfm_hil.links.can.layout import Plan, load_plan
 from gfm_hil.links.can.vectors import CanFrame, VectorSender
 from gfm_hil.links.frame import FrameWriter
 from gfm_hil.recording.run import Run
-from gfm_runtime.signals import Vector, carried
+from gfm_runtime.signals import VectorName, carried
 from gfm_runtime.states import INIT, PLANT_TRIP, REASONS, SAFE
 
 _PIECE = 1 << 16  # ticks
@@ -122,7 +122,7 @@ def _pieces(run: Run) -> Iterator[tuple[int, int]]:
     return ((a, min(a + _PIECE, run.ticks)) for a in range(0, run.ticks, _PIECE))
 
 
-def _vector(run: Run, group: Vector, first: int, last: int) -> NDArray[np.float64]:
+def _vector(run: Run, group: VectorName, first: int, last: int) -> NDArray[np.float64]:
     """Rows of a vector, shape (ticks, n), p.u."""
     carries = carried(group, "u_E_q" in run.recorded)
     return np.column_stack([run.recorded[f"{group}_{n}"][first:last] for n in carries])
