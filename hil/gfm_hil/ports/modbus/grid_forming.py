@@ -33,7 +33,7 @@ class GridForming(Direct):
         power = exponent(b.S_n * top("P_ref"), 32, signed=True)
         self.layout = {
             NUMBER: {
-                "ID": NUMBER, "W_SF": power, "Var_SF": power,
+                "W_SF": power, "Var_SF": power,
                 "V_SF": exponent(self._phase_V * top("V"), 16),
                 "A_SF": exponent(b.base_of("I") * top("p"), 16),
                 "Hz_SF": exponent(b.base_of("f") * top("omega_g"), 16),

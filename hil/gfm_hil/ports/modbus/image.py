@@ -108,7 +108,8 @@ class Image:
         self._written: dict[str, object] = {}  # newest value of each path
         self.registers: list[int] = [*struct.unpack(">2H", b"SunS")]
         for number, content in models.items():
-            model = sunspec.Model(number, model_def=definition(number), data=dict(content))
+            layout = {"ID": number, **content}
+            model = sunspec.Model(number, model_def=definition(number), data=layout)
             if model.error_info:
                 raise ValueError(f"model {number}: {model.error_info}")
             start = BASE + len(self.registers)

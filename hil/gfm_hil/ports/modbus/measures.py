@@ -123,36 +123,28 @@ class Measures:
         volt = exponent(b.V_n * top("V"), 16)
         amp = exponent(b.base_of("I") * top("p"), 16, signed=True)
         set_point = exponent(b.S_n * top("P_ref"), 32, signed=True)
+        sizes = {"A_SF": amp, "V_SF": volt} | dict.fromkeys(("W_SF", "VA_SF", "Var_SF"), power)
         points: list[dict[str, Any]] = [{}, {}]
         return {
-            1: {"ID": 1},
-            701: {
-                "ID": 701, "A_SF": amp, "V_SF": volt, "Hz_SF": -4, "W_SF": power, "PF_SF": -3,
-                "VA_SF": power, "Var_SF": power,
-            },
-            702: {
-                "ID": 702, "W_SF": power, "VA_SF": power, "Var_SF": power, "V_SF": volt,
-                "A_SF": amp,
-            },
+            1: {},
+            701: {**sizes, "Hz_SF": -4, "PF_SF": -3},
+            702: sizes,
             704: {
-                "ID": 704, "WSet_SF": set_point, "VarSet_SF": set_point, "WSetPct_SF": -2,
-                "VarSetPct_SF": -2,
+                "WSet_SF": set_point, "VarSet_SF": set_point, "WSetPct_SF": -2, "VarSetPct_SF": -2,
             },
             705: {
-                "ID": 705, "NPt": 2, "NCrv": 2, "V_SF": -2, "DeptRef_SF": -2, "RspTms_SF": 0,
+                "NPt": 2, "NCrv": 2, "V_SF": -2, "DeptRef_SF": -2, "RspTms_SF": 0,
                 "Crv": [{"Pt": points}, {"Pt": points}],
             },
-            711: {
-                "ID": 711, "NCtl": 2, "Db_SF": -3, "K_SF": -5, "RspTms_SF": -3, "Ctl": [{}, {}],
-            },
+            711: {"NCtl": 2, "Db_SF": -3, "K_SF": -5, "RspTms_SF": -3, "Ctl": [{}, {}]},
             714: {
-                "ID": 714, "NPrt": 1, "DCV_SF": exponent(b.V_dcref * top("v_dc"), 16),
+                "NPrt": 1, "DCV_SF": exponent(b.V_dcref * top("v_dc"), 16),
                 "DCA_SF": exponent(b.base_of("i_dc") * top("i_u"), 16, signed=True),
                 "DCW_SF": exponent(b.S_n * top("i_u") * top("v_dc"), 16, signed=True),
                 "Prt": [{}],
             },
-            715: {"ID": 715},
-            VENDOR: {"ID": VENDOR, "NLaw": len(laws), "Laws": [{} for _ in laws]},
+            715: {},
+            VENDOR: {"NLaw": len(laws), "Laws": [{} for _ in laws]},
         }  # fmt: skip
 
     def plate(self, laws: Sequence[str], unit: int) -> dict[str, Value]:
