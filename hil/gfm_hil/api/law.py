@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gfm_hil.api.lti import cells_of, content_of, read_matrix
-from gfm_hil.core.errors import UserError, need
+from gfm_hil.core.errors import UserError, naming, need
 from gfm_hil.core.files import check_empty, write_new, write_text
 from gfm_hil.results.page import fragment
 from gfm_hil.results.table import Table
@@ -369,10 +369,8 @@ class Law:
             check_empty(folder)
         omega_b = 2 * math.pi * f_n
         files = export({self.name: self.built()}, T_s, real, "unrolled", omega_b)
-        try:
+        with naming(folder):
             write_files(folder, files)
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
         return folder
 
     def to_toml(self) -> str:

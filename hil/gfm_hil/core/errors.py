@@ -1,6 +1,8 @@
 """Errors that the user can fix: printed as one line, without a traceback."""
 
+import contextlib
 import importlib.util
+from collections.abc import Iterator
 
 from gfm_runtime.mistakes import lines as lines
 
@@ -15,6 +17,15 @@ class Unfinished(Exception):
 
 class PeerLost(Exception):
     """The other side never connected, stopped answering, or is not compatible with this side."""
+
+
+@contextlib.contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Make a UserError, which names ``where``, of an OSError in this context."""
+    try:
+        yield
+    except OSError as problem:
+        raise UserError(f"{where}: {problem.strerror or problem}") from None
 
 
 def need(module: str, package: str, what: str, extra: str) -> None:

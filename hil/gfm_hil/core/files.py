@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json
 
-from gfm_hil.core.errors import UserError, lines
+from gfm_hil.core.errors import UserError, lines, naming
 from gfm_runtime.errors import printable
 from gfm_runtime.regular import open_regular, read_regular
 
@@ -161,10 +161,8 @@ def write_new(path: Path, text: str, overwrite: bool = False) -> Path:
     ``overwrite``, or cannot be written."""
     if path.exists() and not overwrite:
         raise UserError(f"{path}: is there already; choose another name, or delete it")
-    try:
+    with naming(path):
         write_text(path, text)
-    except OSError as problem:
-        raise UserError(f"{path}: {problem.strerror}") from None
     return path
 
 

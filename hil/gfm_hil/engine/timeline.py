@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gfm_hil.controllers import ControllerError
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import naming
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.engine.setup import Bench
 from gfm_hil.engine.snapshot import keep_snapshot
@@ -85,12 +85,10 @@ class Timeline:
 
     def _open(self, log: Path) -> None:
         self._path, self._room = log, log.with_suffix(".room")
-        try:
+        with naming(log):
             self._log = log.open("ab", buffering=0)
             with self._room.open("wb") as room:
                 os.posix_fallocate(room.fileno(), 0, _ROOM)
-        except OSError as problem:
-            raise UserError(f"{log}: {problem.strerror}") from None
 
     @property
     def running(self) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gfm_hil.core import temporary as scratch
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import open_file
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.recording.columns import PLAIN_COLUMNS, ColumnSet, kept_of, recorded_in
@@ -60,12 +60,10 @@ class RolePart:
 
         def made(name: str, dtype: str, shape: tuple[int, ...], fill: float) -> Any:
             path = parts / name
-            try:
+            with naming(parts.resolve()):
                 array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
                 with path.open("r+b") as file:  # else a full disk would kill the process later
                     os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-            except OSError as problem:
-                raise UserError(f"{path.parent.resolve()}: {problem.strerror}") from None
             array[:] = fill
             return np.asarray(array)  # a memmap's own indexing costs microseconds
 
@@ -224,10 +222,8 @@ def keep_in_memory(
             shutil.rmtree(place)
             scratch.release(_holds.pop(parts))
     place = place_of(folder) or parts.readlink()
-    try:
+    with naming(f"{parts}: {place}"):
         _holds[parts] = scratch.hold(place)
-    except OSError as problem:
-        raise UserError(f"{parts}: {place}: {problem.strerror or problem}") from None
 
 
 def place_of(folder: Path) -> Path | None:

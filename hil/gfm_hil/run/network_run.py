@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.columns import Columns
 from gfm_hil.recording.run import Run, Signals, nominal_frequency, read_scenario
@@ -67,15 +67,14 @@ class NetworkRun(Mapping[str, Run]):
         """The metrics of each run by converter, see ``Run.metrics``."""
         return {name: run.metrics for name, run in self.items()}
 
-    def conclude(self, folder: Path, report: Report | None = None) -> None:
-        """Write what the runs share into a folder that has theirs and the scenario. Raises
-        UserError: the folder cannot be written."""
-        try:
+    def conclude(self, folder: Path, report: Report | None = None) -> Self:
+        """Write what the runs share into a folder that has theirs and the scenario; returns this.
+        Raises UserError: the folder cannot be written."""
+        with naming(folder):
             if report is not None and any(run.ticks for run in self.values()):
                 report(replace(self, folder=folder))
             write_text(folder / "summary.json", json.dumps(self.summary, indent=2) + "\n")
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
+        return self
 
     @classmethod
     def recover(cls, folder: Path, report: Report | None = None) -> NetworkRun:
@@ -83,9 +82,7 @@ class NetworkRun(Mapping[str, Run]):
         UserError, Unfinished: as ``run_folder.recover``."""
         scenario = read_scenario(folder)
         runs = {name: recover(place, report) for name, place in _places(folder, scenario).items()}
-        found = cls(scenario, runs, folder)
-        found.conclude(folder, report)
-        return found
+        return cls(scenario, runs, folder).conclude(folder, report)
 
     @classmethod
     def merge(
@@ -110,13 +107,9 @@ class NetworkRun(Mapping[str, Run]):
             name: merge_roles(place, of[name], folder / name, report)
             for name, place in places.items()
         }
-        try:
+        with naming(folder):
             write_scenario(folder, scenario)
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
-        found = cls(scenario, runs, folder)
-        found.conclude(folder, report)
-        return found
+        return cls(scenario, runs, folder).conclude(folder, report)
 
     @classmethod
     def load(cls, folder: str | Path) -> NetworkRun:
@@ -173,9 +166,7 @@ def save_network(run: NetworkRun, folder: str | Path, report: Report | None = No
     check_empty(folder)
     for name, one in run.items():
         save(one, folder / name, report)
-    try:
+    with naming(folder):
         write_scenario(folder, run.scenario)
-    except OSError as problem:
-        raise UserError(f"{folder}: {problem.strerror}") from None
     run.conclude(folder, report)
     return folder

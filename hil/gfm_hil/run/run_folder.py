@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from gfm_hil.core import temporary as scratch
-from gfm_hil.core.errors import Unfinished, UserError
+from gfm_hil.core.errors import Unfinished, UserError, naming
 from gfm_hil.core.files import check_empty, read_json, sync_folder, unfinished, write_text
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
@@ -167,10 +167,8 @@ def _locked(folder: Path, operation: int, patience_s: float, why: str = "") -> I
     """Lock a file of a run folder that only our user can open, so that no other user can keep it
     locked; ``why`` says what it means if another process has."""
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
-    try:
+    with naming(folder / _LOCK):
         handle = os.open(folder / _LOCK, flags, 0o600)
-    except OSError as problem:
-        raise UserError(f"{folder / _LOCK}: {problem.strerror}") from None
     with contextlib.ExitStack() as stack:
         stack.callback(os.close, handle)
         try:
@@ -256,7 +254,7 @@ def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
     """
     folder = Path(folder)
     check_empty(folder)
-    try:
+    with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
         if run.folder is not None:
             shutil.copytree(run.folder, folder, dirs_exist_ok=True)
@@ -276,8 +274,6 @@ def save(run: Run, folder: str | Path, report: Report | None = None) -> Path:
         if report is not None:
             report(replace(run, columns=arrays, folder=folder))
         write_text(folder / "summary.json", json.dumps(run.summary, indent=2) + "\n")
-    except OSError as problem:
-        raise UserError(f"{folder}: {problem.strerror}") from None
     return folder
 
 

@@ -18,7 +18,7 @@ from gfm_hil.controllers import (
     precision,
     read_map,
 )
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.roles import ROLES, Role
 from gfm_hil.core.stopping import Interrupt
 from gfm_hil.engine.compiling import compile_external, compiled_benches
@@ -128,7 +128,7 @@ def run_network(
         controller_commands: by converter, as ``controller_command`` there.
     """
     runs = _run(scenario, folder, progress, notice, report, controller_commands)
-    return _network(scenario, runs, folder, report)
+    return NetworkRun(scenario, runs, folder).conclude(folder, report)
 
 
 def _run(
@@ -144,13 +144,10 @@ def _run(
     def work(benches: Sequence[Bench], places: Mapping[str, Path]) -> _Outcomes:
         try:
             with Interrupt() as interrupt:
-                try:
+                with naming(folder):
                     write_scenario(folder, scenario)
-                    if scenario.parts:
-                        for place, bench in zip(places.values(), benches, strict=True):
-                            write_scenario(place, bench.scenario)
-                except OSError as problem:
-                    raise UserError(f"{folder}: {problem.strerror}") from None
+                    for name, bench in zip(scenario.parts, benches, strict=False):
+                        write_scenario(places[name], bench.scenario)
                 if scenario.in_process:
                     return _run_here(benches, [*places.values()], progress, interrupt), {}
                 return Processes(
@@ -200,15 +197,6 @@ def _record(
         }
 
 
-def _network(
-    scenario: Scenario, runs: dict[str, Run], folder: Path, report: Report | None
-) -> NetworkRun:
-    """The runs of a network, with what they share in its folder."""
-    whole = NetworkRun(scenario, runs, folder)
-    whole.conclude(folder, report)
-    return whole
-
-
 def run_side(
     role: Role,
     scenario: Scenario,
@@ -235,7 +223,9 @@ def run_side(
         return began, {}
 
     runs = _record(scenario, folder, (role,), notice, report, work)
-    return _network(scenario, runs, folder, report) if scenario.parts else runs[""]
+    if scenario.parts:
+        return NetworkRun(scenario, runs, folder).conclude(folder, report)
+    return runs[""]
 
 
 def run_part(

@@ -47,7 +47,7 @@ from gfm_design.margins.admittance import (
 )
 from gfm_design.margins.certificate import Certificate, GridClass, certify
 from gfm_design.model.dead_time import with_dead_time
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import check_empty, write_text
 from gfm_hil.recording.run import Run, controlled_by
 from gfm_hil.run.runner import run_in_memory, run_scenario
@@ -235,14 +235,12 @@ class FrequencyScan:
         folder = Path(folder)
         check_empty(folder)
         content = self.summary() | {"grids": [self._judge(*grid) for grid in grids]}
-        try:
+        with naming(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with (folder / "admittance.csv").open("w", encoding="utf-8", newline="") as file:
                 csv.writer(file).writerows(self.rows())
             save_figures(self, folder, grids)
             write_text(folder / "identification.json", json.dumps(content, indent=2) + "\n")
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
         return folder
 
     def rows(self) -> Iterator[list[Any]]:

@@ -13,7 +13,7 @@ import zmq.auth
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.roles import OTHER, ROLES, Role
 
 _KEY_BYTES = 32
@@ -35,13 +35,12 @@ def write_keys(folder: Path, force: bool = False) -> list[Path]:
             raise UserError(f"{file}: is there already; --force replaces all keys of the folder")
     before = os.umask(0o077)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in files:
-            file.unlink(missing_ok=True)  # an existing file would keep its mode
-        for role in ROLES:
-            zmq.auth.create_certificates(folder, role)
-    except OSError as problem:
-        raise UserError(f"{folder}: {problem.strerror}") from None
+        with naming(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            for file in files:
+                file.unlink(missing_ok=True)  # an existing file would keep its mode
+            for role in ROLES:
+                zmq.auth.create_certificates(folder, role)
     finally:
         os.umask(before)
     return files

@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.listener import Listener
 from gfm_hil.ports.streams.port import METRICS, Follower
@@ -155,10 +155,8 @@ def serve_metrics(collector: RunCollector, host: str, port: int) -> Iterator[int
     port cannot be bound."""
     registry = CollectorRegistry()
     registry.register(collector)
-    try:
+    with naming(f"--prometheus {port}: {host}"):
         server = _Server(host, port, make_wsgi_app(registry))
-    except OSError as problem:
-        raise UserError(f"--prometheus {port}: {host}: {problem.strerror}") from None
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:

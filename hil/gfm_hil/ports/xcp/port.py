@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import can
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import write_text
 from gfm_hil.core.identity import address
 from gfm_hil.ports.port import BesideRun, OperatorPort, say
@@ -42,13 +42,10 @@ class Udp:
 
     def __enter__(self) -> Self:
         """Listen. Raises UserError: it cannot be opened."""
-        try:
+        with naming(f"--host {self._host} --port {self._port}"):
             found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(*found[:3])
             self._socket.bind(found[4])
-        except OSError as problem:
-            where = f"--host {self._host} --port {self._port}"
-            raise UserError(f"{where}: {problem.strerror}") from None
         self._port = self._socket.getsockname()[1]
         return self
 

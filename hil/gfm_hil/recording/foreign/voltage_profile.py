@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import write_text
 from gfm_hil.core.schema import read_model
 from gfm_hil.recording.foreign.channels import RecordingMap
@@ -77,8 +77,6 @@ def grid_profile(
         turned = omega_n * 0.5 * (off[1:] + off[:-1]) * np.diff(columns["t"])
         columns["degrees"] = np.concatenate([[0.0], np.degrees(np.diff(angle) - turned)])
     rows = (",".join(f"{x:.9g}" for x in row) for row in np.stack([*columns.values()], 1))
-    try:
+    with naming(to):
         write_text(Path(to), "\n".join([",".join(columns), *rows]) + "\n")
-    except OSError as problem:
-        raise UserError(f"{to}: {problem.strerror}") from None
     return Path(to)

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import UserError, naming
 from gfm_hil.core.files import replacing
 from gfm_hil.recording.run import Run, bases
 from gfm_hil.recording.waveforms import three_phase
@@ -75,17 +75,14 @@ def export_run(
         waves = three_phase(run.columns, bases(run.scenario), si=phases == "si")
         run = replace(run, columns={**run.columns, **waves})
     written = [file]
-    try:
-        with replacing(file) as part:
-            part.touch()  # the packages say it each in its own way
-            _function(form.writer)(run, part)
-            if form.beside is not None:
-                suffix, writer = form.beside
-                written.append(file.with_suffix(suffix))
-                with replacing(written[-1]) as second:
-                    _function(writer)(run, second)
-    except OSError as problem:
-        raise UserError(f"{file}: {problem.strerror or problem}") from None
+    with naming(file), replacing(file) as part:
+        part.touch()  # the packages say it each in its own way
+        _function(form.writer)(run, part)
+        if form.beside is not None:
+            suffix, writer = form.beside
+            written.append(file.with_suffix(suffix))
+            with replacing(written[-1]) as second:
+                _function(writer)(run, second)
     return written
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from gfm_hil.core.errors import UserError
+from gfm_hil.core.errors import naming
 from gfm_hil.core.files import write_text
 from gfm_hil.realtime.environment import environment
 from gfm_hil.recording.columns import symbol_of
@@ -215,7 +215,7 @@ class Conformity:
         """
         from gfm_hil.studies.conformity.document import write_document
 
-        try:
+        with naming(folder):
             folder.mkdir(parents=True, exist_ok=True)
             write_text(folder / "results.json", json.dumps(self.plain(), indent=1) + "\n")
             write_text(folder / "junit.xml", self._junit())
@@ -234,8 +234,6 @@ class Conformity:
                 tests = [case.id for case in self.cases]
                 draw_matrix(folder / "matrix.png", self.laws, tests, self.matrix)
                 write_text(folder / "report.html", self._page(None))
-        except OSError as problem:
-            raise UserError(f"{folder}: {problem.strerror}") from None
 
     def _junit(self) -> str:
         """One suite a law and test, one case a clause; what cannot be judged is an error, what is
