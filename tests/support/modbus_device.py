@@ -31,10 +31,10 @@ class Bench:
         self.deaf = False
         self.scenario = check_scenario({"title": "made up", "duration": 1.0, "law": LAWS[0]}, "")
         self.device = Device(
-            self.scenario, LAWS, self.look, self.command, heartbeat_ms, lambda: self.now
+            self.scenario, LAWS, self.newest, self.command, heartbeat_ms, lambda: self.now
         )
 
-    def look(self) -> RunState:
+    def newest(self) -> RunState:
         row = dict(self.row)
         reason = "over-current" if row["true_trip"] else ""
         return RunState(row, 1, 0, int(row["state"]), self.law, dict(self.gains), reason)

@@ -23,12 +23,12 @@ _KEEPALIVE = (  # the kernel detects within a minute that the other machine is g
 @dataclass
 class _Peer:
     """A connection; ``since`` is the time of its last whole message or, if it never ``spoke``, of
-    its accept, s. A connection that is ``kept`` may be silent for ever and is not counted."""
+    its accept, s. A connection that is ``exempt`` may be silent for ever and is not counted."""
 
     connection: socket.socket
     since: float
     spoke: bool = False
-    kept: bool = False
+    exempt: bool = False
 
 
 class Listener(socket.socket):
@@ -82,20 +82,20 @@ class Listener(socket.socket):
             if first:
                 self._make_room(spoke=True)
 
-    def keep(self, number: int, kept: bool = True) -> None:
+    def exempt(self, number: int, exempt: bool = True) -> None:
         """Exempt the connection of this descriptor from all limits, or no longer do so."""
         if number in self._peers:
-            self._peers[number].kept = kept
+            self._peers[number].exempt = exempt
 
     def reap(self) -> None:
         """Close the connections that have been silent too long; call this periodically."""
         now = time.monotonic()
         for number, peer in list(self._peers.items()):
-            if not peer.kept and now - peer.since > self._silence_s[peer.spoke]:
+            if not peer.exempt and now - peer.since > self._silence_s[peer.spoke]:
                 self._end(number)
 
     def _make_room(self, spoke: bool) -> None:
-        same = [n for n, p in self._peers.items() if p.spoke == spoke and not p.kept]
+        same = [n for n, p in self._peers.items() if p.spoke == spoke and not p.exempt]
         for number in same[: max(len(same) - self._limit, 0)]:
             self._end(number)
 

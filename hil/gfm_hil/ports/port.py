@@ -68,7 +68,7 @@ class BesideRun:
         self.folder, self._through, self._patient = folder, through, patient
         self._interrupt = interrupt
         self._resources = contextlib.ExitStack()
-        self._gone, self._next_look = False, 0.0
+        self._gone, self._next_check = False, 0.0
         self._places: dict[str, Path] = {}  # once the scenario is there
 
     def __enter__(self) -> BesideRun:
@@ -94,13 +94,13 @@ class BesideRun:
         """Whether no role is alive any more, or the port is to end. What cannot be examined
         is reported, and not over."""
         now = time.monotonic()
-        if not self._gone and now >= self._next_look:
-            self._next_look = now + _POLL_S
+        if not self._gone and now >= self._next_check:
+            self._next_check = now + _POLL_S
             try:
                 self._gone = not any(map(running_roles, self.places.values()))
             except (OSError, UserError) as problem:
                 report("the check whether the run goes on", problem)
-                self._next_look = now + PAUSE_S
+                self._next_check = now + PAUSE_S
         return self._gone or self.interrupted
 
     def wait(self, commands: bool = True) -> None:

@@ -80,7 +80,7 @@ class Duration:
         found[there] = self._ns(begin[there], end[there], T_s) * 1e-3
         return found
 
-    def spread(
+    def histogram(
         self, columns: Columns, T_s: float, first: int = 0, last: int | None = None
     ) -> DurationHistogram:
         """The histogram over the ticks [first, last) with both stamps; read piece by piece."""

@@ -36,7 +36,7 @@ class Panel:
     dots: bool = False  # points without lines; those of a curve ``run`` are values alone
 
 
-def few_ticks(columns: Sequence[ColumnLike], most: int = POINTS) -> NDArray[np.intp]:
+def decimated_ticks(columns: Sequence[ColumnLike], most: int = POINTS) -> NDArray[np.intp]:
     """Ticks between which straight lines follow all columns of a panel.
 
     Half of them at most are the least and the largest value of stretches of the same length, so
@@ -66,7 +66,7 @@ def _height(column: ColumnLike) -> float:
 
 
 def _split(piece: NDArray[Any], heights: NDArray[Any], share: float) -> NDArray[np.intp]:
-    """``few_ticks`` of a piece, shape (curves, ticks), which it divides by the heights."""
+    """``decimated_ticks`` of a piece, shape (curves, ticks), which it divides by the heights."""
     piece /= heights
     np.nan_to_num(piece, copy=False, posinf=0.0, neginf=0.0)
     every = np.arange(piece.shape[1], dtype=float)

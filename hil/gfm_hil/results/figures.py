@@ -33,7 +33,7 @@ from gfm_hil.recording.columns import (
 from gfm_hil.recording.run import Run, bases, controlled_by, nominal_frequency
 from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
-from gfm_hil.results.curves import POINTS, Panel, few_ticks
+from gfm_hil.results.curves import POINTS, Panel, decimated_ticks
 from gfm_hil.results.look import COLOURS as COLOURS
 from gfm_hil.results.look import figure_of, look, own_axes, own_colour, rc, with_look
 from gfm_hil.run.network_run import NetworkRun
@@ -54,7 +54,7 @@ GREY = "#888888"
 _NEAR = 3.0  # half a side of the complex plane: beyond it a locus is not near -1
 
 
-def _thin(t: ColumnLike, x: ColumnLike, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
+def _decimate(t: ColumnLike, x: ColumnLike, factor: float) -> tuple[NDArray[Any], NDArray[Any]]:
     """Least and largest value of each stretch, so that no oscillation is drawn away.
 
     ``t`` and ``x`` are arrays or columns of a file, of which a piece is read at a time.
@@ -116,7 +116,7 @@ def draw_panel(
     ``label``: of the ordinate, see ``dress``."""
     width = rc("lines.linewidth", 1.1)
     for k, (t, x, ours, name) in enumerate(curves):
-        points, style = _thin(*_within(t, x), factor), styles[k % len(styles)]
+        points, style = _decimate(*_within(t, x), factor), styles[k % len(styles)]
         axes.plot(*points, color=own_colour(ours), lw=width, ls=style, label=name)
     dress(axes, title, label)
     axes.ticklabel_format(useOffset=False)
@@ -472,7 +472,7 @@ def _panel(
     bands: Sequence[tuple[float, float]] = (),
 ) -> Panel:
     """Columns by label, times ``factor``, over all of t [s], at ``most`` ticks."""
-    at = few_ticks([*columns.values()], most)
+    at = decimated_ticks([*columns.values()], most)
     curves = {label: _at(x, at) * factor for label, x in columns.items()}
     ends = 0.0, float(t[len(t) - 1 :][0])
     return Panel(title, _at(t, at), curves, ends, events, colours=colours, bands=bands)
@@ -654,7 +654,7 @@ def draw_timing(run: Run) -> Picture:
     figure = _figure((10.5, 3.4))
     left, right = figure.subplots(1, 2)
     for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
-        spread = duration.spread(timing, T_s)
+        spread = duration.histogram(timing, T_s)
         before = np.cumsum(spread.count) - spread.count
         beyond = 1 - before / max(1, len(spread))
         us = np.maximum(spread.ns / 1e3, 0.1)

@@ -88,7 +88,7 @@ def loop_delay(run: Run, set_s: float, margin_s: float) -> LoopDelay:
         run.ticks,
         int(late.sum()),
         int(ages.max()),
-        ROUND_TRIP.spread(run.timing, T_s).percentiles_us() or None,
+        ROUND_TRIP.histogram(run.timing, T_s).percentiles_us() or None,
         {name: round(set_us + us, 2) for name, us in held.percentiles_us().items()},
         int(np.sum(T_s_us * ages >= 1e6 * margin_s)),
     )

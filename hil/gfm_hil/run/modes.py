@@ -133,7 +133,7 @@ def oscillations(x: Vector, T_s: float, f_n: float) -> Oscillations:
 def _swing(slow: Vector, T_s: float, f_n: float) -> Oscillation | None:
     """The strongest oscillation below f_n/2, from the means of each cycle."""
     stride = max(1, len(slow) // _SAMPLES)
-    thin = _thin_out(slow, stride)
+    thin = _decimate(slow, stride)
     longest = _HALF / max(len(thin) * stride * T_s, T_s)
     return _strongest(thin, stride * T_s, (longest, 0.5 * f_n), _LEAST, 0.0)
 
@@ -151,7 +151,7 @@ def _fast_mode(rest: Vector, T_s: float, f_n: float) -> Oscillation | None:
     stride = 1 << max(0, int(np.log2(1.0 / (_A_PERIOD * hertz * T_s))))  # so that filters are few
     ticks = (_FAST_SAMPLES + _TAPS) * stride
     grows = 2 * int(np.argmax(np.abs(rest))) > len(rest)  # then the end shows it best
-    thin = _thin_out(rest[-ticks:] if grows else rest[:ticks], stride)
+    thin = _decimate(rest[-ticks:] if grows else rest[:ticks], stride)
     band = (0.5 * f_n, np.inf)
     return _strongest(thin[:_FAST_SAMPLES], stride * T_s, band, _LEAST_FAST, _SHARE)
 
@@ -166,7 +166,7 @@ def _means(x: Vector, width: float) -> Vector:
     return np.concatenate([np.empty(0), *cycle_means(x, 0, len(x), width)])
 
 
-def _thin_out(x: Vector, stride: int) -> Vector:
+def _decimate(x: Vector, stride: int) -> Vector:
     """Every ``stride``-th sample of x after a low-pass at 0.8 of their Nyquist frequency.
 
     The filter is one-sided, its weight on the earliest ticks of each window: what decays within a

@@ -210,7 +210,7 @@ def _round_trip(timing: Columns, T_s: float) -> dict[str, float] | None:
     """Percentiles, µs; None where no u was received."""
     if not timing.keys() >= {*ROUND_TRIP.needs}:
         return None
-    return ROUND_TRIP.spread(timing, T_s).percentiles_us() or None
+    return ROUND_TRIP.histogram(timing, T_s).percentiles_us() or None
 
 
 def _instructions(counted: ColumnLike) -> dict[str, int]:

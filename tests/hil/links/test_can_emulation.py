@@ -36,13 +36,13 @@ class World:
         """Receive frames of other nodes."""
         for number in numbers:
             emulation.arrive(self.bus, self.places, frame_of(number, bytes(length)), 1, self._ns())
-        assert not emulation.is_through(self.bus, self.places, self._ns())
+        assert not emulation.is_ready(self.bus, self.places, self._ns())
 
     def heard_at(self, after: float) -> list[int]:
         """The frames delivered until ``after`` s after the start."""
         self.now = 100.0 + after
         out, frame = [], np.zeros(1, frame_dtype)
-        while emulation.is_through(self.bus, self.places, self._ns()):
+        while emulation.is_ready(self.bus, self.places, self._ns()):
             emulation.deliver(self.bus, self.places, frame)
             out.append(int(frame["id"][0]))
         return out

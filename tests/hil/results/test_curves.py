@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gfmhil
-from gfm_hil.results.curves import _PIECE, PackedCurves, Panel, few_ticks
+from gfm_hil.results.curves import _PIECE, PackedCurves, Panel, decimated_ticks
 
 from ...support.page import unpacked
 from ...support.processes import wait_for
@@ -20,7 +20,7 @@ def test_lines_between_the_points_follow_every_tick():
     t = np.arange(50_000) * 1e-4
     step = np.where(t < 2.0, 0.5, 1.0 - 0.5 * np.exp(-(t - 2.0) / 0.1))
     swing = np.where(t < 2.0, 0.0, np.exp(-(t - 2.0)) * np.sin(2 * np.pi * 4 * t))
-    at = few_ticks([step, swing])
+    at = decimated_ticks([step, swing])
     assert len(at) < 16_000
     for x, height in ((step, 0.5), (swing, np.ptp(swing))):
         assert np.abs(np.interp(np.arange(len(x)), at, x[at]) - x).max() <= 5e-4 * height
@@ -31,7 +31,7 @@ def test_no_spike_is_lost_where_there_are_too_many_ticks(seed, curves):
     chance = np.random.default_rng(seed)
     noise = chance.normal(size=(curves, 30_000))
     noise[chance.integers(curves), chance.integers(30_000)] = 50.0
-    at = few_ticks(list(noise), 1000)
+    at = decimated_ticks(list(noise), 1000)
     assert len(at) <= 1000 and (np.diff(at) > 0).all() and at[[0, -1]].tolist() == [0, 29_999]
     assert (noise[:, at].max(axis=1) == noise.max(axis=1)).all()
     assert (noise[:, at].min(axis=1) == noise.min(axis=1)).all()
@@ -40,7 +40,7 @@ def test_no_spike_is_lost_where_there_are_too_many_ticks(seed, curves):
 @pytest.mark.parametrize("ticks", [0, 1, 2, 5, _PIECE + 1])
 def test_runs_of_any_length(ticks):
     x = np.sin(np.arange(ticks))
-    at = few_ticks([x, np.full(ticks, np.nan)], 100)
+    at = decimated_ticks([x, np.full(ticks, np.nan)], 100)
     assert len(at) <= min(ticks, 102) and (ticks == 0 or at[-1] == ticks - 1)
 
 

@@ -24,7 +24,7 @@ bus_dtype = np.dtype(
         ("free", "i8"),  # when the frame on the bus ends, ns
         ("waiting", "i8"),  # frames
         ("first", "i8"),  # index of the next frame to deliver
-        ("through", "i8"),  # frames ready for delivery
+        ("ready", "i8"),  # frames ready for delivery
         ("time", "i8", (_LONGEST + 1,)),  # time on the bus by number of data bytes, ns
     ]
 )
@@ -46,13 +46,13 @@ def set_bus(bus: np.ndarray, fd: bool, bitrate: int, data_bitrate: int) -> None:
 @compiled
 def has_room(bus):
     """Whether another frame may ``arrive``."""
-    return bus[0].waiting < PLACES and bus[0].through < PLACES
+    return bus[0].waiting < PLACES and bus[0].ready < PLACES
 
 
 @compiled
 def busy(bus):
     """Whether a frame is on the bus or waits for it."""
-    return bus[0].waiting > 0 or bus[0].through > 0
+    return bus[0].waiting > 0 or bus[0].ready > 0
 
 
 @compiled
@@ -67,12 +67,12 @@ def arrive(bus, places, frame, deliver, now):
     """
     b = bus[0]
     if not b.emulate:
-        _fill(places, PLACES + (b.first + b.through) % PLACES, frame, 1, 0)
-        b.through += 1
+        _fill(places, PLACES + (b.first + b.ready) % PLACES, frame, 1, 0)
+        b.ready += 1
     elif frame[0].id & ERROR:  # an error frame concerns this node only: no arbitration
         b.first = (b.first - 1) % PLACES
         _fill(places, PLACES + b.first, frame, 1, 0)
-        b.through += 1
+        b.ready += 1
     else:
         _fill(places, b.waiting, frame, deliver, now)
         b.waiting += 1
@@ -87,7 +87,7 @@ def _fill(places, k, frame, deliver, at):
 @compiled
 def _arbitrate(b, places, now):
     """Move every frame that has won arbitration by now from waiting to delivery."""
-    while b.waiting > 0 and b.through < PLACES:
+    while b.waiting > 0 and b.ready < PLACES:
         start = places[0].at
         for k in range(1, b.waiting):
             start = min(start, places[k].at)
@@ -100,31 +100,31 @@ def _arbitrate(b, places, now):
                 best = k
         b.free = start + b.time[places[best].length]
         if places[best].deliver:
-            to = PLACES + (b.first + b.through) % PLACES
+            to = PLACES + (b.first + b.ready) % PLACES
             places[to] = places[best]
             places[to].at = b.free
-            b.through += 1
+            b.ready += 1
         b.waiting -= 1
         for k in range(best, b.waiting):  # keep the order of arrival
             places[k] = places[k + 1]
 
 
 @compiled
-def is_through(bus, places, now):
+def is_ready(bus, places, now):
     """Whether a frame is ready for delivery."""
     b = bus[0]
     if b.waiting > 0:
         _arbitrate(b, places, now)
-    return b.through > 0 and places[PLACES + b.first].at <= now
+    return b.ready > 0 and places[PLACES + b.first].at <= now
 
 
 @compiled
 def deliver(bus, places, frame):
-    """Copy the frame that ``is_through`` found into ``frame``, an array of ``wire.frame_dtype``."""
+    """Copy the frame that ``is_ready`` found into ``frame``, an array of ``wire.frame_dtype``."""
     b = bus[0]
     copy(
         frame.ctypes.data, places[PLACES + b.first : PLACES + b.first + 1].ctypes.data + _FRAME_AT,
         MTU_FD,
     )  # fmt: skip
     b.first = (b.first + 1) % PLACES
-    b.through -= 1
+    b.ready -= 1

@@ -19,7 +19,7 @@ from gfm_hil.links.can.emulation import (
     busy,
     deliver,
     has_room,
-    is_through,
+    is_ready,
     place_dtype,
     set_bus,
 )
@@ -164,16 +164,16 @@ def fetch(handle):
     """Read the frames that the socket has; returns whether one is ready to be processed."""
     bus, places, into = _bus(handle), _places(handle), _into(handle)
     # an emulated bus needs every frame's time of arrival: read them all now
-    while has_room(bus) and (bus[0].emulate or bus[0].through == 0) and _read(handle, into):
+    while has_room(bus) and (bus[0].emulate or bus[0].ready == 0) and _read(handle, into):
         arrive(bus, places, into, 1, now_ns() if bus[0].emulate else 0)
-    return is_through(bus, places, now_ns() if bus[0].emulate else 0)
+    return is_ready(bus, places, now_ns() if bus[0].emulate else 0)
 
 
 @compiled
 def _take_frame(handle, frame):
     """The next frame to process, if there is one: of those that were fetched, or of the socket."""
     bus = _bus(handle)
-    if bus[0].emulate or bus[0].through > 0:
+    if bus[0].emulate or bus[0].ready > 0:
         there = fetch(handle)
         if there:
             deliver(bus, _places(handle), frame)

@@ -66,7 +66,7 @@ class Device:
     Args:
         scenario: of the run.
         laws: names of the laws that are ready.
-        look: returns the newest tick.
+        newest: returns the newest tick.
         command: sends a command to the run; called in a separate thread.
         heartbeat_ms: timeout of a client's heartbeat, 0: none.
         elapsed_s: time since the device was started, s.
@@ -81,14 +81,14 @@ class Device:
         self,
         scenario: Scenario,
         laws: Sequence[str],
-        look: Callable[[], RunState | None],
+        newest: Callable[[], RunState | None],
         command: Command,
         heartbeat_ms: int,
         elapsed_s: Callable[[], float],
         unit: int = 1,
     ) -> None:
         self.unit = unit
-        self._look, self._command, self._elapsed_s = look, command, elapsed_s
+        self._newest, self._command, self._elapsed_s = newest, command, elapsed_s
         gains, self._measures = LawDroops(laws), Measures(scenario)
         rating = load_converter(scenario.plant.converter).bases.S_n
         self._set_points = (
@@ -120,7 +120,7 @@ class Device:
 
     def refresh(self) -> None:
         """Update every register to the newest tick."""
-        run, now = self._look(), self._elapsed_s()
+        run, now = self._newest(), self._elapsed_s()
         self._fresh = int(now / TICK_S)
         if run is None:
             return
@@ -148,7 +148,7 @@ class Device:
         now = self._elapsed_s()
         if int(now) != self._second:
             self._second = int(now)
-            run = self._look()
+            run = self._newest()
             if run is not None and run.tick != self._seen:  # the device of a stalled run is dead
                 self._beats, self._seen = self._beats + 1, run.tick
         if self._heart.lost(now):
@@ -156,7 +156,7 @@ class Device:
                 set_point.end(now)
         for set_point in [s for s in self._set_points if s.expired(now)]:
             async with self._lock:
-                run = self._look()
+                run = self._newest()
                 if run is None or not set_point.expired(now):  # a client has just written it
                     continue
                 try:
@@ -192,7 +192,7 @@ class Device:
         if self.local and any(point.path != "715.ControllerHb" for point, _ in points):
             raise Refusal(ExcCodes.ILLEGAL_FUNCTION, "local control: the bench is commanded there")
         async with self._lock:
-            run = self._look()
+            run = self._newest()
             if run is None:
                 raise Refusal(ExcCodes.DEVICE_FAILURE, "the run has not begun")
             plans = self._plans(points, run)

@@ -62,7 +62,7 @@ class Watcher:
         self._code: tuple[float, ...] = ()
         self._asked = -math.inf
 
-    def look(self) -> RunState | None:
+    def newest(self) -> RunState | None:
         """The newest tick of both sides, or None before there is one."""
         plant, controller = self._run.done("plant"), self._run.done("controller")
         if not (plant and controller):
@@ -83,14 +83,14 @@ class Watcher:
         )  # fmt: skip
 
     def forget(self) -> None:
-        """Make the next ``look`` read the names again, after a command."""
+        """Make the next ``newest`` read the names again, after a command."""
         self._asked = -math.inf
 
     def slack(self) -> dict[str, float]:
         """The slack over the last second of ticks by ``SLACK_POINTS``; empty without deadlines."""
         done = self._run.done("plant")
         first = max(done - self._window, 0)
-        left = SLACK.spread(self._run.columns, self._T_s, first, done) if done else None
+        left = SLACK.histogram(self._run.columns, self._T_s, first, done) if done else None
         return {name: left.percentile(q) * 1e-3 for name, q in SLACK_POINTS.items()} if left else {}
 
 

@@ -156,7 +156,7 @@ def _make_device(
     operator = run.operator(place)
     scenario = load_scenario(str(place / "scenario.toml"))
     watcher = Watcher(operator, scenario.T_s)
-    run.first(watcher.look)
+    run.first(watcher.newest)
 
     def command(event: dict[str, Any]) -> None:
         client = CLIENT.get()
@@ -168,7 +168,7 @@ def _make_device(
         watcher.forget()
 
     device = Device(
-        scenario, operator.snapshot()["laws"], watcher.look, command, heartbeat_ms,
+        scenario, operator.snapshot()["laws"], watcher.newest, command, heartbeat_ms,
         lambda: time.monotonic() - began, unit,
     )  # fmt: skip
     return device, watcher
@@ -319,7 +319,7 @@ class Connection(ServerRequestHandler):
         if code == WRITE_ONE and not answer.isError():  # echo the request, not the new value
             answer.address, *answer.registers = struct.unpack(">HH", frame[1:])
         if code != READ and not answer.isError():
-            self.server.keep(self)
+            self.server.exempt(self)
         return answer
 
 
@@ -343,12 +343,12 @@ class Server(ModbusTcpServer):
         self.workers: set[asyncio.Task[None]] = set()
         self._commands: Connection | None = None
 
-    def keep(self, connection: Connection) -> None:
+    def exempt(self, connection: Connection) -> None:
         """Exempt the connection of the last client that commanded from the idle timeout."""
         if self._commands is not None:
-            self.peers.keep(self._commands.number, kept=False)
+            self.peers.exempt(self._commands.number, False)
         self._commands = connection
-        self.peers.keep(connection.number)
+        self.peers.exempt(connection.number)
 
     async def shutdown(self) -> None:
         """Close all connections."""

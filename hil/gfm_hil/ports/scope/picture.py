@@ -85,14 +85,14 @@ class Acquisition:
 
     def window(self, head: int) -> tuple[int, int]:
         """The displayed ticks when ``head`` ticks are done."""
-        self._look(head)
+        self._update(head)
         if self.shown >= 0:
             first = self.shown - self._before
             return first, first + self._span
         last = max(head, self._span)
         return last - self._span, last
 
-    def _look(self, head: int) -> None:
+    def _update(self, head: int) -> None:
         if self._at >= 0 and head >= self._at - self._before + self._span:  # the picture is full
             self._since = head
             if self._trigger.mode == "single":

@@ -156,7 +156,7 @@ class Scope:
             if full := await self._full(bool(session.operator)):
                 await connection.close(CloseCode.TRY_AGAIN_LATER, full)
                 return
-            listener.keep(connection.transport.get_extra_info("socket").fileno())
+            listener.exempt(connection.transport.get_extra_info("socket").fileno())
             run.sessions.add(session)
             try:
                 await session.say("about", **run.about())

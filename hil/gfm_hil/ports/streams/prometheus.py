@@ -102,7 +102,7 @@ def _times(run: LiveRun) -> Iterator[_Values]:
         ("gfmhil_slack_seconds", SLACK, (0.0, 0.001, 0.01, 0.5)),  # low slack is bad
         ("gfmhil_round_trip_seconds", ROUND_TRIP, (0.5, 0.99, 0.999, 1.0)),  # long ones are bad
     ):
-        found = duration.spread(run.columns, run.T_s, *window)
+        found = duration.histogram(run.columns, run.T_s, *window)
         values = [(f"{q:g}", found.percentile(100 * q) * 1e-9) for q in quantiles if found]
         yield name, values
 
@@ -119,7 +119,7 @@ class _Request(WSGIRequestHandler):
     server: _Server
 
     def parse_request(self) -> bool:
-        self.server.socket.keep(self.connection.fileno())  # it has asked
+        self.server.socket.exempt(self.connection.fileno())  # it has asked
         return super().parse_request()
 
     def log_message(self, format: str, *args: Any) -> None:
