@@ -149,6 +149,7 @@ class ColumnInfo:
     quantity: str  # short description
     origin: str = ""  # where it was recorded, in short; may be empty
     words: tuple[tuple[int, str], ...] = ()  # meanings of the values of a code
+    limits: tuple[float, float] | None = None  # of a signal, by the signal table
 
     @property
     def comment(self) -> str:
@@ -184,11 +185,12 @@ _TIMES = {
 
 def _signals(prefix: str, groups: tuple[str, ...], origin: str) -> list[ColumnInfo]:
     """The rows of the signal table's groups, as columns with a prefix."""
-    return [
-        ColumnInfo(f"{prefix}_{s.name}", s.symbol, f"{s.unit} ({s.base})", s.description, origin)
-        for s in SIGNALS
-        if s.group in groups
-    ]
+    found = []
+    for s in SIGNALS:
+        if s.group in groups:
+            about = s.symbol, f"{s.unit} ({s.base})", s.description, origin
+            found.append(ColumnInfo(f"{prefix}_{s.name}", *about, limits=(s.low, s.high)))
+    return found
 
 
 def _time(role: Role, name: str) -> ColumnInfo:

@@ -31,7 +31,7 @@ from gfm_runtime import LawError, law_file
 from gfm_runtime.firmware import Entry, a2l_text, unit_of
 from gfm_runtime.firmware.c_text import identifier
 from gfm_runtime.lawfile import build_law, tied
-from gfm_runtime.signals import SIGNALS, group, table_hash
+from gfm_runtime.signals import group, table_hash
 
 #: error codes
 OUT_OF_RANGE, WRITE_PROTECTED, ACCESS_DENIED, NOT_NOW = 0x22, 0x23, 0x24, 0x33
@@ -40,15 +40,6 @@ _EPK, _MEASURED, _REFERENCES, _LAW, _GAINS = 0x800, 0x1000, 0x8000, 0x9000, 0x10
 _LAW_BYTES = 0x1000  # from the parameters of one law to those of the next
 _A_REFERENCE, _THE_LAW = "a reference", "the law"  # no law has such a name
 _RECORDED_S = 1.0  # how long a write waits until the recording has it
-#: the columns that are a signal of the table, with its range
-_SIGNALS = {
-    f"{prefix}_{s.name}": s
-    for prefix, groups in (
-        ("y", ("y", "y_inner")), ("u", ("u", "u_inner")), ("ref", ("ref",)), ("true", ("y", "d")),
-    )
-    for s in SIGNALS
-    if s.group in groups
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -121,8 +112,7 @@ class Memory:
 
     def _measurement(self, name: str, address: int) -> _Number:
         row = describe(name, self._laws)
-        signal = _SIGNALS.get(name)
-        low, high = (signal.low, signal.high) if signal else (None, None)
+        low, high = row.limits or (None, None)
         entry = Entry(
             name, row.comment, "FLOAT64_IEEE", address, row.unit, low, high, words=row.words
         )
