@@ -9,10 +9,10 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.roles import Role
 from gfm_hil.links import link_names
 from gfm_hil.realtime.priority import one_processor
+from gfm_hil.recording.run import bases
 from gfm_hil.results.report import write_report
 from gfm_hil.run.runner import run_part, run_side
 from gfm_hil.scenario import Scenario
-from gfm_plant import load_converter
 from gfm_runtime.children import name_process
 from gfm_runtime.errors import meant
 
@@ -61,8 +61,8 @@ def call(options: argparse.Namespace) -> int:
 
 def _bench_context(scenario: Scenario) -> BenchContext:
     """What a model in place of the controller is connected to."""
-    delay, bases = scenario.plant.delay, load_converter(scenario.plant.converter).bases
-    return BenchContext(scenario.T_s, scenario.signal_set, bases, delay.samples + delay.fraction)
+    delay = scenario.plant.delay.samples + scenario.plant.delay.fraction
+    return BenchContext(scenario.T_s, scenario.signal_set, bases(scenario), delay)
 
 
 def _of_one(role: Role, scenario: Scenario, converter: str | None) -> Scenario:

@@ -32,8 +32,8 @@ from gfm_hil.ports.modbus.points import (
     VoltVar,
 )
 from gfm_hil.ports.port import Refusal, refusing
+from gfm_hil.recording.run import bases
 from gfm_hil.scenario import Scenario
-from gfm_plant import load_converter
 
 #: carries out a command, or raises UserError
 Command = Callable[[dict[str, Any]], object]
@@ -90,7 +90,7 @@ class Device:
         self.unit = unit
         self._newest, self._command, self._elapsed_s = newest, command, elapsed_s
         gains, self._measures = LawDroops(laws), Measures(scenario)
-        rating = load_converter(scenario.plant.converter).bases.S_n
+        rating = bases(scenario).S_n
         self._set_points = (
             SetPoint("WSet", "P_ref", rating, absolute=1, percent=(0,)),
             SetPoint("VarSet", "Q_ref", rating, absolute=4, percent=(0, 1, 3)),

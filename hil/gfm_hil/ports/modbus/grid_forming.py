@@ -7,8 +7,8 @@ import math
 from gfm_hil.ports.modbus.image import Value
 from gfm_hil.ports.modbus.measures import RunState, exponent, top
 from gfm_hil.ports.modbus.points import Direct, LawDroops
+from gfm_hil.recording.run import bases
 from gfm_hil.scenario import Scenario
-from gfm_plant import load_converter
 from gfm_runtime.states import RUNNING
 
 NUMBER = 64416
@@ -21,7 +21,7 @@ class GridForming(Direct):
     """The points of the draft: references, droops, H, the trip's threshold, angle and E_u."""
 
     def __init__(self, gains: LawDroops, scenario: Scenario) -> None:
-        b = self._bases = load_converter(scenario.plant.converter).bases
+        b = self._bases = bases(scenario)
         self._phase_V = b.V_n / math.sqrt(3)
         self._trip = scenario.plant.protection.over_current
         points = {

@@ -12,9 +12,9 @@ from typing import Any
 from gfm_hil.core.errors import UserError
 from gfm_hil.ports.commands import Operator
 from gfm_hil.ports.modbus.image import VENDOR, Value
+from gfm_hil.recording.run import bases
 from gfm_hil.recording.timing import SLACK
 from gfm_hil.scenario import Scenario
-from gfm_plant import load_converter
 from gfm_plant.names import TRIPS
 from gfm_runtime.signals import SIGNALS
 from gfm_runtime.states import INIT, READY, RUNNING, SAFE, STOPPED
@@ -114,7 +114,7 @@ class Measures:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._bases = load_converter(scenario.plant.converter).bases
+        self._bases = bases(scenario)
 
     def models(self, laws: Sequence[str]) -> dict[int, Mapping[str, Any]]:
         """Every model of the device with the points that determine its layout, for ``Image``."""
