@@ -223,7 +223,7 @@ def tune(
     """
     _check_search(evaluations, starts, seed, decay)
     law = as_law(law)
-    scenario = load_scenario(on) if isinstance(on, str | Path) else on
+    scenario = None if on is None else load_scenario(on)
     if scenario is None and scr:
         raise UserError("scr: are those of a scenario's grid; say which scenario")
     loops = [

@@ -296,7 +296,7 @@ class Law:
         from gfm_hil.studies.linear_loop import loop_under
 
         changes = {key: more.pop(key) for key in more.keys() - _OF_LOOP}
-        if isinstance(on, str | Path) or (changes and isinstance(on, Scenario)):
+        if isinstance(on, str | Path | Scenario):
             on = load_scenario(on, **changes)
         elif changes:
             raise UserError(f"{', '.join(changes)}: no scenario that it could change")

@@ -152,7 +152,7 @@ def run(
     if folder is not None:
         if isinstance(law, Law):
             raise UserError(f"law = {law.name!r}: save it first, as the folder names its file")
-        checked = _load(scenario, {**changes, "law": law})
+        checked = load_scenario(scenario, law=law, **changes)
         notice = notice or _silent
         command = runner.controller_program(checked, controller, ports, notice)
         report = explain_and_report if figures else None
@@ -184,7 +184,7 @@ def run_network(
     Raises:
         UserError: one line a mistake; it has no network; or no operating point.
     """
-    checked = _load(scenario, changes, in_process=folder is None)
+    checked = load_scenario(scenario, in_process=folder is None, **changes)
     if checked.network is None:
         raise UserError("network: the scenario has none; use gfmhil.run")
     for name in (*controllers, *ports):
@@ -206,21 +206,6 @@ def run_network(
     }
     report = explain_and_report if figures else None
     return runner.run_network(checked, Path(folder), progress, notice, report, commands)
-
-
-def _load(
-    scenario: str | Path | Scenario | dict[str, Any],
-    changes: dict[str, Any],
-    in_process: bool = False,
-) -> Scenario:
-    """The scenario with its changes; one that is checked and stays as it is takes no time."""
-    if (
-        isinstance(scenario, Scenario)
-        and not in_process
-        and all(value is None for value in changes.values())
-    ):
-        return scenario
-    return load_scenario(scenario, in_process=in_process, **changes)
 
 
 def _with_name(made: Run, law: Law) -> Run:
@@ -251,7 +236,7 @@ def load_run(
         return Run.load(folder)
     if map is None or scenario is None:
         raise UserError(f"{folder}: a recording takes both, its map and the scenario")
-    return open_recording(folder, map, _load(scenario, {}, in_process=True))
+    return open_recording(folder, map, load_scenario(scenario, in_process=True))
 
 
 def recover(folder: str | Path) -> Run | NetworkRun:
@@ -377,7 +362,7 @@ def compare(
     if recording is not None or map is not None:
         if recording is None or map is None:
             raise UserError("recording, map: give both or none")
-        done = _load(scenario, changes, in_process=True)
+        done = load_scenario(scenario, in_process=True, **changes)
         if done.network is not None:
             raise UserError("recording: is of one converter, the scenario has a network")
         beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}

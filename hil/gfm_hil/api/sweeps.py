@@ -120,7 +120,7 @@ def sweep(
         UserError: a range or number that cannot be, or no such scenario.
         LawError: the law is none, has no such parameter, or cannot be at a value.
     """
-    law, loop = as_law(law), _scenario(on)
+    law, loop = as_law(law), load_scenario(on)
     values = _values(law, gain, low, high, points)
     poles = []
     for k, value in enumerate(values):
@@ -154,7 +154,7 @@ def stability_map(
     Raises:
         UserError, LawError: as ``sweep``; the scenario has a network.
     """
-    law, scenario = as_law(law), _scenario(on)
+    law, scenario = as_law(law), load_scenario(on)
     if scenario.network is not None:
         raise UserError("scr: is that of one converter's grid; the scenario has a network")
     if not 0.0 < scr[0] < scr[1] < math.inf:
@@ -167,10 +167,6 @@ def stability_map(
         watch.progress(i + 1, points, "")
     own = float(law.file.parameters[gain].value)
     return StabilityMap(law.name, gain, own, values, scenario.title, ratios, sigma)
-
-
-def _scenario(on: str | Path | Scenario) -> Scenario:
-    return on if isinstance(on, Scenario) else load_scenario(on)
 
 
 def _values(law: Law, gain: str, low: float | None, high: float | None, points: int) -> Vector:

@@ -72,7 +72,8 @@ def load_scenario(
     """Read, override and check a scenario, its laws and its plant.
 
     Args:
-        given: path or shipped name; content of a file; or a checked scenario.
+        given: path or shipped name; content of a file; or a checked scenario, which comes back
+            itself, in no time, if nothing changes.
         options: what the user calls an override, by its name in ``changed``, e.g.
             ``{"link__type": "--link"}``; messages name it in place of the file.
         in_process: the caller runs it in this process: the link is ``inproc`` unless ``changed``
@@ -90,6 +91,9 @@ def load_scenario(
         UserError: one line per mistake, each with its path, the value and what is allowed.
     """
     where, content = "scenario", {}
+    overrides = {key: value for key, value in changed.items() if value is not None}
+    if isinstance(given, Scenario) and not (overrides or in_process or converter):
+        return given
     if isinstance(given, str | Path):
         where = str(find_scenario(str(given)))
         try:
@@ -103,7 +107,6 @@ def load_scenario(
         content = given.model_dump(mode="json", exclude_none=True)
     else:
         content = copy.deepcopy(given)
-    overrides = {key: value for key, value in changed.items() if value is not None}
     overrides, options = _of_converter(content, converter, overrides, options)
     implied: dict[str, Any] = {}
     if in_process or overrides.get("link__type") == INPROC:

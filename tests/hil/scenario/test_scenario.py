@@ -178,6 +178,13 @@ def test_an_override_of_a_table_that_is_none(here):
         load_scenario("bad.toml", link__type="inproc")
 
 
+def test_a_checked_scenario_without_a_change_is_itself():
+    one = load_scenario("pref_step")
+    assert load_scenario(one) is load_scenario(one, duration=None) is one
+    assert load_scenario(one, seed=one.seed + 1).seed == one.seed + 1
+    assert load_scenario(one, in_process=True).link.type == "inproc"
+
+
 def test_a_short_circuit_ratio_comes_in_place_of_the_files_own_line():
     grid = {"scr": 3.0, "x_over_r": 6.0}
     changes = {"plant__grid__scr": 3.0, "plant__grid__x_over_r": 6.0}, {"plant__grid": grid}
