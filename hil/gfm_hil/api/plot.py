@@ -31,7 +31,7 @@ from gfm_hil.results.figures import (
     pyplot_panels,
     symbol,
 )
-from gfm_hil.results.look import figure_of, look, own_colour, rc, with_look
+from gfm_hil.results.look import figure_of, legend, look, own_colour, rc, with_look
 from gfm_hil.results.look import save as save
 from gfm_hil.studies.certificate import CertifiedLaws
 from gfm_hil.studies.clearing import OF_ANGLE, ClearingTime
@@ -85,7 +85,7 @@ def bode(loop: ClosedLoop, *at: str) -> list[Axes]:
         if stable:
             _mark_margins(gain, phase, *found, k)
     if phase.get_legend_handles_labels()[1]:
-        phase.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
+        legend(phase, loc="best")
     gain.axhline(0.0, color=GREY, lw=0.8)
     gain.set_ylim(bottom=max(gain.get_ylim()[0], _LEAST_DB))
     phase.axhline(-180.0, color=GREY, lw=0.8)
@@ -178,7 +178,7 @@ def step(loop: ClosedLoop | NetworkLoop, of: str | None = None, seconds: float =
         draw_panel(axes, symbol(signal), lines, label=symbol(signal))
     panels[-1].set_xlabel("t [s]", fontsize=rc("axes.labelsize", 9))
     if len(curves) > 1:
-        panels[0].legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best", ncols=4)
+        legend(panels[0], loc="best", ncols=4)
     headline(figure_of(panels), title)
     return panels
 
@@ -203,7 +203,7 @@ def pole_map(loop: ClosedLoop | NetworkLoop) -> Axes:
         title = f"{_title(loop)}: poles, stable where σ < 0"
     _dress_poles(axes, title)
     if isinstance(loop, NetworkLoop):
-        axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
+        legend(axes, loc="best")
     return axes
 
 
@@ -216,9 +216,7 @@ def root_locus(sweep: GainSweep) -> Axes:
     poles = np.concatenate(sweep.poles)
     scale = "log" if values.min() > 0.0 else "linear"
     cloud = axes.scatter(poles.real, poles.imag / (2 * np.pi), 9, values, norm=scale)
-    figure = axes.get_figure()
-    assert figure is not None
-    figure.colorbar(cloud, ax=axes, label=sweep.gain)
+    figure_of([axes]).colorbar(cloud, ax=axes, label=sweep.gain)
     if sweep.values[0] <= sweep.own <= sweep.values[-1]:
         k = int(np.argmin(np.abs(sweep.values - sweep.own)))
         near, label = sweep.poles[k], _of_law(sweep.gain, sweep.own)
@@ -257,11 +255,10 @@ def _of(found: GainSweep | StabilityMap) -> str:
 
 def _explain(axes: Axes, lines: list[Line2D]) -> None:
     """A legend below the axes, where it covers nothing; within those of somebody's figure."""
-    more: dict[str, Any] = {"handles": lines, "fontsize": rc("legend.fontsize", 8)}
     if look().ax:
-        axes.legend(**more, loc="upper left")
+        legend(axes, handles=lines, loc="upper left", frameon=None)
     else:
-        figure_of([axes]).legend(**more, loc="outside lower center", ncols=2, frameon=False)
+        legend(figure_of([axes]), handles=lines, loc="outside lower center", ncols=2)
 
 
 @with_look
@@ -304,7 +301,7 @@ def certificate(found: CertifiedLaws) -> Axes:
     axes.set_yscale("symlog", linthresh=1e-3)
     axes.set(xlabel="frequency in the dq frame [Hz]", ylabel="margin", xlim=(hz[0], hz[-1]))
     if found.certificate.void:
-        axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+        legend(axes)
     grids = found.grids
     dress_alone(axes, f"{', '.join(found.laws)}: strength {grids.weakest:g} to {grids.stiffest:g}")
     return axes
@@ -340,10 +337,8 @@ def clearing_map(found: TransientMap[ClearingTime]) -> list[Axes]:
         for mark, meaning in _ENDS.items():
             x, y = places[np.isin(kinds, mark) & here, :2].T
             axes.plot(x, y, mark, color="w", mec="k", mew=0.7, ms=5, label=meaning)
-    figure_of(panels).legend(
-        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3,
-        fontsize=rc("legend.fontsize", 8), frameon=False,
-    )  # fmt: skip
+    handles, labels = panels[0].get_legend_handles_labels()
+    legend(figure_of(panels), handles=handles, labels=labels, loc="outside lower center", ncols=3)
     return panels
 
 
@@ -361,7 +356,7 @@ def attraction_map(found: TransientMap[Attraction]) -> list[Axes]:
         axes.plot(x, edge, "o-", color=COLOURS[0], lw=rc("lines.linewidth", 1.2), ms=4)
     axes.set(xlabel=_QUANTITY.get(name, name), ylabel="jump of the grid's angle [deg]")
     axes.set(ylim=(-185.0, 185.0), yticks=range(-180, 181, 60))
-    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+    legend(axes)
     dress_alone(axes, f"{found.law}: {found.title}")
     return [axes]
 
@@ -399,7 +394,7 @@ def _clearing_curve(times: Sequence[ClearingTime], x: Vector, quantity: str) -> 
             axes.plot(x[some], y[some], mark, color=COLOURS[0], ms=5, label=name)
     label = _QUANTITY.get(quantity, quantity)
     axes.set(xlabel=label, ylabel="clearing time [s]", ylim=(0.0, None))
-    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False)
+    legend(axes)
     dress_alone(axes, f"{times[0].law}: {times[0].title}")
     return axes
 
@@ -458,8 +453,7 @@ def participations(loop: NetworkLoop, most: int = _SHOWN) -> Axes:
     axes.invert_yaxis()
     axes.set(xlim=(0.0, 1.0), xlabel="participation")
     dress(axes)
-    size = rc("legend.fontsize", 8)
-    axes.legend(fontsize=size, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
+    legend(axes, loc="lower left", bbox_to_anchor=(0, 1), ncols=6)
     return axes
 
 
@@ -590,9 +584,8 @@ def _finish(panels: list[Axes], title: str, *labels: str) -> list[Axes]:
         for one in filter(None, (axes.get_legend() for axes in panels)):
             one.remove()
         handles, names = ([x for pair in part for x in pair] for part in zip(*both, strict=True))
-        figure_of(panels).legend(
-            handles, names, loc="outside lower left", frameon=False, ncols=2, columnspacing=1.0
-        )
+        where: dict[str, Any] = {"loc": "outside lower left", "ncols": 2, "columnspacing": 1.0}
+        legend(figure_of(panels), handles=handles, labels=names, **where)
     else:
-        panels[0].legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="best")
+        legend(panels[0], loc="best")
     return panels

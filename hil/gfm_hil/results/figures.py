@@ -35,7 +35,7 @@ from gfm_hil.recording.timing import LATE, ROUND_TRIP, missed
 from gfm_hil.recording.waveforms import NEEDS, three_phase, usual_window
 from gfm_hil.results.curves import POINTS, Panel, decimated_ticks
 from gfm_hil.results.look import COLOURS as COLOURS
-from gfm_hil.results.look import figure_of, look, own_axes, own_colour, rc, with_look
+from gfm_hil.results.look import figure_of, legend, look, own_axes, own_colour, rc, with_look
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.scenario import Scenario
 from gfm_hil.scenario.expectation import reason_name
@@ -257,12 +257,11 @@ def _legend(axes: Axes, columns: int) -> None:
     for a free place among many points. In a paper it has as many columns as fit."""
     if look().paper:
         labels = axes.get_legend_handles_labels()[1]
-        letters = axes.get_figure().get_figwidth() * 72 / (0.55 * 7.0)  # type: ignore[union-attr]
+        letters = figure_of([axes]).get_figwidth() * 72 / (0.55 * 7.0)
         columns = min(columns, max(1, int(letters / (max(map(len, labels), default=1) + 6))))
-    axes.legend(
-        fontsize=rc("legend.fontsize", 8), frameon=False, loc="lower right", bbox_to_anchor=(1, 1),
-        borderpad=0.2, borderaxespad=0, ncols=columns, handlelength=1.6, columnspacing=1.2,
-        handletextpad=0.5,
+    legend(
+        axes, loc="lower right", bbox_to_anchor=(1, 1), borderpad=0.2, borderaxespad=0,
+        ncols=columns, handlelength=1.6, columnspacing=1.2, handletextpad=0.5,
     )  # fmt: skip
 
 
@@ -654,10 +653,10 @@ def draw_timing(run: Run) -> Picture:
     figure = _figure((10.5, 3.4))
     left, right = figure.subplots(1, 2)
     for duration, colour in ((ROUND_TRIP, COLOURS[0]), (LATE, COLOURS[1])):
-        spread = duration.histogram(timing, T_s)
-        before = np.cumsum(spread.count) - spread.count
-        beyond = 1 - before / max(1, len(spread))
-        us = np.maximum(spread.ns / 1e3, 0.1)
+        took = duration.histogram(timing, T_s)
+        before = np.cumsum(took.count) - took.count
+        beyond = 1 - before / max(1, len(took))
+        us = np.maximum(took.ns / 1e3, 0.1)
         left.loglog(us, beyond, color=colour, lw=1.2, label=duration.meaning)
     left.axvline(T_s * 1e6, color=GREY, lw=0.8, ls=(0, (4, 3)))
     left.text(
@@ -769,7 +768,7 @@ def complex_plane(
     axes.set(xlim=(-_NEAR, _NEAR), ylim=(-_NEAR, _NEAR), aspect="equal")
     axes.set(xlabel=f"Re {of}".rstrip(), ylabel=f"Im {of}".rstrip())
     dress_alone(axes, title)
-    axes.legend(fontsize=rc("legend.fontsize", 8), frameon=False, loc="upper right")
+    legend(axes, loc="upper right")
     return axes
 
 

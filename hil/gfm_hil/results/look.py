@@ -258,6 +258,11 @@ def _middles(edges: NDArray[np.float64]) -> list[float]:
     return found
 
 
+def legend(where: Axes | Figure, **more: Any) -> None:
+    """A legend in small letters without a frame; ``more``: as matplotlib's own takes it."""
+    where.legend(**{"fontsize": rc("legend.fontsize", 8), "frameon": False, **more})
+
+
 def figure_of(axes: Sequence[Axes]) -> Figure:
     """The figure of some axes."""
     figure: Any = axes[0].get_figure()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gfm_design.margins.tolerance import Region, factor
 from gfm_design.model.closed_loop import ClosedLoop
 from gfm_hil.results.figures import COLOURS, GREY, dress
-from gfm_hil.results.look import look
+from gfm_hil.results.look import figure_of, look
 
 _SPAN = 100.0  # 1/s; colours of sigma end there
 _DELAYS = 300
@@ -36,9 +36,9 @@ def draw_sigma(
         axes.contour(x, y, finite, levels=[0.0], colors="k", linewidths=1.2)
     close = () if look().paper else (-1.0, 1.0)  # to 0, where the bar is short
     ticks = [-100.0, -10.0, 0.0, 10.0, 100.0, *close]
-    figure = axes.get_figure()
-    assert figure is not None
-    bar = figure.colorbar(mesh, ax=axes, ticks=ticks, format="%g", label="largest σ [1/s]")
+    bar = figure_of([axes]).colorbar(
+        mesh, ax=axes, ticks=ticks, format="%g", label="largest σ [1/s]"
+    )
     bar.minorticks_off()
     return [_EDGE] * crosses + [_NO_POINT] * bool(np.isnan(sigma).any())
 
