@@ -135,7 +135,6 @@ class GainPhase:
 
 def gain_phase(locus: Locus, omega: Matrix, H: Response, k: int) -> GainPhase:
     """Margins of the locus' k-th channel; omega and H from ``locus.sampled()``."""
-
     alone = locus.of(k)
 
     def at(w: Matrix) -> Response:

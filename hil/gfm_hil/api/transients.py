@@ -130,7 +130,6 @@ def clearing_map(
         UserError: one line a mistake.
         LawError: the law is none, or a stage cannot have a value.
     """
-
     base = load_scenario(on, in_process=True, **changes)
     clearing.event_to_clear(base, longest, after, within)
     work = partial(clearing.clearing_time, longest=longest, after=after, within=within)
@@ -183,7 +182,6 @@ def attraction_map(
     Raises:
         UserError, LawError: as ``clearing_map``.
     """
-
     base = load_scenario(on, in_process=True, **changes)
     angles.check_attraction(base, after, within)
     work = partial(angles.attraction, after=after, within=within)

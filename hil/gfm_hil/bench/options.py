@@ -64,7 +64,6 @@ class BenchOptions:
 def measurements(options: Namespace) -> list[Measurement]:
     """The measurements that the command's options ask for, in order. Raises UserError: an option is
     invalid."""
-
     given = {k: v for k, v in vars(options).items() if v is not None}
 
     def part(kind: str, **changes: Any) -> Measurement:
