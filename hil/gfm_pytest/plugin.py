@@ -7,7 +7,8 @@ It imports only pytest until a test uses the bench.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,6 +117,23 @@ def _folders(out: str | None, nodeid: str, temporary: Any) -> Callable[[], Path]
         return folder
 
     return make
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    call: pytest.CallInfo[None],
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Of wrong input show the line of the test, without what the bench called to find it."""
+    errors = sys.modules.get("gfm_hil.core.errors")
+    if errors and call.excinfo and isinstance(call.excinfo.value, errors.UserError):
+        bench = Path(errors.__file__ or "").parents[1]
+        entry = call.excinfo.tb
+        while (
+            entry.tb_next and bench not in Path(entry.tb_next.tb_frame.f_code.co_filename).parents
+        ):
+            entry = entry.tb_next
+        entry.tb_next = None
+    return (yield)
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

@@ -96,6 +96,27 @@ def test_failing_test_says_why_and_leaves_a_figure(pytester):
     assert figure.read_bytes().startswith(b"\x89PNG")
 
 
+def test_wrong_input_of_a_test_is_told_at_its_line(pytester):
+    pytester.makepyfile(
+        """
+        import pytest
+
+        def test_unknown_key(bench):
+            bench.start("pref_step", plant__factor={"L_g": 1})
+
+        @pytest.mark.gfmhil("nowhere")
+        def test_unknown_scenario(bench):
+            bench.run(0.01)
+        """
+    )
+    result = pytester.runpytest()
+    result.assert_outcomes(failed=1, errors=1)
+    result.stdout.fnmatch_lines(
+        ["E*scenario nowhere: no such file*", "E*plant.factor = *did you mean 'factors'?"]
+    )
+    result.stdout.no_fnmatch_line("*loading.py*")
+
+
 def test_passing_test_passes_and_is_marked_by_its_link(pytester):
     pytester.makepyfile(
         """
