@@ -202,6 +202,8 @@ def _unknown(parser: argparse.ArgumentParser, words: list[str]) -> Exception:
         close = f"; a law's file comes after --law, a scenario's {place}"
     elif "=" in first and not first.startswith("-"):
         close = "; an option changes what --help lists"
+        if "--ramp" in known:
+            close = "; references come right after the run folder, before all options"
         if "--set" in known:
             close = "; a key of the scenario comes after --set, e.g. --set references.P_ref=0.8"
     return UserError(f"{' '.join(words)}: {parser.prog} does not know it{close}")
