@@ -150,7 +150,9 @@ def fill_narrow(
         single_line.assign_lanes(bars, lines),
     )
     x = 0.2 + _LANE * (1 + max(lanes.values(), default=-1))
-    width, height = max(_NARROW, x + _WORDS) + 0.9 * bool(phasors), _STACKED_ROW * (top + 0.3)
+    faults = [event for event in scenario.events if isinstance(event, Fault)]
+    width = max(_NARROW, x + _WORDS) + 0.9 * bool(phasors)
+    height = _STACKED_ROW * (top + 0.3) + 0.3 * bool(faults)  # words below the last node
     figure.set_size_inches(0.72 * width, 0.72 * height)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, width), ylim=(0.75 - height, 0.75), aspect="equal")
@@ -162,7 +164,7 @@ def fill_narrow(
         axes.plot([x, x], [ys[0] + 0.35, ys[-1] - 0.35], color=_INK, lw=3.5, solid_capstyle="butt")
         axes.text(x - 0.03, ys[0] + 0.42, name, fontsize=8.5, color=_INK)
         spots[f"node {name}"] = ((x, ys[-1] - 0.3),) * 2
-        labels[f"node {name}"] = x + 0.3, ys[-1] - 0.5
+        labels[f"node {name}"] = x + 0.3, ys[-1] - 0.75  # below the arrow of a load
         for y, converter in zip(ys, bar.converters, strict=False):
             _in_words(axes, x, y, width, converter, plants[converter], laws[converter])
             spots[converter], labels[converter] = ((x + 0.35, y), (x, y)), (x + 0.3, y - 0.5)
@@ -190,10 +192,9 @@ def fill_narrow(
         labels[name] = x + 0.3, y - 0.45
         if url := _url_of(line, nodes, report):
             _link_area(axes, (at - 0.3, width), y, url, 0.45)
-    for event in scenario.events:
-        if isinstance(event, Fault):
-            *_, text = _fault(axes, scenario, event, spots)
-            axes.text(*labels[_spot_of(event, spots)], text, **_MARKED)
+    for event in faults:
+        *_, text = _fault(axes, scenario, event, spots)
+        axes.text(*labels[_spot_of(event, spots)], text, **_MARKED)
     return axes
 
 

@@ -25,4 +25,4 @@ class CapacitorBank(Component):
         return (Capacitor(name, self.node, self.Q),)
 
     def label(self) -> str:
-        return f"Q {self.Q:g} p.u."
+        return f"Q {self.Q:.4g} p.u."

@@ -146,7 +146,7 @@ class ConstantPowerLoad(Drawing):
 
     def label(self) -> str:
         shares = f", I {self.share_I:g}, Z {self.share_Z:g}" * (self.share_I + self.share_Z > 0.0)
-        return f"constant P {self.P:g}, Q {self.Q:g} p.u.{shares}"
+        return f"constant P {self.P:.4g}, Q {self.Q:.4g} p.u.{shares}"
 
     def lag(self) -> float:
         return self.tau_s

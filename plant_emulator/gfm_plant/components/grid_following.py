@@ -180,7 +180,7 @@ class GridFollowing(Drawing):
     closed: bool = Field(True, description="its breaker at the start")
 
     def label(self) -> str:
-        return f"S {self.S:g}, P {self.P:g}, Q {self.Q:g}"
+        return f"S {self.S:.4g}, P {self.P:.4g}, Q {self.Q:.4g}"
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
         rates = {"k_p": self.k_p, "k_i": math.sqrt(self.k_i)}

@@ -152,7 +152,7 @@ class InductionMotor(Fed):
         return (Branch(name, emf(name), self.node, X / self.S, R / self.S),)
 
     def label(self) -> str:
-        return f"S {self.S:g}, P {self.P:g}, H {self.H:g} s"
+        return f"S {self.S:.4g}, P {self.P:.4g}, H {self.H:g} s"
 
     def sees(self, name: str, banks: Any) -> str:
         return name

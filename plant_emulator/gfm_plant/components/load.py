@@ -41,4 +41,4 @@ class Load(Component):
         return (Shunt(name, self.node, 1 / self.P),)
 
     def label(self) -> str:
-        return f"P {self.P:g}, Q {self.Q:g} p.u."
+        return f"P {self.P:.4g}, Q {self.Q:.4g} p.u."

@@ -127,7 +127,7 @@ class Machine(Rotating):
         return (Branch(name, emf(name), self.node, self.X / self.S, self.R / self.S),)
 
     def label(self) -> str:
-        return f"S {self.S:g}, H {self.H:g} s, X {self.X:g}"
+        return f"S {self.S:.4g}, H {self.H:g} s, X {self.X:.4g}"
 
     def pack(self, record: Any, where: str, T_s: float, omega_b: float) -> None:
         pack_swing(self, record, self.X / self.S, where, T_s, omega_b)

@@ -364,7 +364,7 @@ class SynchronousMachine(Rotating):
 
     def label(self) -> str:
         kinds = [f", {one.kind()}" for *_, one in self._controls()]
-        return f"S {self.S:g}, H {self.H:g} s, X'' {self.X_2:g}{''.join(kinds)}"
+        return f"S {self.S:.4g}, H {self.H:g} s, X'' {self.X_2:.4g}{''.join(kinds)}"
 
     def asked(self, omega: float) -> float:
         if self.governor is None:

@@ -54,6 +54,6 @@ class Transformer(Component):
         return [leakage, Branch(f"{name}.m", self.start, GROUND, X_m, 0.0, switched=False)]
 
     def label(self) -> str:
-        text = f"S {self.S:g}, X {self.X:.3g}, R {self.R:.2g}"
-        text += f", ratio {self.ratio:g}" * (self.ratio != 1.0)
+        text = f"S {self.S:.4g}, X {self.X:.3g}, R {self.R:.2g}"
+        text += f", ratio {self.ratio:.4g}" * (self.ratio != 1.0)
         return text if self.X_m is None else f"{text}, $X_m$ {self.X_m:g}"

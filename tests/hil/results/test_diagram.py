@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.text import Annotation
 
 import gfmhil
 from gfm_hil.results.diagram import draw_diagram, fill_diagram, fill_narrow
@@ -52,6 +53,26 @@ def test_a_fault_is_marked_at_its_place(make):
         dots = [x for line in axes.lines if line.get_marker() == "o" for x in line.get_xdata()]
         assert places[0] == dots[0]  # the terminal, where the capacitor is
     assert places[2] - places[0] == pytest.approx(2 * (places[1] - places[0]))
+
+
+@pytest.mark.parametrize("node", ["bus", "far"])
+def test_the_words_of_a_fault_at_a_load_lie_on_nothing(node):
+    feeder = {"start": "bus", "end": "far", "L": 0.1, "R": 0.01}
+    loads = {name: {"node": name, "P": 1 / 3} for name in ("bus", "far")}
+    network = {"converters": {"A": {"node": "bus"}}, "lines": {"feeder": feeder}, "loads": loads}
+    fault = {"t": 0.5, "type": "fault", "node": node, "R": 0.1}
+    figure = Figure()
+    one = {"title": "two loads", "duration": 1.0, "law": "vsg-2", "network": network}
+    axes = fill_narrow(figure, Scenario.model_validate({**one, "events": [fault]}))
+    figure.draw_without_rendering()
+    (words,) = (text for text in axes.texts if text.get_text() == "fault, 0.5 s")
+    arrows = [text.arrow_patch for text in axes.texts if isinstance(text, Annotation)]
+    others = [text for text in axes.texts if text.get_text() not in ("", words.get_text())]
+    box = words.get_window_extent()
+    assert len(arrows) == 2
+    assert any("0.3333," in text.get_text() for text in others)
+    assert not any(box.overlaps(other.get_window_extent()) for other in [*arrows, *others])
+    assert box.y0 > 0
 
 
 def test_a_transformer_and_a_second_inductor_are_drawn(make):
