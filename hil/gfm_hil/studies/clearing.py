@@ -141,7 +141,8 @@ def event_to_clear(scenario: Scenario, longest: float, after: float, within: flo
         if not least <= value <= _MOST_S:
             raise UserError(f"{name} = {value:g} s: must lie in [{least:g}, {_MOST_S:g}]")
     if scenario.network is not None:
-        raise UserError("network: the clearing time is that of one converter on its grid")
+        one = "network: the clearing time is that of one converter on its grid"
+        raise UserError(f"{one}; here try durations with gfmhil run --set events.0.duration=S")
     some = [k for k, event in enumerate(scenario.events) if getattr(event, "duration", None)]
     if len(some) != 1:
         raise UserError(f"events: one must have a duration, a fault or a sag; {len(some)} have")

@@ -23,9 +23,11 @@ def add_converter_option(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def add_loop_options(command: argparse.ArgumentParser, scenario: str = "pref_step") -> Any:
-    """Law, inner stage, scenario and converter of a loop, and JSON; returns the group in which
-    something else may stand in place of the scenario."""
+def add_loop_options(
+    command: argparse.ArgumentParser, scenario: str = "pref_step", networks: bool = True
+) -> Any:
+    """Law, inner stage, scenario and, if there may be a network, converter of a loop, and JSON;
+    returns the group in which something else may stand in place of the scenario."""
     command.add_argument("--law", help="catalogue name or law file; the scenario's by default")
     add_inner(command)
     where = command.add_mutually_exclusive_group()
@@ -33,7 +35,10 @@ def add_loop_options(command: argparse.ArgumentParser, scenario: str = "pref_ste
         "--scenario", default=scenario,
         help="scenario file or shipped name: plant, references, T_s; %(default)s by default",
     )  # fmt: skip
-    add_converter_option(command)
+    if networks:
+        add_converter_option(command)
+    else:
+        command.set_defaults(converter=None)
     add_settings(command)
     command.add_argument("--json", action="store_true", help="as JSON")
     return where

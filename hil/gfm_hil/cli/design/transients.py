@@ -61,7 +61,7 @@ def _add(kinds: Any, name: str, text: str, scenario: str, after: float) -> argpa
     command: argparse.ArgumentParser = kinds.add_parser(
         name, help=text, description=f"{text}, by runs"
     )
-    add_loop_options(command, scenario)
+    add_loop_options(command, scenario, networks=False)
     command.add_argument(
         "--scr", metavar="LIST", type=numbers, default=[],
         help="short-circuit ratios by commas; that of the scenario by default",
