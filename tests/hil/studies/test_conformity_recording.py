@@ -249,3 +249,22 @@ def test_what_is_wrong_is_told_in_one_line(place: Path, waves: Columns, name: st
     with pytest.raises(UserError, match=words) as found:
         judged(place, change(waves), "wrong.toml")
     assert "\n" not in str(found.value)
+
+
+def test_a_recording_of_which_the_end_is_missing_is_refused(place: Path, waves: Columns) -> None:
+    """The package that reads COMTRADE has zeros there, which would be judged as a trip."""
+    write_float_comtrade(place / "recording.cfg", waves)
+    data = place / "recording.dat"
+    kept = data.read_bytes()[:-5000]
+    data.write_bytes(kept)
+    rows = len(kept) // (8 + 4 * (len(waves) - 1))
+    with pytest.raises(UserError, match=f"data end after {rows} of {len(waves['t'])} samples"):
+        judged(place, {}, kind="cfg")
+
+
+@pytest.mark.parametrize("text", ["", "t,v_a_V\n"])
+@pytest.mark.filterwarnings("error")
+def test_an_empty_recording_is_told_without_a_warning(place: Path, text: str) -> None:
+    (place / "recording.csv").write_text(text)
+    with pytest.raises(UserError, match="nothing below its first line"):
+        judged(place, {}, kind="csv")

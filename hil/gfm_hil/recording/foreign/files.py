@@ -1,5 +1,6 @@
 """The files that recordings come in: each format's channels by name, as numbers."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,9 +33,11 @@ def read_channels(file: Path) -> dict[str, Vector]:
 
 
 def _csv(file: Path) -> dict[str, Vector]:
-    with file.open(encoding="utf-8-sig") as lines:
+    with file.open(encoding="utf-8-sig") as lines, warnings.catch_warnings(action="ignore"):
         head = [name.strip().strip('"') for name in lines.readline().split(",")]
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
+    if not rows.size:
+        raise ValueError("there is nothing below its first line")
     if rows.shape[1] != len(head):
         raise ValueError(
             f"its first line names {len(head)} columns, its second has {rows.shape[1]}"
@@ -80,6 +83,8 @@ def _comtrade(file: Path) -> dict[str, Vector]:
     opened = comtrade.Comtrade(ignore_warnings=True, use_numpy_arrays=True)
     opened.load(str(file))
     rates, t = opened.cfg.sample_rates, np.asarray(opened.time, np.float64)
+    if len(t) > 1 and t[-1] <= t[0]:  # what the package has not read stays 0
+        raise ValueError(f"its data end after {np.argmax(t) + 1} of {len(t)} samples")
     if len(rates) == 1 and rates[0][0] > 0:  # the package has 32-bit floats
         t = np.arange(len(t)) / rates[0][0]
     found = {TIME: t}
