@@ -52,7 +52,7 @@ def in_a_row_words(run: Run) -> str:
     else:
         bears = str(borne)
     share = misses.longest / max(borne or tried, 1)
-    light = light_of(share)
+    light = f"{light_of(share)} by its longest row"
     if not misses.misses:
         return f"{light}: no tick of {misses.ticks} was missed; {label} bears {bears} in a row here"
     return (
