@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import U_CARRIED, ClosedLoop, frequencies_near
+from gfm_design.model.closed_loop import U_CARRIED, ClosedLoop
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.api.transients import SCR
@@ -141,7 +141,7 @@ def _crossings(x: Vector, y: Vector) -> Vector:
 def nyquist(loop: ClosedLoop, *at: str) -> Axes:
     """Draw L in the complex plane near -1, over positive frequencies; arguments and errors as
     ``bode``."""
-    loci = {name: L for name, _, L in _gains(loop, at)}
+    loci = {symbol_of(name): L for name, _, L in _gains(loop, at)}
     return complex_plane(f"{_title(loop)}: L, one loop cut", loci, (0.0, 1.0, None), "L")
 
 
@@ -555,7 +555,9 @@ def _gains(
 def _hz(loop: ClosedLoop) -> Vector:
     """The frequencies of a figure, closer together where the loop resonates."""
     top = _TOP_HZ if loop.T_s is None else 0.5 / loop.T_s
-    near = frequencies_near(loop.poles()) / (2 * np.pi)
+    poles = loop.poles()
+    across = np.tan(np.linspace(-1.5, 1.5, 60))  # a resonance is a circle in the complex plane
+    near = np.abs(poles.imag[:, None] + across * poles.real[:, None]).ravel() / (2 * np.pi)
     base = np.geomspace(_LOWEST_HZ, 0.999 * top, _POINTS)
     return np.unique(np.concatenate([base, near[(near > _LOWEST_HZ) & (near < base[-1])]]))
 

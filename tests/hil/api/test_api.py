@@ -116,8 +116,11 @@ def test_a_closed_loop_of_a_law_draws_what_it_says():
     assert abs(L + 10 ** (there[0] / 20)) < 0.03 * abs(L)
     turned = phase / 360 - np.angle(loop.loop_gain("E_u", 2 * np.pi * hz)) / (2 * np.pi)
     assert np.allclose(turned, np.round(turned)) and np.abs(np.diff(phase)).max() < 180
-    labels = [line.get_label() for line in plot.nyquist(loop).lines]
-    assert labels[:2] == ["omega_u", "E_u"]  # the regulated source ignores i_u
+    loci = plot.nyquist(loop).lines
+    assert [line.get_label() for line in loci[:2]] == ["ω_u", "E_u"]  # its source ignores i_u
+    for x, y in (line.get_data() for line in loci[:2]):  # the circles of resonances are round
+        z = x + 1j * y
+        assert np.abs(np.diff(z))[abs(z[1:]) < 1].max() < 0.25
     staged = gfmhil.Law.load("vsg-2").closed_loop("deep_sag")  # a stage commands both axes of E
     for figure in (plot.bode(staged)[0], plot.nyquist(staged)):
         labels = [line.get_label() for line in figure.lines]
