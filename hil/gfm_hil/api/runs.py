@@ -366,11 +366,10 @@ def compare(
         if done.network is not None:
             raise UserError("recording: is of one converter, the scenario has a network")
         beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}
+    names = {"converter": "converter (--converter)"}  # whoever calls this
     with law_files(laws) as files:
         scenarios = {
-            name: load_scenario(
-                scenario, {"converter": "converter"}, folder is None, converter, law=file, **changes
-            )
+            name: load_scenario(scenario, names, folder is None, converter, law=file, **changes)
             for name, file in files.items()
         }
         if folder is not None:
