@@ -119,7 +119,8 @@ def _line(at: Path, errors: Sequence[Any], model: Any) -> str:
 
 
 def _said(error: Any) -> str:
-    return str(error["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+    said = str(error["msg"]).removeprefix("Value error, ").partition(" after validation, not")[0]
+    return re.sub("^(Input|String|Dictionary|List|Tuple) should", "must", said)
 
 
 def _quoted(text: str) -> list[str]:
