@@ -5,6 +5,7 @@ larger than memory. ``open_file``, ``read_file`` and ``read_json`` are the only 
 """
 
 import contextlib
+import errno
 import io
 import os
 import secrets
@@ -30,7 +31,8 @@ _LONGEST = 1 << 17  # bytes of an entry, at most: a name and an extra field of 6
 def check_empty(folder: Path) -> None:
     """Raise UserError if a folder to write to holds something already, or is none."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder}: is not empty; choose another folder, or delete it")
+        what = "is not empty" if folder.is_dir() else "is no folder"
+        raise UserError(f"{folder}: {what}; choose another folder, or delete it")
 
 
 def open_file(path: Path, most: int | None = None) -> io.BufferedReader:
@@ -124,9 +126,12 @@ def replacing(path: Path) -> Iterator[Path]:
     The data is on disk before the rename is, so that a power failure leaves either the old file or
     the new one. If the block raises, ``path`` stays as it was. The file is new and its name cannot
     be told in advance, so that nobody can put a link in its place; if ``path`` is a link, the file
-    replaces the link. Raises OSError: the file cannot be written; it names ``path``, not the path
-    beside it.
+    replaces the link. Raises OSError: the file cannot be written, or ``path`` is a device or a
+    pipe, which the rename would destroy; it names ``path``, not the path beside it.
     """
+    other = path.exists() and not (path.is_file() or path.is_dir())
+    if other or path.parent.resolve() == Path("/dev"):  # whose links lead to files, too
+        raise OSError(errno.EINVAL, "is a device or a pipe; give the name of a file", str(path))
     part = path.with_name(f"{_PREFIX}{secrets.token_hex(8)}-{path.name}")
     try:
         os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
