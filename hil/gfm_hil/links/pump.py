@@ -83,6 +83,7 @@ class PumpedLink:
         link, handle, message = self._link, self._pump, np.empty(LONGEST, np.uint8)
         moved, give_up = time.monotonic_ns(), float("inf")
         while time.monotonic() < give_up:
+            stopping = self._stopping.is_set()  # before looking: what the loop sent last is there
             size = ring.take(handle, message)
             if size:
                 link.send(message[:size].tobytes())
@@ -92,13 +93,13 @@ class PumpedLink:
             now = time.monotonic_ns()
             if size or came is not None:
                 moved = now
-            elif self._stopping.is_set():
+            elif stopping:
                 return
             elif now - moved < _YIELDS_NS:
                 os.sched_yield()
             else:
                 link.wait(_SLEEP_S)
-            if self._stopping.is_set():
+            if stopping:
                 give_up = min(give_up, time.monotonic() + _FAREWELL_S)
 
 

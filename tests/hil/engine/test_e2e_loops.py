@@ -131,6 +131,7 @@ def lied_to(
         while not liar.heard_the_end() and time.monotonic() < give_up:
             ends[OTHER[role]].wait(0.1)
             liar.listen()
+        assert liar.heard_the_end()
     finally:
         liar.over.set()
         for end in ends.values():

@@ -263,6 +263,22 @@ def test_the_port_sends_and_receives_the_same(way, ends):
             getattr(link, "stop", lambda: None)()
 
 
+def test_a_pumped_link_sends_what_comes_while_it_is_told_to_stop():
+    """Between the thread's look for a message of the loop and its look whether to stop."""
+
+    class Late(QueueLink):
+        def receive(self) -> None:
+            if not pumped._stopping.is_set():
+                assert pumped.send(b"the last")
+                pumped._stopping.set()
+
+    pumped = with_port(Late("plant", "late", {}))
+    pumped.start()
+    assert pumped._stopping.wait(PATIENCE_S)
+    pumped.stop()
+    assert QueueLink.ends["late"]["controller"] == [b"the last"]
+
+
 def test_a_closed_end_does_nothing(way, ends):
     link = ends["plant"]
     link.close()
