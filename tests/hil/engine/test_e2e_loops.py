@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from gfm_hil.core.roles import ROLES, Role
+from gfm_hil.engine import drive
 from gfm_hil.engine.drive import Share, run_loop
 from gfm_hil.engine.process import compile_role
 from gfm_hil.engine.setup import make_bench
@@ -39,6 +40,13 @@ GROUPS: dict[Role, Group] = {"plant": "u", "controller": "y"}  # what each side 
 OTHER: dict[Role, Role] = {"plant": "controller", "controller": "plant"}
 LIMIT_S = 20.0
 LOCKSTEP = {"mode": "lockstep", "duration": 4.0}
+
+
+@pytest.fixture(autouse=True)
+def _leaves_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No loop waits long for a last word, which most liars do not say."""
+    monkeypatch.setattr(drive, "_LAST_NS", 100_000_000)
+
 
 by_link = pytest.mark.parametrize("link", LINKS)
 

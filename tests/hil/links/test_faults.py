@@ -21,7 +21,7 @@ from ...support.links import LINKS, PATIENT, Pair, run_pair
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(900)]
 
 REPORT = os.environ.get("GFMHIL_FAULTS_REPORT")
-TICKS = 100_000 if REPORT else 2_000
+TICKS = 100_000 if REPORT else 1_000
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "loss": {"loss": 0.01},
     "burst": {"loss": 0.01, "burst": 4.0},
