@@ -48,7 +48,8 @@ def bench(tmp_path: Path, capsys: Any, kind: str, *options: str) -> dict[str, An
 @alone
 @pytest.mark.apt
 def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
-    found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", "--seconds", "0.02", *NONE)
+    short = ("--seconds", "0.02", "--rounds", "1")
+    found = bench(tmp_path, capsys, "latency", "--links", "shm,zmq", *short, *NONE)
     rows = found["results"]
     assert {r["link"] for r in rows} == {"shm", "zmq"}
     assert {(r["mode"], r["load"]) for r in rows} == {
@@ -66,10 +67,9 @@ def test_latency_puts_every_link_beside_its_limit(tmp_path, capsys):
     assert found["environment"]["cpus"] == len(os.sched_getaffinity(0))
 
 
-@alone
 @pytest.mark.apt
 def test_every_peer_answers_beside_its_limit(tmp_path, capsys):
-    short = ("--seconds", "0.05", "--load", "idle", "--mode", "lockstep")
+    short = ("--seconds", "0.05", "--load", "idle", "--mode", "lockstep", "--policy", "other")
     found = bench(tmp_path, capsys, "latency", "--links", "shm", *short)
     rows = {row["link"]: row for row in found["results"] if row["peer"] not in ("ours", "C")}
     expected = {name for name in PEERS if not missing_packages(name)}

@@ -40,21 +40,25 @@ def other_side(*line):
             process.terminate()
 
 
-@alone  # in real time, beside another test, all answers may be late
-@pytest.mark.parametrize("link", ["tcp", "udp", "shm", "pty", "can"])
-def test_both_ways_over_every_link(link, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("link", "modes"),
+    [
+        *[(link, "lockstep") for link in ("tcp", "shm", "pty")],
+        # in real time, beside another test, all answers may be late
+        *[pytest.param(link, "lockstep,realtime", marks=alone) for link in ("udp", "can")],
+    ],
+)
+def test_both_ways_over_every_link(link, modes, tmp_path, capsys):
     place, port = uuid.uuid4().hex, free_port()
     endpoint = {
         "shm": f"shm://{place}", "pty": f"pty://{tmp_path}/line", "can": "can+udp://127.0.0.1:"
         f"{20000 + port % 20000}",
     }.get(link, f"{link}://127.0.0.1:{port}")  # fmt: skip
     with other_side(*GFMHIL, "bench", "answer", endpoint):
-        line = ("latency", "--to", endpoint, "--as", "far", "--load", "idle")
-        rows = bench(tmp_path, capsys, *line, "--seconds", "0.05", "--rounds", "1")
+        line = ("latency", "--to", endpoint, "--as", "far", "--rounds", "1", *SHORT)
+        rows = bench(tmp_path, capsys, *line, "--mode", modes)
     rows = [row for row in rows["results"] if row["peer"] == "to"]
-    assert [(row["name"], row["mode"]) for row in rows] == [
-        ("far", "lockstep"), ("far", "realtime")
-    ]  # fmt: skip
+    assert [(row["name"], row["mode"]) for row in rows] == [("far", mode) for mode in modes.split(",")]
     for row in rows:
         assert row["n"] == row["sent"] - row["lost"] > 0
         assert 0 < row["bench_us"] < row["p50_us"]

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 T_NS = 100_000
 #: by method, how many stalls and the least pause between them, s: /proc is read every 0.1 s
-STALLS = {"trace": (60, 0.08), "proc": (60, 0.3)}
+STALLS = {"trace": (40, 0.08), "proc": (40, 0.3)}
 NAMES = {"fifo": "thread stall-fifo", "busy": "thread stall-busy", "stop": STOPPED}
 #: provokes stalls of 2 to 5 ms of threads in turn, and prints (kind, begin, end) of each
 PROVOKE = """
@@ -66,7 +66,7 @@ def trace(tmp_path_factory):
         mounted = place
     yield
     if mounted:
-        subprocess.run(["umount", str(mounted)], check=True)
+        subprocess.run(["umount", "--lazy", str(mounted)], check=True)
 
 
 def provoked(tmp_path: Path, stalls_wanted: int, pause_s: float):
