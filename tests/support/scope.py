@@ -156,8 +156,9 @@ class Browser:
 
         options = webdriver.ChromeOptions()
         options.binary_location = shutil.which("chromium") or ""
-        for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
-            options.add_argument(argument)
+        # a graphics processor that is emulated would take most of a processor
+        for word in ("headless=new", "disable-gpu", "no-sandbox", "disable-dev-shm-usage"):
+            options.add_argument(f"--{word}")
         options.add_argument(f"--window-size={width},{height}")
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         service = webdriver.ChromeService(shutil.which("chromedriver") or "")

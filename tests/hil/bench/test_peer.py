@@ -58,9 +58,9 @@ def test_both_ways_over_every_link(link, modes, tmp_path, capsys):
         line = ("latency", "--to", endpoint, "--as", "far", "--rounds", "1", *SHORT)
         rows = bench(tmp_path, capsys, *line, "--mode", modes)
     rows = [row for row in rows["results"] if row["peer"] == "to"]
-    assert [(row["name"], row["mode"]) for row in rows] == [("far", mode) for mode in modes.split(",")]
+    assert [row["mode"] for row in rows] == modes.split(",")
     for row in rows:
-        assert row["n"] == row["sent"] - row["lost"] > 0
+        assert row["name"] == "far" and row["n"] == row["sent"] - row["lost"] > 0
         assert 0 < row["bench_us"] < row["p50_us"]
         if link == "can":  # its frames have no room for a clock
             assert "clock" not in row
