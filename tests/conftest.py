@@ -52,20 +52,24 @@ _MOST_WORKERS = 8  # more would compile the same functions once more each
 #: Files that take longest in the other tiers, the longest first. Workers begin with them, and then
 #: with those of most tests: one that begins last leaves all processors but one idle.
 _LONGEST = (
-    "test_wheel.py", "runtime/test_firmware_c.py", "hil/controllers/test_shared_start.py",
-    "hil/engine/test_compiling.py", "hil/studies/test_conformity.py",
-    "hil/bench/test_peer.py", "hil/ports/test_modbus.py",
-    "hil/engine/test_left_behind.py", "hil/recording/test_recover.py",
-    "hil/engine/test_network_links.py", "hil/api/test_testing.py",
-    "hil/controllers/test_controllers.py", "hil/controllers/test_pil.py",
-    "hil/ports/test_scope_browser.py", "hil/ports/test_scope_crowd.py", "hil/links/test_faults.py",
-    "hil/ports/test_telemetry.py", "hil/engine/test_e2e_loops.py", "hil/engine/test_kill.py",
-    "hil/ports/test_xcp.py", "hil/studies/test_identification.py", "hil/studies/test_campaign.py",
-    "hil/studies/test_unit_fit.py", "runtime/test_firmware_targets.py",
-    "runtime/test_firmware_fixed.py", "hil/run/test_network.py", "hil/run/test_network_parts.py",
-    "runtime/test_firmware.py", "hil/links/test_inner_links.py", "plant/test_network.py",
-    "plant/test_bridge.py", "hil/scenario/test_published.py", "hil/cli/test_network_design.py",
-    "plant/test_bergeron_line.py", "design/test_certificate.py", "test_packaging.py",
+    "test_wheel.py", "hil/recording/test_recover.py", "hil/ports/test_scope_browser.py",
+    "runtime/test_firmware_c.py", "hil/api/test_testing.py", "hil/studies/test_conformity.py",
+    "hil/ports/test_scope_crowd.py", "hil/controllers/test_library.py", "hil/run/test_counts.py",
+    "hil/controllers/test_snapshot.py", "hil/bench/test_peer.py",
+    "hil/engine/test_network_links.py", "hil/engine/test_processes.py",
+    "hil/engine/test_left_behind.py", "hil/ports/test_modbus.py", "hil/engine/test_compiling.py",
+    "hil/ports/test_telemetry.py", "hil/controllers/test_shared_start.py",
+    "hil/results/test_export_can.py", "hil/bench/test_bench.py",
+    "hil/controllers/test_controllers.py", "hil/controllers/test_pil.py", "hil/engine/test_kill.py",
+    "hil/studies/test_identification.py", "hil/ports/test_telemetry_metrics.py",
+    "hil/engine/test_sd_notify.py", "hil/engine/test_loops.py", "hil/links/test_can.py",
+    "hil/ports/test_xcp.py", "test_deploy_sandbox.py", "hil/ports/test_operator.py",
+    "hil/studies/test_campaign.py", "hil/studies/test_unit_fit.py",
+    "runtime/test_firmware_targets.py", "runtime/test_firmware_fixed.py", "hil/run/test_network.py",
+    "hil/run/test_network_parts.py", "runtime/test_firmware.py", "hil/links/test_inner_links.py",
+    "plant/test_network.py", "plant/test_bridge.py", "hil/scenario/test_published.py",
+    "hil/cli/test_network_design.py", "plant/test_bergeron_line.py", "design/test_certificate.py",
+    "test_packaging.py",
 )  # fmt: skip
 #: Of the fast tier: the file that compiles the loop in process first, and those that find it
 #: compiled if they begin when files of more tests than this have ended.

@@ -257,15 +257,16 @@ def test_set_points_follow_the_signals_of_stages_and_of_counts(more: dict[str, A
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("link", ["shm", "zmq"])
-def test_over_a_link_every_bit_is_that_in_process(link: str, tmp_path: Path) -> None:
+def test_over_two_links_every_bit_is_that_in_process(tmp_path: Path) -> None:
     content = network({**ALL, "control": "V"}, duration=0.3)
     alone = gfmhil.run_network(load_scenario(content), folder=tmp_path / "alone")
-    other = copy.deepcopy(content) | {"link": {"type": link}}
-    gfmhil.run_network(load_scenario(other), folder=tmp_path / link)
+    other = copy.deepcopy(content) | {"link": {"type": "shm"}}
+    other["network"]["converters"]["A"]["link"] = {"type": "zmq"}
+    apart = gfmhil.run_network(load_scenario(other), folder=tmp_path / "apart")
     assert alone.status == "completed"
+    assert [apart[name].summary["link"] for name in "AB"] == ["zmq", "shm"]
     for name in "AB":
-        a, b = (np.load(tmp_path / x / name / "signals.npz") for x in ("alone", link))
+        a, b = (np.load(tmp_path / x / name / "signals.npz") for x in ("alone", "apart"))
         assert a.files == b.files
         assert all(a[x].tobytes() == b[x].tobytes() for x in a.files)
 
