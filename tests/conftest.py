@@ -129,6 +129,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run the fast tier on all processors, a file at a time, unless told how many (``-n``)."""
+    if not getattr(config.option, "reruns", None):
+        # its thread would keep the sides of a run from beginning as copies of this process
+        config.pluginmanager.unregister(name="rerunfailures")
     if hasattr(config, "workerinput"):  # a worker, which must not start workers
         return
     config.option.loadscopereorder = False  # see longest_first

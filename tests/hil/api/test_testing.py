@@ -33,6 +33,12 @@ Lab = Callable[..., Experiment]
 pytest_plugins = ["pytester"]
 
 
+@pytest.fixture(autouse=True)
+def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No plugin has a thread: the sides of runs begin as copies of pytest, also from now on."""
+    monkeypatch.setenv("PYTEST_ADDOPTS", "-p no:rerunfailures")
+
+
 @pytest.fixture
 def lab(tmp_path: Path) -> Lab:
     """Makes an experiment like the fixture's, started with the given arguments."""
