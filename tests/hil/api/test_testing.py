@@ -33,10 +33,15 @@ Lab = Callable[..., Experiment]
 pytest_plugins = ["pytester"]
 
 
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No plugin has a thread: the sides of runs begin as copies of pytest, also from now on."""
-    monkeypatch.setenv("PYTEST_ADDOPTS", "-p no:rerunfailures")
+#: of pytest's plugins the one whose thread keeps the sides of a run from beginning as its copies
+ONE_THREAD = ("-p", "no:rerunfailures")
+
+
+@pytest.fixture
+def pytester(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
+    """It runs in this process, where such a thread would stay."""
+    monkeypatch.setenv("PYTEST_ADDOPTS", " ".join(ONE_THREAD))
+    return pytester
 
 
 @pytest.fixture
@@ -204,7 +209,7 @@ def project(name: str, tmp_path: Path, *options: str) -> subprocess.CompletedPro
     """Run pytest in a copy of an example project."""
     copy = tmp_path / name
     shutil.copytree(EXAMPLES / name, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *ONE_THREAD, *options]
     return subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
 
 
