@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.alone]
 
 T_NS = 100_000
 #: by method, how many stalls and the least pause between them, s: /proc is read every 0.1 s
-STALLS = {"trace": (40, 0.08), "proc": (40, 0.3)}
+STALLS = {"trace": (60, 0.08), "proc": (60, 0.3)}
 NAMES = {"fifo": "thread stall-fifo", "busy": "thread stall-busy", "stop": STOPPED}
 #: provokes stalls of 2 to 5 ms of threads in turn, and prints (kind, begin, end) of each
 PROVOKE = """
