@@ -186,12 +186,7 @@ def _make(
     st["u"][:, :, COMPARE:] = st["u_now"][:, COMPARE:] = -1.0
     st["phase_seen"] = st["phase_sums"] = math.nan
     network.net["conversions"] = conversions
-    supervisor = network.net["supervisor"][0]
-    for number, (name, controller) in enumerate(supervisors, 1):
-        controller.supervise(name, number, wiring, supervisor)
-    network.net["followers"] = supervisor[: len(par)].any()
-    follow = np.flatnonzero(supervisor[len(par) :])
-    network.of(GridFollowing)["follower"][follow] = len(par) + follow
+    _number_followers(network, supervisors)
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
     now["closed"], now["stands_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
@@ -239,6 +234,16 @@ def _together(
                 before = found.get(one.node)
                 found[one.node] = one if before is None else replace(before, C=before.C + one.C)
     return tuple(found.values())
+
+
+def _number_followers(network: Network, supervisors: Sequence[tuple[str, PlantController]]) -> None:
+    """Say of each converter and neighbour which plant controller commands it."""
+    supervisor, N = network.net["supervisor"][0], len(network.par)
+    for number, (name, controller) in enumerate(supervisors, 1):
+        controller.supervise(name, number, network.wiring, supervisor)
+    network.net["followers"] = supervisor[:N].any()
+    follow = np.flatnonzero(supervisor[N:])
+    network.of(GridFollowing)["follower"][follow] = N + follow
 
 
 def _network(

@@ -558,9 +558,10 @@ def acts(s: Response, T_s: float, u_delay: Matrix) -> Response:
     return np.asarray(hold[:, None] * np.exp(-s[:, None] * u_delay))[:, :, None]
 
 
-def frequencies_near(poles: Response) -> Matrix:
-    """Frequencies [rad/s] across the resonance of each pole [1/s], in no order."""
-    return np.asarray(np.abs(poles.imag[:, None] + _ACROSS * poles.real[:, None]).ravel())
+def frequencies_near(poles: Response, across: Matrix = _ACROSS) -> Matrix:
+    """Frequencies [rad/s] across the resonance of each pole [1/s], in no order: so many of its
+    decay rates beside it."""
+    return np.asarray(np.abs(poles.imag[:, None] + across * poles.real[:, None]).ravel())
 
 
 class Responses:

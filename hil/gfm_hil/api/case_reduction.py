@@ -6,7 +6,7 @@ from dataclasses import replace
 from gfm_hil.api.power_flow import FlowBranch, PowerFlow, named
 
 
-def reduced(flow: PowerFlow) -> PowerFlow:
+def simplify(flow: PowerFlow) -> PowerFlow:
     """The same case, whose other buses keep their voltages, without buses at which there is nothing
     and which are the end of one branch, or between a negative reactance and one more branch."""
     empty = [

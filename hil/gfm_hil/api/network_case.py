@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from gfm_design.model.operating_point import node_voltages, operating_point
-from gfm_hil.api.case_reduction import reduced
+from gfm_hil.api.case_reduction import simplify
 from gfm_hil.api.dyr_machines import Machines, read_machines
 from gfm_hil.api.power_flow import PowerFlow, named, read_pandapower
 from gfm_hil.core.errors import UserError
@@ -142,7 +142,7 @@ def network_from(
             part that a network cannot have; a generator without a rating; a law that has no steady
             state there.
     """
-    flow = reduced(read_pandapower(case, title, frequency))
+    flow = simplify(read_pandapower(case, title, frequency))
     machines = Machines({}, ()) if dynamics is None else read_machines(dynamics)
     flow = _with_following(flow, machines)
     names = [bus.name for bus in flow.buses]

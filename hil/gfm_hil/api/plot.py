@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gfm_design.model.closed_loop import U_CARRIED, ClosedLoop
+from gfm_design.model.closed_loop import U_CARRIED, ClosedLoop, frequencies_near
 from gfm_design.model.linear import Mode
 from gfm_design.model.network import NetworkLoop
 from gfm_hil.api.transients import SCR
@@ -555,9 +555,8 @@ def _gains(
 def _hz(loop: ClosedLoop) -> Vector:
     """The frequencies of a figure, closer together where the loop resonates."""
     top = _TOP_HZ if loop.T_s is None else 0.5 / loop.T_s
-    poles = loop.poles()
     across = np.tan(np.linspace(-1.5, 1.5, 60))  # a resonance is a circle in the complex plane
-    near = np.abs(poles.imag[:, None] + across * poles.real[:, None]).ravel() / (2 * np.pi)
+    near = frequencies_near(loop.poles(), across) / (2 * np.pi)
     base = np.geomspace(_LOWEST_HZ, 0.999 * top, _POINTS)
     return np.unique(np.concatenate([base, near[(near > _LOWEST_HZ) & (near < base[-1])]]))
 

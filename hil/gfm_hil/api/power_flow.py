@@ -70,7 +70,7 @@ class PowerFlow:
 def read_pandapower(case: Any, title: str, frequency: float | None = None) -> PowerFlow:
     """Solve a net of pandapower, and read it as pandapower itself hands it to PYPOWER."""
     need("pandapower", "pandapower", "a power-flow case", "networks")
-    import pandapower  # an optional package, and seconds of imports
+    # an optional package, and seconds of imports
     from pandapower.converter.pypower import to_ppc
 
     ignored: list[str] = []
@@ -92,15 +92,7 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
         case = _load_pandapower(str(case))
     if len(case.bus) > _MOST_BUSES:
         raise UserError(f"{of}: {len(case.bus)} buses: at most {_MOST_BUSES}")
-    if not case.ext_grid.in_service.any() and not case.gen.query("slack and in_service").size:
-        raise UserError(f"{of}: has no slack: an ext_grid, or a gen with slack")
-    try:
-        pandapower.runpp(
-            case, init="dc", tolerance_mva=1e-9, numba=False, enforce_q_lims=False,
-            calculate_voltage_angles=False, trafo_model="pi",
-        )  # fmt: skip
-    except Exception as problem:  # of many kinds, from inside
-        raise UserError(f"{of}: its power flow does not converge: {problem}") from None
+    _solve(case, of)
     ppc = to_ppc(case, calculate_voltage_angles=False, trafo_model="pi", init="results", mode="pf")
     S_b = ppc["baseMVA"]
     names: dict[int, str] = {}
@@ -124,9 +116,8 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
         Z = complex(row[2], row[3])
         branches.append(FlowBranch(a, b, Z, float(row[4]), float(ratio), bool(transformer)))
     comes = V * (_admittance(shunt, branches) @ V).conj() + load
-    ratings, by_power = _ratings(case, where, place, S_b)
-    static = _static(case, where, place, S_b)
-    sources = _sources(case, where, place)
+    ratings, raised = _ratings(case, where, place, S_b, comes)
+    static, sources = _static(case, where, place, S_b), _sources(case, where, place)
     ignored += [
         f"{len(case[table])} {table}: {why}."
         for table, why in _IGNORED.items()
@@ -134,11 +125,9 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
     ]
     if turning := int((case.trafo.shift_degree % 30 != 0).sum()):
         ignored.append(f"{turning} trafo: they turn no phase.")
-    for k in by_power:
-        if abs(comes[k]) > ratings[k]:
-            ratings[k] = abs(comes[k])
-            name = named(names[int(bus[k, 0])])
-            ignored.append(f"Machines at {name}: max_p_mw is less than they bring, their rating.")
+    for k in raised:
+        name = named(names[int(bus[k, 0])])
+        ignored.append(f"The power at {name} is the rating of the machines: it is above max_p_mw.")
     buses = [
         Bus(names[int(row[0])], V[k], load[k] + static.get(k, (0j, 0.0))[0], shunt[k],
             comes[k] if k in ratings else 0j, ratings.get(k), *static.get(k, (0j, 0.0)),
@@ -155,11 +144,27 @@ def read_pandapower(case: Any, title: str, frequency: float | None = None) -> Po
     return PowerFlow(of, title, S_b * 1e6, float(case.f_hz), buses, branches, slack, ignored)
 
 
+def _solve(case: Any, of: str) -> None:
+    """Solve the power flow of a net."""
+    import pandapower
+
+    if not case.ext_grid.in_service.any() and not case.gen.query("slack and in_service").size:
+        raise UserError(f"{of}: has no slack: an ext_grid, or a gen with slack")
+    try:
+        pandapower.runpp(
+            case, init="dc", tolerance_mva=1e-9, numba=False, enforce_q_lims=False,
+            calculate_voltage_angles=False, trafo_model="pi",
+        )  # fmt: skip
+    except Exception as problem:  # of many kinds, from inside
+        raise UserError(f"{of}: its power flow does not converge: {problem}") from None
+
+
 def _ratings(
-    case: Any, where: Any, place: Mapping[int, int], S_b: float
-) -> tuple[dict[int, float | None], set[int]]:
-    """Rating of the generators of each bus, p.u., None if one of them has none; and of which buses
-    it is their largest power, or the largest reactive power of a condenser, which has no other."""
+    case: Any, where: Any, place: Mapping[int, int], S_b: float, comes: NDArray[np.complex128]
+) -> tuple[dict[int, float | None], list[int]]:
+    """Rating of the generators of each bus, p.u., None if one of them has none: ``sn_mva``, or the
+    largest power (of a condenser the largest reactive power), or what comes, if that is more; and
+    at which buses it is more."""
     ratings, by_power = dict[int, float | None](), set[int]()
     for table in ("gen", "ext_grid"):
         for _, row in _working(case, case[table]).iterrows():
@@ -169,7 +174,8 @@ def _ratings(
             ratings[k] = None if not by or before is None else before + float(row[by[0]]) / S_b
             if by and by[0] != "sn_mva":
                 by_power.add(k)
-    return ratings, {k for k in by_power if ratings[k] is not None}
+    raised = [k for k in by_power if (S := ratings[k]) is not None and abs(comes[k]) > S]
+    return ratings | {k: float(abs(comes[k])) for k in raised}, raised
 
 
 def _sources(case: Any, where: Any, place: Mapping[int, int]) -> dict[int, float]:

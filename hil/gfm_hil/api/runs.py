@@ -366,7 +366,7 @@ def compare(
         if done.network is not None:
             raise UserError("recording: is of one converter, the scenario has a network")
         beside = {Path(recording).name: _with_metrics(open_recording(recording, map, done))}
-    names = {"converter": "converter (--converter)"}  # whoever calls this
+    names = {"converter": "converter (--converter)"}  # in Python and on the command line
     with law_files(laws) as files:
         scenarios = {
             name: load_scenario(scenario, names, folder is None, converter, law=file, **changes)
