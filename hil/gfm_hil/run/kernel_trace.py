@@ -171,6 +171,12 @@ def tracefs() -> Path | str:
     return "tracefs is not mounted: mount -t tracefs nodev /sys/kernel/tracing"
 
 
+# when the pipe ends; a process that dies may hold the files of its instance a while yet
+_REMOVE = """read _; echo 0 > "$0/tracing_on"
+for _ in 1 2 3 4 5 6 7 8 9; do rmdir "$0" 2>/dev/null && exit; sleep 0.2; done; rmdir "$0"
+"""
+
+
 class KernelTrace:
     """A trace of some processors, until ``stop``.
 
@@ -186,7 +192,7 @@ class KernelTrace:
         self._here = place / "instances" / f"{_PREFIX}{os.getpid()}-{time.monotonic_ns()}"
         self._here.mkdir()
         self._guard = subprocess.Popen(  # removes the instance, also after a kill of this process
-            ["sh", "-c", 'read _; echo 0 > "$0/tracing_on"; rmdir "$0"', str(self._here)],
+            ["sh", "-c", _REMOVE, str(self._here)],
             stdin=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
         self._vectors: list[str] = []

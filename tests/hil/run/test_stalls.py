@@ -102,30 +102,35 @@ def provoked(tmp_path: Path, stalls_wanted: int, pause_s: float):
         yield kind, [why.names[k] for k in here], {CAUSES[why.causes[k]] for k in here}
 
 
-@pytest.mark.parametrize("method", STALLS)
-def test_a_provoked_stall_has_its_name_in_95_of_100(tmp_path, method, request, monkeypatch):
-    """/proc does not show a stop of 2 ms between two readings, nor always who ran while it is
-    read; then no other thread is blamed."""
-    if method == "trace":
-        request.getfixturevalue("trace")
-    elif not may_sched_fifo():
-        pytest.skip("needs the right to SCHED_FIFO")
-    else:
-        monkeypatch.setattr("gfm_hil.run.stalls.tracefs", lambda: "no trace")
-    right, unseen, wrong = 0, 0, Counter[tuple[str, str]]()
-    for kind, names, causes in provoked(tmp_path, *STALLS[method]):
+def test_the_trace_names_95_of_100_provoked_stalls(tmp_path, trace):
+    wanted, pause_s = STALLS["trace"]
+    right, wrong = 0, Counter[tuple[str, str]]()
+    for kind, names, causes in provoked(tmp_path, wanted, pause_s):
         assert "link" not in causes
-        most = Counter(names).most_common(1)
-        named = most[0][0] if most else "no miss"
+        named = Counter(names).most_common(1)[0][0] if names else "no miss"
         if named.startswith(NAMES[kind]):
             right += 1
-        elif named in (UNREAD, nobody("proc")):
-            unseen += 1
-        else:
+        elif named != UNREAD:
             wrong[kind, named] += 1
-    assert right + unseen + wrong.total() == STALLS[method][0]
-    assert wrong.total() <= 0.05 * STALLS[method][0], wrong
-    assert right > unseen
+    assert right > wanted / 2
+    assert wrong.total() <= 0.05 * wanted, wrong
+
+
+def test_proc_blames_no_thread_that_did_not_run(tmp_path, monkeypatch):
+    """/proc does not show a stop of 2 ms between two readings, nor always who ran while it is
+    read, and on a busy machine the host takes its part: how many have a name is not judged."""
+    if not may_sched_fifo():
+        pytest.skip("needs the right to SCHED_FIFO")
+    monkeypatch.setattr("gfm_hil.run.stalls.tracefs", lambda: "no trace")
+    wanted, pause_s = STALLS["proc"]
+    right, blamed = 0, Counter[tuple[str, str]]()
+    for kind, names, causes in provoked(tmp_path, wanted, pause_s):
+        assert "link" not in causes
+        right += any(name.startswith(NAMES[kind]) for name in names)
+        blamed.update((kind, name) for name in {*names} if name.startswith("thread "))
+    others = {one: n for one, n in blamed.items() if not one[1].startswith("thread stall-")}
+    assert sum(others.values()) <= 0.05 * wanted, others
+    assert right
 
 
 def test_proc_shows_the_thread_that_a_loop_waited_for():
