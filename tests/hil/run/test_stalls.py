@@ -30,9 +30,9 @@ NAMES = {"fifo": "thread stall-fifo", "busy": "thread stall-busy", "stop": STOPP
 #: provokes stalls of 2 to 5 ms of threads in turn, and prints (kind, begin, end) of each
 PROVOKE = """
 import json, os, signal, sys, time
-loops, n, pause = json.loads(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-done = []
+n, pause, done = int(sys.argv[1]), float(sys.argv[2]), []
 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(60))  # its sleeps take no processor
+loops = json.loads(sys.stdin.readline())
 for k in range(n):
     cpu, thread = list(loops.items())[k % len(loops)]
     kind = ("fifo", "busy", "stop")[k % 3]
@@ -77,23 +77,24 @@ def provoked(tmp_path: Path, stalls_wanted: int, pause_s: float):
         "law": "mimo-gfm", "link": {"type": "shm", "peer_timeout_s": 5.0},
         "late_policy": {"hold": 10**9},
     }  # fmt: skip
-    folder, children = tmp_path / "run", []
-    with ProcessorWatch() as watch:
+    folder = tmp_path / "run"
+    command = [sys.executable, "-c", PROVOKE, str(stalls_wanted), str(pause_s)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as child, ProcessorWatch() as watch:
+        ended = False
 
         def progress(ticks, misses):
-            if ticks > 5_000 and not children:
+            nonlocal ended
+            if ticks > 5_000 and not watch.loops:
                 watch.begin(loops_of(folder))
-                loops = json.dumps(watch.loops)
-                how = str(stalls_wanted), str(pause_s)
-                command = [sys.executable, "-c", PROVOKE, loops, *how]
-                children.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-            if len(children) == 1 and children[0].poll() is not None:
-                children.extend(children)  # once
+                print(json.dumps(watch.loops), file=child.stdin, flush=True)
+            if not ended and child.poll() is not None:
+                ended = True
                 os.kill(os.getpid(), signal.SIGINT)
 
         run = run_scenario(check_scenario(content, "test"), folder, progress)
+        made = json.loads(child.communicate(timeout=60)[0])
     assert run.status == "interrupted"
-    made = json.loads(children[0].communicate(timeout=60)[0])
     timing = {name: np.array(column[:]) for name, column in run.timing.items()}
     why = attribute(timing, T_NS, (), watch.taken, [*watch.loops])
     at = timing["plant_scheduled"][missed_ticks(timing)]
