@@ -200,10 +200,11 @@ def wait_reason(plant: PlantRecords, k: int) -> str:
     )
 
 
-def trip_reason(plant: PlantRecords, k: int = 0) -> str:
-    """Say what tripped converter k, with quantity, value, threshold and time; "" without a trip."""
+def trip_reason(plant: PlantRecords, k: int = 0, before: int = 0) -> str:
+    """Say what tripped converter k, with quantity, value, threshold and time, "" without a trip;
+    ``before``: ticks of the plant before the run whose time that is."""
     r, s = plant.par[k], plant.st[k]
-    code, tick, value = int(s["trip"]), int(s["trip_tick"]), float(s["trip_value"])
+    code, tick, value = int(s["trip"]), int(s["trip_tick"]) - before, float(s["trip_value"])
     if code == 0:
         return ""
     T_s = float(r["T_s"])

@@ -192,12 +192,14 @@ class Timeline:
     def _found(self, ctl: Any, st: Any) -> tuple[Status, str] | None:
         """The fault that keeps our side from running, if any; the cause before its consequences."""
         trip = int(st["trip"][self._bench.place]) if "plant" in self._roles else 0
+        bench = self._bench
+        why = trip_reason(bench.plant.records, bench.place, bench.before) if trip else ""
         if trip not in (0, CONTROLLER):
-            return "tripped", trip_reason(self._bench.plant.records, self._bench.place)
+            return "tripped", why
         if "controller" in self._roles and int(ctl["state"][0]) == SAFE:
             heard = int(ctl["reason"][0]) == PLANT_TRIP
             return "tripped" if heard else "safe", safe_reason(ctl)
-        return ("safe", trip_reason(self._bench.plant.records, self._bench.place)) if trip else None
+        return ("safe", why) if trip else None
 
     def checked(self, found: SynchroCheckResult, tick: int) -> None:
         """Log how a synchro-check has ended."""
