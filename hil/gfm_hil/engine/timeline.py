@@ -75,7 +75,7 @@ class Timeline:
             ours.insert(0, (round(scenario.snapshot / scenario.T_s), _SNAPSHOT))
         self._todo = deque[tuple[int, Any]](sorted(ours, key=lambda entry: entry[0]))
         self._inbox: deque[tuple[Any, Ticket]] = deque()
-        self._changes = 0
+        self._changes = int(bench.controller.ctl["changes"][0])  # more after a snapshot
         self._lines: deque[dict[str, Any]] = deque()
         self.put_off = False  # a write may take longer than a tick
         self.outcome: Outcome | None = None

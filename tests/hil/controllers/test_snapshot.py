@@ -204,7 +204,10 @@ def test_a_run_of_a_law_goes_on_in_process(tmp_path, inner):
     )
     later = {**given, "duration": 0.05, "start_from": str(cut), "ready_laws": ["droop-5"],
              "events": [{**events[3], "tick": 700 - CUT}]}  # fmt: skip
-    check_equal(gfmhil.run(later), whole, CUT, OF_TIME)
+    rest = gfmhil.run(later)
+    check_equal(rest, whole, CUT, OF_TIME)
+    of_laws = [[e["tick"] for e in r.events if e["event"] == "law-active"] for r in (whole, rest)]
+    assert of_laws[1] == [tick - CUT for tick in of_laws[0] if tick >= CUT]
 
 
 def test_a_trip_after_a_snapshot_has_the_tick_of_the_new_run(tmp_path):
