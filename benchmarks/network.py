@@ -102,6 +102,9 @@ def rigs() -> dict[str, Scenario]:
     made["four, one of two levels"] = star(4, 1, bridges["two levels"])
     made["four, one of two levels, 2 us"] = star(4, 1, late)
     made["four of two levels"] = star(4, 4, bridges["two levels"])
+    made["two levels, from counts"] = load_scenario(
+        "rig_switched", in_process=True, plant__bridge=bridges["two levels"], counts="rig"
+    )
     made["two levels, 2 us, from counts"] = load_scenario("rig_switched", in_process=True)
     return made
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gfm_plant.layout import field
 from gfm_plant.model import V_DC
 from gfm_plant.period import advance
-from gfm_plant.phases import along, stands
+from gfm_plant.phases import along, frame_turn
 from gfm_plant.records import I_F, I_O, PlantRecords, V
 from gfm_plant.solution import circuit, mirror_sources, own
 from gfm_runtime.compiled import cached, compiled
@@ -89,7 +89,7 @@ def _next(plant: PlantRecords, steps: int, first: float, at: float, last: float)
 @compiled
 def _see(plant: PlantRecords, seen: NDArray[Any], row: int, at: float) -> None:
     r, s, w = plant.par[0], plant.st[0], field(plant.now[0], "w")
-    turn = stands(plant, at)
+    turn = frame_turn(plant, at)
     i, v, i_o = w[own(0) + I_F] * turn, w[own(0) + V] * turn, w[own(0) + I_O] * turn
     seen[row, 0], seen[row, 1], seen[row, 2] = at, s.x[V_DC], s.mid
     for x in range(3):

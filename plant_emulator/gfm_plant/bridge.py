@@ -217,11 +217,12 @@ def _load(plant: PlantRecords, k: int, c: int, unit: int) -> None:
         s.E[0] = s.E[1] = 0.0
         return
     limit_voltage(s, r.m_max * s.ends[0, DC])
-    half = turned(0.5 * n.omega_b * s.u_now[1] * n.unit_s)
-    E = complex(s.E[0], s.E[1]) * s.ahead * half
-    i = complex(s.ends[0, 0], s.ends[0, 1]) * field(n, "axis")[c].conjugate()
-    counts = modulate(r, s, E, s.ends[0, DC], i)
-    if not s.u_now[COMPARE] < 0.0:  # those of the controller
+    if s.u_now[COMPARE] < 0.0:  # the controller gives none
+        half = turned(0.5 * n.omega_b * s.u_now[1] * n.unit_s)
+        E = complex(s.E[0], s.E[1]) * s.ahead * half
+        i = complex(s.ends[0, 0], s.ends[0, 1]) * field(n, "axis")[c].conjugate()
+        counts = modulate(r, s, E, s.ends[0, DC], i)
+    else:
         counts = _taken(r, s, 0), _taken(r, s, 1), _taken(r, s, 2)
     down = n.updates == 2 and unit % 2 == 1  # the second half of the carrier's period
     for x in range(3):

@@ -188,7 +188,7 @@ def _make(
     network.net["conversions"] = conversions
     _number_followers(network, supervisors)
     st["u"][:, :, 1] = st["u_now"][:, 1] = grid.omega_g
-    now["closed"], now["stands_tick"] = grid_node is not None, -1
+    now["closed"], now["frame_tick"] = grid_node is not None, -1
     now["omega_g"] = now["omega_g_to"] = grid.omega_g
     now["V_g"] = now["V_g_to"] = grid.V_g
     connect_new(network, wiring)
@@ -539,9 +539,10 @@ def _pack_phases(par: Record, phases: Phases, T_s: float) -> None:
         ("noise", phases.noise_std, 0.0), ("skew", phases.skew_s, 0.0),
     ):  # fmt: skip
         par[f"phase_{name}"] = [values.get(channel, default) for channel in CHANNELS]
+    par["skewed"] = (par["phase_skew"] != 0).any()
     ends = [phases.ends(channel) for channel in CHANNELS]
     par["phase_lo"] = [low for low, _ in ends]
-    par["phase_lsb"] = [(high - low) / 2**phases.bits for low, high in ends]
+    par["phase_per_lsb"] = [2**phases.bits / (high - low) for low, high in ends]
     par["phase_top"] = 2**phases.bits - 1
     par["phase_samples"], par["phase_weights"] = phases.samples, (0.0, 0.0, 1.0)
     if phases.samples << phases.bits > 1 << COUNT_BITS:

@@ -11,6 +11,7 @@ from typing import Any
 from gfm_plant.joint import drop_dead, fault_phases
 from gfm_plant.layout import field
 from gfm_plant.period import advance, go_back, keep
+from gfm_plant.phases import frame_turn
 from gfm_plant.records import PlantRecords
 from gfm_plant.solution import circuit, enter, mirror_sources
 from gfm_runtime.compiled import compiled, inlined
@@ -146,7 +147,7 @@ def _pass_on(plant: PlantRecords, at: float) -> None:
     if n.contact_w >= 0:
         i_a, i_b, i_c = contact_currents(plant, at, 0)
         vector = complex((2.0 * i_a - i_b - i_c) / 3.0, (i_b - i_c) / math.sqrt(3.0))
-        field(plant.now[0], "w")[n.contact_w] = vector * _turn(plant, at).conjugate()
+        field(plant.now[0], "w")[n.contact_w] = vector * frame_turn(plant, at).conjugate()
 
 
 @compiled
@@ -175,7 +176,7 @@ def contact_currents(plant: PlantRecords, at: float, j: int) -> tuple[float, flo
     """Return the currents of phases a, b, c through contact j, of several or the only one, at an
     instant of the period."""
     n, now = plant.net[0], plant.now[0]
-    by_w, w, turn = field(n, "contact_current")[now.contact], field(now, "w"), _turn(plant, at)
+    by_w, w, turn = field(n, "contact_current")[now.contact], field(now, "w"), frame_turn(plant, at)
     if now.joint:
         by_w = (
             field(n, "pole_carries")[j - 1] if j else field(n, "fault_carries")[fault_phases(now)]
@@ -186,11 +187,3 @@ def contact_currents(plant: PlantRecords, at: float, j: int) -> tuple[float, flo
         i_b += by_w[1, i] * w[i]
         i_c += by_w[2, i] * w[i]
     return (i_a * turn).real, (i_b * turn).real, (i_c * turn).real
-
-
-@compiled
-def _turn(plant: PlantRecords, at: float) -> complex:
-    """Return e^(j omega_b t): from the common frame to the one that stands still."""
-    n = plant.net[0]
-    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
-    return complex(math.cos(angle), math.sin(angle))

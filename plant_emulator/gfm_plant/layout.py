@@ -307,8 +307,8 @@ now_dtype = _header(
         ("order", "i8"),  # of the matrices of `powers`
         ("behind", "i8"),  # whether the network goes on behind a `port` in this unit
         # e^(j omega_b t) at the beginning of a period, and its tick
-        ("stands", "c16"),
-        ("stands_tick", "i8"),
+        ("frame_turn", "c16"),
+        ("frame_tick", "i8"),
         # grid simulator: values now, where ramps lead, and p.u./s (inf: a step)
         ("closed", "i8"),
         ("omega_g", "f8"),

@@ -156,9 +156,11 @@ def _names(wiring: Wiring) -> frozenset[str]:
 def _take_state(part: Network, whole: Network, units: Sequence[int]) -> None:
     """Put a part where the whole plant is."""
     its, now, N = part.now[0], whole.now[0], len(whole.par)
-    for name in ("closed", "omega_g", "omega_g_slope", "omega_g_to", "V_g", "V_g_to", "sequence"):
+    for name in (
+        "closed", "omega_g", "omega_g_slope", "omega_g_to", "V_g", "V_g_to", "sequence",
+        "frame_turn", "frame_tick",
+    ):  # fmt: skip
         its[name] = now[name]
-    its["stands_tick"] = now["stands_tick"]
     w = dict(zip(whole.wiring.order, now["w"], strict=False))
     its["w"][: len(part.wiring.order)] = [w[name] for name in part.wiring.order]
     places, g = whole.wiring.sources(), len(units)

@@ -19,7 +19,7 @@ from gfm_plant.components import (
 from gfm_plant.dc_link import advance_dc_link
 from gfm_plant.layout import field
 from gfm_plant.model import DELTA, V_DC, terminal
-from gfm_plant.phases import apply_counts, stands
+from gfm_plant.phases import apply_counts, frame_turn
 from gfm_plant.records import COMPARE, I_F, I_O, N_COMMANDS, PlantRecords, V
 from gfm_plant.solution import (
     circuit,
@@ -121,7 +121,7 @@ def take_command(plant: PlantRecords, k: int, part: int) -> None:
             begin = 0.0
             for before in range(part):
                 begin += field(n, "stretch")[before]
-            frame = field(now, "unit")[k] * stands(plant, begin)
+            frame = field(now, "unit")[k] * frame_turn(plant, begin)
             apply_counts(plant, k, frame, field(n, "stretch")[part])
     else:
         s.u_now[1] = now.omega_g + 0.5 * n.T_s * now.omega_g_slope  # see `trip`

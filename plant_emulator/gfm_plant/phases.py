@@ -21,12 +21,20 @@ _A = np.array([1.0, complex(-0.5, math.sqrt(0.75)), complex(-0.5, -math.sqrt(0.7
 _SEED = np.uint64(1 << 62)  # tells the noise of the phases from that of `sensors`
 
 
-@compiled
-def stands(plant: PlantRecords, at: float) -> complex:
-    """Return e^(j omega_b t) at an instant of the period, s after its beginning."""
-    n = plant.net[0]
-    angle = n.omega_b * (n.T_s * plant.st[0].tick + at)
-    return complex(math.cos(angle), math.sin(angle))
+@inlined
+def frame_turn(plant: PlantRecords, at: float) -> complex:
+    """Return e^(j omega_b t) at an instant of the period, s after its beginning: from the common
+    frame to the one that stands still."""
+    n, now, tick = plant.net[0], plant.now[0], plant.st[0].tick
+    if at == n.T_s:
+        tick, at = tick + 1, 0.0
+    if at == 0.0 and tick == now.frame_tick:
+        return now.frame_turn
+    angle = n.omega_b * (n.T_s * tick + at)
+    turn = complex(math.cos(angle), math.sin(angle))
+    if at == 0.0:
+        now.frame_turn, now.frame_tick = turn, tick
+    return turn
 
 
 @inlined
@@ -34,7 +42,7 @@ def along(x: int, z: complex) -> float:
     return _A[x].real * z.real + _A[x].imag * z.imag
 
 
-@compiled
+@inlined
 def read_phases(plant: PlantRecords, k: int) -> None:
     """Have the counts of converter k's A/D at this tick in ``phase_sums``, in the order of the
     signal table's group ``adc``.
@@ -48,7 +56,7 @@ def read_phases(plant: PlantRecords, k: int) -> None:
             convert(plant, k, m, 0.0)
 
 
-@compiled
+@inlined
 def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
     """Add conversion m of this period, at an instant s after its beginning, to the counts of
     converter k.
@@ -58,35 +66,50 @@ def convert(plant: PlantRecords, k: int, m: int, at: float) -> None:
     that it has before the tick, where its bridge has a zero vector if it is switched.
     """
     r, s, w = plant.par[k], plant.st[k], field(plant.now[0], "w")
-    turn = stands(plant, at)
+    turn = frame_turn(plant, at)
     i, v, i_o = w[own(k) + I_F] * turn, w[own(k) + V] * turn, w[own(k) + I_O] * turn
     i, i_o = i * r.current, i_o * r.current
-    slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
-    if r.levels == 0:
-        E = complex(s.E[0], s.E[1]) * field(plant.now[0], "unit")[k] * turn
-        slope += E * (r.omega_b / r.L_f)
-    tick, noise, other = s.tick * r.phase_samples + m, 0.0, 0.0
+    s.phase_true[0] = s.x[V_DC]
+    for x in range(3):
+        s.phase_true[1 + x], s.phase_true[4 + x] = along(x, i), along(x, v)
+        s.phase_true[7 + x] = along(x, i_o)
+    if math.isnan(s.phase_seen[0, 0]):
+        for j in range(N_PHASES):
+            s.phase_seen[0, j] = s.phase_seen[1, j] = s.phase_true[j]
+    if r.skewed:
+        _find_slopes(plant, k, turn, i, v)
+    tick = s.tick * r.phase_samples + m
+    for j in range(0, N_PHASES, 2):
+        s.phase_random[j], s.phase_random[j + 1] = _noise(r, tick, j)
+    if m == 0:
+        for j in range(N_PHASES):
+            s.phase_sums[j] = 0.0
     for j in range(N_PHASES):
-        noise, other = other, noise
-        if j % 2 == 0:
-            noise, other = _noise(r, tick, j)
-        x = (j - 1) % 3
-        value = along(x, i if j < 4 else (v if j < 7 else i_o)) if j > 0 else s.x[V_DC]
-        if math.isnan(s.phase_seen[0, j]):
-            s.phase_seen[0, j] = s.phase_seen[1, j] = value
-        change = value - s.phase_seen[0, j]
         low = (
             r.phase_weights[0] * s.phase_seen[1, j]
             + r.phase_weights[1] * s.phase_seen[0, j]
-            + r.phase_weights[2] * value
+            + r.phase_weights[2] * s.phase_true[j]
         )
-        s.phase_seen[0, j], s.phase_seen[1, j] = value, low
-        back = change * r.phase_samples / plant.net[0].T_s
-        if 0 < j < 4 and r.phase_samples == 1:
-            back = along(x, slope)
-        seen = low - r.phase_skew[j] * back
-        before = 0.0 if m == 0 else s.phase_sums[j]
-        s.phase_sums[j] = before + _count(r, j, seen, noise)
+        s.phase_seen[0, j], s.phase_seen[1, j] = s.phase_true[j], low
+        seen = low - r.phase_skew[j] * s.phase_slope[j]
+        s.phase_sums[j] += _count(r, j, seen, s.phase_random[j])
+
+
+@compiled
+def _find_slopes(plant: PlantRecords, k: int, turn: complex, i: complex, v: complex) -> None:
+    """Find what each channel changes by in a second before a conversion; current of L_f and voltage
+    of C_f as they stand, p.u."""
+    r, s = plant.par[k], plant.st[k]
+    for j in range(N_PHASES):
+        change = s.phase_true[j] - s.phase_seen[0, j]
+        s.phase_slope[j] = change * r.phase_samples / plant.net[0].T_s
+    if r.phase_samples == 1:
+        slope = -(v + r.R_f * i) * (r.omega_b / r.L_f)
+        if r.levels == 0:
+            E = complex(s.E[0], s.E[1]) * field(plant.now[0], "unit")[k] * turn
+            slope += E * (r.omega_b / r.L_f)
+        for x in range(3):
+            s.phase_slope[1 + x] = along(x, slope)
 
 
 @cached
@@ -114,7 +137,7 @@ def _noise(r: Any, tick: int, j: int) -> tuple[float, float]:
 def _count(r: Any, j: int, value: float, noise: float) -> float:
     """Return what channel j reads of a value, counts; ``noise`` is a sample of N(0, 1)."""
     value = r.phase_gain[j] * value + r.phase_offset[j] + r.phase_noise[j] * noise
-    count = math.floor((value - r.phase_lo[j]) / r.phase_lsb[j] + 0.5)
+    count = np.floor((value - r.phase_lo[j]) * r.phase_per_lsb[j] + 0.5)
     return min(max(count, 0.0), r.phase_top)
 
 

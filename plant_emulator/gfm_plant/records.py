@@ -132,8 +132,9 @@ converter_par_dtype = np.dtype(
         ("phase_offset", "f8", (N_PHASES,)),
         ("phase_noise", "f8", (N_PHASES,)),
         ("phase_skew", "f8", (N_PHASES,)),
+        ("skewed", "i8"),  # one of them
         ("phase_lo", "f8", (N_PHASES,)),
-        ("phase_lsb", "f8", (N_PHASES,)),
+        ("phase_per_lsb", "f8", (N_PHASES,)),
         ("phase_top", "f8"),
         ("phase_weights", "f8", (3,)),
         ("phase_samples", "i8"),  # conversions in a period, whose sum is the count
@@ -184,6 +185,10 @@ converter_state_dtype = np.dtype(
         ("omega_seen", "f8"),
         # at the phases, at the last tick: the true values and the sensors' (NaN: not known yet)
         ("phase_seen", "f8", (2, N_PHASES)),
+        # of a conversion: values, what they change by in a second, and samples of N(0, 1)
+        ("phase_true", "f8", (N_PHASES,)),
+        ("phase_slope", "f8", (N_PHASES,)),
+        ("phase_random", "f8", (N_PHASES,)),
         # what ``seen`` changes by in a second at the beginning and the end of an interval between
         # two edges
         ("seen_slopes", "f8", (2, 3)),

@@ -14,7 +14,6 @@ An unbalanced fault acts on two axes, on which the real and the imaginary parts 
 have rates of their own, see `circuit`; all vectors are then turned so that alpha is real.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import numpy as np
 from gfm_plant.beside import average_rates, set_average
 from gfm_plant.layout import ORDER, POWERS, TERMS, field
 from gfm_plant.model import V_DC
+from gfm_plant.phases import frame_turn
 from gfm_plant.port import drive_by_itself, drive_port, keep_moments
 from gfm_plant.powers import MID_AT, ONE, SMALL, SOURCE_AT, N, P, fill_powers, find_slot, go_to
 from gfm_plant.records import I_F, I_O, N_PATH, PlantRecords, V
@@ -49,13 +49,13 @@ def begin_series(plant: PlantRecords, c: int, at: float) -> None:
     w, unit, source, speed = (
         field(now, "w"), field(now, "unit"), field(now, "source"), field(now, "source_speed")
     )  # fmt: skip
-    stands = _stands(plant, at)
-    to = stands * field(n, "axis")[c]
+    turn = frame_turn(plant, at)
+    to = turn * field(n, "axis")[c]
     for i in range(n.n_states):
         w[i] = w[i] * to
     for k in range(n.n_converters):
         s = plant.st[k]
-        s.ahead = unit[k] * stands
+        s.ahead = unit[k] * turn
         for i in range(3):
             s.ends[0, 2 * i], s.ends[0, 2 * i + 1] = w[own(k) + i].real, w[own(k) + i].imag
         s.ends[0, DC], s.ends[0, SOURCE], s.ends[0, MID] = s.x[V_DC], s.i_source, s.mid
@@ -90,7 +90,7 @@ def end_series(plant: PlantRecords, c: int, at: float, lasted: float) -> None:
     """
     n, now = plant.net[0], plant.now[0]
     w, unit = field(now, "w"), field(now, "unit")
-    back = _stands(plant, at + lasted).conjugate()
+    back = frame_turn(plant, at + lasted).conjugate()
     to = back * field(n, "axis")[c].conjugate()
     for k in range(n.n_converters):
         s = plant.st[k]
@@ -112,21 +112,6 @@ def normal(u: complex) -> complex:
     """Return a unit phasor without its rounding."""
     length = 1.5 - 0.5 * (u.real * u.real + u.imag * u.imag)
     return complex(u.real * length, u.imag * length)
-
-
-@inlined
-def _stands(plant: PlantRecords, at: float) -> complex:
-    """Return e^(j omega_b t) at an instant of the period."""
-    n, now, tick = plant.net[0], plant.now[0], plant.st[0].tick
-    if at == n.T_s:
-        tick, at = tick + 1, 0.0
-    if at == 0.0 and tick == now.stands_tick:
-        return now.stands
-    angle = n.omega_b * (n.T_s * tick + at)
-    found = complex(math.cos(angle), math.sin(angle))
-    if at == 0.0:
-        now.stands, now.stands_tick = found, tick
-    return found
 
 
 @compiled

@@ -96,8 +96,8 @@ _ELEMENTS = {"L_f", "R_f", "C_f", "L_g", "R_g", "L_line_n", "R_line_n"}
 _OF_OTHERS = {
     "soc", "P_most", "R_battery", "place_ticks", "by_voltage", "levels", "counts", "count_s",
     "dead", "least", "leg", "wide", "band", "band_kind", "cancels", "I_sc", "I_0", "v_T",
-    "irradiance", *(f"phase_{x}" for x in ("gain", "offset", "noise", "skew", "lo", "lsb", "top")),
-    "phase_weights", "phase_samples",
+    "irradiance", "phase_gain", "phase_offset", "phase_noise", "phase_skew", "skewed", "phase_lo",
+    "phase_per_lsb", "phase_top", "phase_weights", "phase_samples",
 }  # fmt: skip
 _OF_THE_START = {"omega_s", "T_s", "fraction", "i_max"}
 
