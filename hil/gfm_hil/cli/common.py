@@ -29,7 +29,7 @@ from gfm_hil.results.report import as_expected, events_table, finite, has_stages
 from gfm_hil.results.table import Table, shown
 from gfm_hil.run.network_run import NetworkRun
 from gfm_hil.run.runner import Notice
-from gfm_hil.scenario import Scenario, load_scenario
+from gfm_hil.scenario import Scenario, find_scenario, load_scenario
 from gfm_hil.studies.workers import Watch
 from gfm_runtime import law_file
 
@@ -231,6 +231,13 @@ def resolve(options: argparse.Namespace, named: bool = False, in_process: bool =
                 why = f"{law} needs its own stage, and keeps it"
                 print(f"gfmhil: --inner {options.inner}: {why}", file=sys.stderr)
     return scenario
+
+
+def short_name(scenario: str) -> str:
+    """What a run is named after: the scenario's file, or the folder of one that a command wrote
+    under the name that all such files have."""
+    file = find_scenario(scenario)
+    return file.resolve().parent.name if file.stem in ("network", "scenario") else file.stem
 
 
 def new_folder(out: str | None, stem: str) -> Path:

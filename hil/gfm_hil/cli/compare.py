@@ -12,7 +12,6 @@ from gfm_hil.core.errors import UserError
 from gfm_hil.core.terminal import terminal
 from gfm_hil.results.report import PAGE, event_rows
 from gfm_hil.results.table import Cell, Table
-from gfm_hil.scenario import find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -42,7 +41,7 @@ def call(options: argparse.Namespace) -> int:
     laws = common.split_laws(options.laws) if options.laws else base.compare
     if not laws:
         raise UserError("--laws: the scenario's compare list is empty; name some laws")
-    folder = common.new_folder(options.out, f"{find_scenario(options.scenario).stem}-compare")
+    folder = common.new_folder(options.out, f"{common.short_name(options.scenario)}-compare")
     with common.watching("compare", options.quiet) as watch:
         found = compare(
             base, laws, folder, converter=options.converter, recording=options.recording,

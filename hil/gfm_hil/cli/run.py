@@ -17,7 +17,6 @@ from gfm_hil.ports.port import OWN_NUMBER, companion
 from gfm_hil.recording.run import Run
 from gfm_hil.results.report import PAGE
 from gfm_hil.run.network_run import NetworkRun
-from gfm_hil.scenario import find_scenario
 
 
 def add(command: argparse.ArgumentParser) -> None:
@@ -70,7 +69,7 @@ def call(options: argparse.Namespace) -> int:
     if pil and not options.mode:
         options.mode = "lockstep"  # QEMU keeps no time
     scenario = common.resolve(options)
-    folder = common.new_folder(options.out, find_scenario(options.scenario).stem)
+    folder = common.new_folder(options.out, common.short_name(options.scenario))
     figures = not options.no_figures
     controllers = common.by_converter("--controller", options.controller, scenario.parts)
     maps = common.by_converter("--map", list(map(str, options.map)), scenario.parts)

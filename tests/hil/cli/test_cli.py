@@ -155,6 +155,16 @@ def with_few_runs(campaign):
     campaign.write_text(campaign.read_text().replace("runs = 200", "runs = 2"))
 
 
+@pytest.mark.parametrize(("file", "name"), [("mine.toml", "mine"), ("ieee9/network.toml", "ieee9")])
+def test_a_run_is_named_after_its_scenario_or_its_case(here, call, file, name):
+    (here / file).parent.mkdir(exist_ok=True)
+    (here / file).write_text(
+        'title = "t"\nduration = 0.01\nlaw = "droop-1"\n[link]\ntype = "inproc"\n'
+    )
+    assert call("run", file, "--no-figures")[0] == 0
+    assert [folder.name.split("-")[0] for folder in (here / "runs").iterdir()] == [name]
+
+
 @pytest.mark.full
 def test_a_new_project_passes_its_own_tests(call, here, monkeypatch):
     assert call("new", "project", "mine")[:2] == (0, "mine\n")
