@@ -69,16 +69,17 @@ def scenario_loop(scenario: Scenario, converter: str | None = None) -> tuple[Clo
     return loop, title_of(loop)
 
 
-def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
+def unstable_mode(scenario: Scenario, last: str = "") -> tuple[str, str] | None:
     """The first law whose linear loop at the start is unstable, and its modes that grow in words,
     the fastest first; None if there is none.
 
-    Without a network, the laws to which the run changes are checked too; with one, the law is "".
-    A law without an operating point is skipped.
+    Without a network, the laws to which the run changes are checked too, the one of the title
+    ``last`` before all others; with one, the law is "". A law without an operating point is
+    skipped.
     """
     alone = scenario.network is None
     laws = scenario.model_copy(update={"ready_laws": []}).laws() if alone else [""]
-    for law, title in law_titles(laws).items():
+    for law, title in sorted(law_titles(laws).items(), key=lambda one: one[1] != last):
         under = scenario.model_copy(update={"law": law})
         try:
             loop = scenario_loop(under)[0] if alone else network_loop(scenario)
@@ -98,15 +99,16 @@ def unstable_mode(scenario: Scenario) -> tuple[str, str] | None:
     return None
 
 
-def why_unstable(scenario: Scenario, named: str | Path) -> str:
+def why_unstable(scenario: Scenario, named: str | Path, last: str = "") -> str:
     """The unstable mode of a scenario's linear loop in one sentence, with the command that shows
     its modes; empty if there is none.
 
     Args:
         scenario: whose loop it is.
         named: what that command calls the scenario.
+        last: title of the law in force when the run ended.
     """
-    found = unstable_mode(scenario)
+    found = unstable_mode(scenario, last)
     if found is None:
         return ""
     law, words = found
@@ -122,7 +124,8 @@ def why_it_ended(run: Run | NetworkRun) -> str:
     if run.folder is None or not any(one.summary["ticks"] for one in early):  # none ever began
         return ""
     ours = all(target_of(one.summary["controller"]) is not None for one in each)
-    return why_unstable(run.scenario, run.folder / "scenario.toml") if ours else ""
+    last = "" if isinstance(run, NetworkRun) else run.summary["laws"][-1]
+    return why_unstable(run.scenario, run.folder / "scenario.toml", last) if ours else ""
 
 
 def _current_loop_too_fast(scenario: Scenario) -> str:

@@ -15,6 +15,7 @@ import pytest
 import gfmhil
 from gfm_hil.cli import main
 from gfm_hil.scenario import shipped_scenarios, toml_text
+from gfm_hil.studies.linear_loop import why_it_ended
 from gfm_runtime import law_names, law_titles
 from gfm_runtime.inner_file import inner_names
 
@@ -477,6 +478,8 @@ def test_laws_of_one_name_are_told_apart(tmp_path):
 def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     """By run, compare and laws show; of a stable one they say nothing."""
     own = str(own_law(tmp_path, "mine", k_34=50.0))
+    (tmp_path / "other").mkdir()
+    again = str(own_law(tmp_path / "other", "again", k_34=50.0))
     mode = r"[\d.]+ Hz, \+[\d.e+]+ 1/s"
     words = rf"the linear loop of mine has \d unstable modes: {mode}(?:; {mode})+ "
     run, command = tmp_path / "run", r"\(gfmhil design poles --law '.*file.toml' --scenario "
@@ -493,6 +496,11 @@ def test_an_unstable_law_is_told_with_its_mode(tmp_path, capsys):
     assert "unstable_mode" not in json.loads(
         (tmp_path / "compared" / "vsg-2" / "summary.json").read_text()
     )
+    begins = {"title": "t", "duration": 3.0, "law": own, "link": {"type": "inproc"},
+              "events": [{"type": "law", "tick": 5, "law": again}]}  # fmt: skip
+    ended = gfmhil.run(begins, folder=tmp_path / "again", figures=False)
+    assert ended.summary["laws"] == ["mine", "again"] and ended.status != "completed"
+    assert why_it_ended(ended).startswith("the linear loop of again has")
     assert main(["laws", "show", own]) == 0
     shown = capsys.readouterr().out
     assert re.search(words + command + r"pref_step\)", shown)
