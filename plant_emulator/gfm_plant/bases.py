@@ -39,6 +39,16 @@ class Bases:
         """Angular frequency base in rad/s: the omega_b of Eq. (1)-(8)."""
         return self.omega_n
 
+    @property
+    def V_peak(self) -> float:
+        """1 p.u. of a phase's instantaneous voltage, V."""
+        return self.V_n * math.sqrt(2 / 3)
+
+    @property
+    def I_peak(self) -> float:
+        """1 p.u. of a phase's instantaneous current, A."""
+        return self.S_n / (1.5 * self.V_peak)
+
     def base_of(self, quantity: str) -> float:
         """Return the SI value that is 1 p.u. of `quantity`. Raises ValueError: If `quantity` is
         none of `QUANTITIES`."""

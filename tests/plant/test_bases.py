@@ -31,6 +31,12 @@ def test_values_worked_by_hand(quantity, si, pu):
     assert bases.to_si(pu, quantity) == pytest.approx(si, rel=1e-6)
 
 
+def test_peaks_of_a_phase():
+    bases = Bases()
+    assert bases.V_peak == pytest.approx(310.26870, rel=1e-6)  # sqrt(2/3) * 380
+    assert bases.I_peak == pytest.approx(8.5947010, rel=1e-6)  # sqrt(2) * 6.0773714
+
+
 @pytest.mark.parametrize("value", [0.0, -380.0, math.nan, math.inf])
 def test_a_base_must_be_positive(value):
     with pytest.raises(ValueError, match=r"V_n = .*must be finite and > 0"):

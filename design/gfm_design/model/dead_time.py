@@ -16,7 +16,6 @@ of the current that the dead time makes itself are left out.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,7 +69,7 @@ class DeadTime:
                 f"dead time = {seconds:g} s: must lie in [0, {0.5 / f_c:g}) s, half of the carrier"
             )
         bases, r = load_converter(plant.converter).bases, par[0]
-        per_leg = math.sqrt(3 / 2) * bases.V_dcref / bases.V_n
+        per_leg = bases.V_dcref / bases.V_peak
         return cls(seconds * f_c, float(r["omega_b"]) / (f_c * float(r["L_f"])), per_leg)
 
     def drop(self, i: complex, e: complex) -> complex:

@@ -68,9 +68,8 @@ def call(options: argparse.Namespace) -> int:
 def _results(between: BetweenTicks) -> dict[str, Any]:
     """Ripple, RMS current and distortion of a window, by a name that ends in the unit."""
     b = between.bases
-    I_b = np.sqrt(2 / 3) * b.S_n / b.V_n  # A, peak
     results: dict[str, Any] = {
-        "ripple_i_A": I_b * max(between.ripple(f"i_{phase}") for phase in "abc"),
+        "ripple_i_A": b.I_peak * max(between.ripple(f"i_{phase}") for phase in "abc"),
         "ripple_v_dc_V": b.V_dcref * between.ripple("v_dc"),
         "capacitor_rms_A": b.S_n / b.V_dcref * between.capacitor_rms(),
     }

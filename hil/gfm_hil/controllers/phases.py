@@ -39,8 +39,7 @@ class Frame:
 
     def __init__(self, context: BenchContext, every: int) -> None:
         self._delay, self._radians = context.delay, context.bases.omega_b * context.T_s
-        self.peak_V = context.bases.V_n * math.sqrt(2.0 / 3.0)  # 1 p.u. of a phase
-        self.peak_A = context.bases.S_n / (1.5 * self.peak_V)
+        self.peak_V, self.peak_A = context.bases.V_peak, context.bases.I_peak
         # a voltage that is held for several ticks acts on average half of them later
         self.delay = context.delay + every / 2  # ticks from a sampling to the middle of its effect
         self.speed, self.origin = 1.0, 0.0

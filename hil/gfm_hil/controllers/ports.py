@@ -247,14 +247,13 @@ def _place(
 
 def _units(name: str, bases: Bases) -> dict[str, float]:
     """The units that a signal's port may have, each with its value at 1 p.u."""
-    peak_V = bases.V_n * math.sqrt(2 / 3)
     if name in (*PHASES, *BRIDGE):
         base, units = ("peak V", "V") if name[0] in "ve" else ("peak A", "A")
     else:
         base = next((s.base for s in (*SIGNALS, *command_rows(True)) if s.name == name), "")
         units = _SI.get(base, "")
     one = {
-        "peak V": peak_V, "peak A": bases.S_n / (1.5 * peak_V), "S_n": bases.S_n, "V_n": bases.V_n,
+        "peak V": bases.V_peak, "peak A": bases.I_peak, "S_n": bases.S_n, "V_n": bases.V_n,
         "V_dcref": bases.V_dcref, "S_n/V_dcref": bases.S_n / bases.V_dcref,
         "omega_n": bases.omega_n,
     }.get(base, 1.0)  # fmt: skip
@@ -264,5 +263,5 @@ def _units(name: str, bases: Bases) -> dict[str, float]:
     if base == "omega_n":
         found |= {"rad/s": one, "Hz": one / (2 * math.pi)}
     if name in BRIDGE:
-        found[V_DC_HALF] = 2 * peak_V / bases.V_dcref
+        found[V_DC_HALF] = 2 * bases.V_peak / bases.V_dcref
     return found

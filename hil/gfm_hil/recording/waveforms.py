@@ -70,8 +70,7 @@ def three_phase(columns: Columns, bases: Bases, si: bool = False) -> dict[str, C
             f"the three phases need {', '.join(missing)}, which the recording lacks: it has no "
             "plant, or an older version made it"
         )
-    peak = math.sqrt(2 / 3)
-    scale = {"V": peak * bases.V_n, "A": peak * bases.S_n / bases.V_n}
+    scale = {"V": bases.V_peak, "A": bases.I_peak}
     f_n = bases.omega_b / (2 * math.pi)
     return {
         wave(name, phase, si): Phase(columns, name, phase, f_n, scale[unit] if si else 1.0)

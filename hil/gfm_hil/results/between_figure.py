@@ -27,7 +27,7 @@ def draw_between(figure: Figure, between: BetweenTicks, title: str = "") -> list
     line, and v_dc, and below, if the window has 10 cycles, the spectra of phase a's currents. Of a
     window longer than 20 ms the curves show its first 20 ms."""
     b = between.bases
-    A = np.sqrt(2 / 3) * b.S_n / b.V_n
+    A = b.I_peak
     axes = figure.subplots(4, 1, height_ratios=(1.1, 1.4, 0.8, 1.3))
     last = int(np.searchsorted(between.t, between.t[0] + _SHOWN * (1 + 1e-9)))
     t = between.t[:last]

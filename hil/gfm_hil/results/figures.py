@@ -636,7 +636,7 @@ def _waves(
     waves = three_phase(run.columns, base)
     start, stop = window or run.scenario.waveforms or usual_window(run.summary, f_n)
     rows = slice(max(0, round(start / T_s)), max(0, round(stop / T_s) + 1))
-    V, A = (f"{np.sqrt(2 / 3) * x:.4g}" for x in (base.V_n, base.S_n / base.V_n))
+    V, A = (f"{x:.4g}" for x in (base.V_peak, base.I_peak))
     titles = {
         "v": f"capacitor voltages [p.u. of {V} V]", "i": f"bridge currents [p.u. of {A} A]",
         "i_o": "line currents [p.u.]",

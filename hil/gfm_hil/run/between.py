@@ -93,8 +93,7 @@ class BetweenTicks:
         """All of it by name, (n,) each: t in s, the columns, ``u_a`` … of the legs and ``i_C``, the
         capacitor's mean in each piece; in V and A under names such as u_a_V if ``si``."""
         b = self.bases
-        peak = math.sqrt(2 / 3)
-        units = {"V": peak * b.V_n, "A": peak * b.S_n / b.V_n}
+        units = {"V": b.V_peak, "A": b.I_peak}
         dc = ("V", b.V_dcref)
         kinds = {wave(w, p, False): (u, units[u]) for w, u in WAVES.items() for p in PHASES}
         kinds |= {"v_dc": dc, "mid": dc, "i_C": ("A", b.S_n / b.V_dcref)}

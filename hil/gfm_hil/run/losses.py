@@ -64,8 +64,7 @@ def losses(between: BetweenTicks, sheet: DataSheet | str | Path) -> Losses:
     if not isinstance(sheet, DataSheet):
         sheet = read_model(sheet, DataSheet)
     b = between.bases
-    A = np.sqrt(2 / 3) * b.S_n / b.V_n
-    currents = A * np.column_stack([between.columns[f"i_{phase}"] for phase in "abc"])
+    currents = b.I_peak * np.column_stack([between.columns[f"i_{phase}"] for phase in "abc"])
     h, lasts = np.diff(between.t)[:, None], float(between.t[-1] - between.t[0])
     i_0, i_1 = currents[:-1], currents[1:]
     size, square = np.abs(i_0 + i_1) / 2 * h, (i_0**2 + i_0 * i_1 + i_1**2) / 3 * h

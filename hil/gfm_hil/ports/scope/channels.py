@@ -1,6 +1,5 @@
 """The channels of a scope: recorded columns with names and units, and figures of the loop."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -47,11 +46,10 @@ class ScopeChannel:
 def si_bases(bases: Bases) -> dict[str, tuple[str, float]]:
     """The unit and the value of 1 p.u. in SI by the base of a channel."""
     S, V = bases.S_n, bases.V_n
-    current = bases.base_of("I")
     return {
-        "S_n": ("W", S), "Q_n": ("var", S), "V_n": ("V", V), "S_n/V_n": ("A", current),
+        "S_n": ("W", S), "Q_n": ("var", S), "V_n": ("V", V), "S_n/V_n": ("A", bases.base_of("I")),
         "V_dcref": ("V", bases.V_dcref), "S_n/V_dcref": ("A", S / bases.V_dcref),
-        "peak v": ("V", math.sqrt(2 / 3) * V), "peak i": ("A", math.sqrt(2) * current),
+        "peak v": ("V", bases.V_peak), "peak i": ("A", bases.I_peak),
     }  # fmt: skip
 
 
