@@ -192,14 +192,16 @@ def test_ctrl_c_ends_both_and_keeps_the_data(begun):
 
 def test_in_lockstep_either_role_may_stand_still_for_seconds(begun):
     """As on a busy machine."""
-    process, folder = begun(duration=3.0, link={"type": "shm"})
-    for stopped in roles_of(folder).values():
+    process, folder = begun(duration=40.0, link={"type": "shm"})  # some seconds
+    roles = roles_of(folder)
+    assert len(roles) == 2
+    for stopped in roles.values():
         os.kill(stopped, signal.SIGSTOP)
         time.sleep(2.0)
         os.kill(stopped, signal.SIGCONT)
     code, out, _ = end(process)
     found = json.loads(out)
-    assert (code, found["status"], found["ticks"]) == (0, "completed", 30_000)
+    assert (code, found["status"], found["ticks"]) == (0, "completed", 400_000)
     assert found["wall_s"] > 4.0
 
 
