@@ -123,9 +123,10 @@ def why_it_ended(run: Run | NetworkRun) -> str:
     early = [one for one in each if one.status not in ("completed", "interrupted")]
     if run.folder is None or not any(one.summary["ticks"] for one in early):  # none ever began
         return ""
-    ours = all(target_of(one.summary["controller"]) is not None for one in each)
+    if any(target_of(one.summary["controller"]) is None for one in each):
+        return ""
     last = "" if isinstance(run, NetworkRun) else run.summary["laws"][-1]
-    return why_unstable(run.scenario, run.folder / "scenario.toml", last) if ours else ""
+    return why_unstable(run.scenario, run.folder / "scenario.toml", last)
 
 
 def _current_loop_too_fast(scenario: Scenario) -> str:
